@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from merge_sumo.analysis.audit import MissedShare, audit_cases, missed_share, missed_shares
 from merge_sumo.values.case import to_unit
+from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.empty_ball import EmptyBall, largest_empty_ball
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.score import Outcome
@@ -58,11 +59,17 @@ class Summary:
     missed: MissedShare | None = None
 
 
-def summarise(outcomes: Sequence[Outcome], levels: Sequence[int]) -> Summary:
-    """Return the summary of outcomes, at the given levels and where else there are any."""
+def summarise(
+    outcomes: Sequence[Outcome], levels: Sequence[int], tolerated: float = 0.0
+) -> Summary:
+    """Return the summary of outcomes, at the given levels and where else there are any.
+
+    A case counts once, by the run that stands for it where a share of its runs is `tolerated`.
+    """
     every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
     audited = audit_cases(outcomes)
     missed = missed_shares(audited, every)
+    outcomes = one_per_case(outcomes, tolerated)
     ends = Counter(outcome.measures.end for outcome in outcomes)
     return Summary(
         cases=len(outcomes),

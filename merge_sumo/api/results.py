@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from merge_sumo.analysis.chance import ChanceSummary, chance_in
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
 from merge_sumo.analysis.people import PeopleSummary, beside_people
@@ -126,7 +127,7 @@ class CampaignRun(Result):
     @property
     def failures(self) -> Table:
         """The failing cases, the worst first."""
-        return Table(failures(self._run.outcomes))
+        return Table(failures(self._run.cases))
 
     @property
     def errors(self) -> Table:
@@ -146,18 +147,23 @@ class CampaignRun(Result):
     @cached_property
     def verdict(self) -> Verdict:
         """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self._run.outcomes)
+        return judge(self._run.cases)
 
     @cached_property
     def summary(self) -> Summary:
         """Cases, failures, regions and failure mode coverage by POV level."""
-        return summarise(self._run.outcomes, self._run.levels)
+        return summarise(self._run.outcomes, self._run.levels, self._run.tolerated)
 
     @cached_property
     def people(self) -> PeopleSummary:
         """Failures beside published drivers: in which the POV does no more than they do."""
         share = self._run.people if self._people is None else self._people
-        return beside_people(self._run.outcomes, share, self._run.levels)
+        return beside_people(self._run.cases, share, self._run.levels)
+
+    @cached_property
+    def chance(self) -> ChanceSummary | None:
+        """What repeats show of chance; None without any."""
+        return chance_in(self._run.outcomes, self._run.tolerated)
 
     @cached_property
     def merging(self) -> MergeStatistics | None:
@@ -225,6 +231,7 @@ class CampaignRun(Result):
             **asdict(self.summary),
             **self.verdict.to_record(),
             **merging_record(outcomes),
+            **({} if self.chance is None else {"chance": self.chance.to_record()}),
             "people": self.people.to_record(),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
@@ -250,6 +257,7 @@ class CampaignRun(Result):
         if self.summary.severities:
             counts = (f"{number} {name}" for name, number in self.summary.severities.items())
             optional.append(f"  severity of all cases: {', '.join(counts)}")
+        optional += [] if self.chance is None else [f"  {self.chance.sentence}"]
         optional += [] if self.merging is None else [f"  {self.merging.sentence}"]
         optional += self.verdict.trouble_lines()
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
@@ -261,7 +269,7 @@ class CampaignRun(Result):
         optional.append(self.people.line)
         optional += self._against_lines()
         optional += [self.careful, f"report: {self.report_file}"]
-        worst = failures(run.outcomes)[:1]
+        worst = failures(run.cases)[:1]
         folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]
         optional += [f"worst case: merge-sumo replay {quoted(path)} --gui" for path in folders]
         return [line for line in optional if line is not None]

@@ -365,7 +365,7 @@ def _run(
             ended += [outcome for batch in together for outcome, _ in batch]
             check()
     done = campaign.ended(ended, workers)
-    for outcome in spread_failures(done.outcomes)[:EXPORTED_FAILURES]:
+    for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         folder = done.folder / SCENARIOS / case_name(outcome.index)
         if not os.path.lexists(folder):  # written whole, before the campaign was stopped
             export_case(done, outcome.index, folder, campaign.plan.road)

@@ -40,6 +40,7 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import decode
 from merge_sumo.system.trust import begun_here
 from merge_sumo.values.case import FloatArray, to_unit
+from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import ALL_LEVELS, US23, Scenario
@@ -125,6 +126,21 @@ class Run:
         if not isinstance(share, (int, float)) or not 0.0 < share <= 1.0:
             raise UserError(f"{self.folder / SETTINGS} has something else than a share as people")
         return float(share)
+
+    @property
+    def tolerated(self) -> float:
+        """The share of its runs in which a case may fail; `UserError` for none."""
+        share = self.settings.get("tolerated", 0.0)
+        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share < 1.0:
+            raise UserError(
+                f"{self.folder / SETTINGS} has something else than a share as tolerated"
+            )
+        return float(share)
+
+    @property
+    def cases(self) -> list[Outcome]:
+        """The run that stands for each case (`one_per_case`): all outcomes without repeats."""
+        return one_per_case(self.outcomes, self.tolerated)
 
     @property
     def vut(self) -> str:

@@ -159,12 +159,12 @@ class BoardModel:
         `summary` is that of the run, where it is known.
         """
         self.run = run
-        self.summary = summary or summarise(run.outcomes, run.levels)
-        self.verdict: Verdict = judge(run.outcomes)
+        self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
+        self.verdict: Verdict = judge(run.cases)
         self.kept: dict[str, Path] = {}
         """Files of the cache that sentences name, by name."""
         held = run.people if people is None else people
-        self.people = beside_people(run.outcomes, held, run.levels)
+        self.people = beside_people(run.cases, held, run.levels)
         self.avoidance = read_avoidance(run)
         self.per_merge = per_merge_of(run.folder)
         self.probability = probability_of(run.folder)
@@ -321,7 +321,7 @@ class BoardModel:
                 self._lines(verdict.contacts, f"{failing}, severity = contact"),
             )
         passing = sum(
-            not o.failed and o.measures.severity == Severity.CONTACT for o in self.run.outcomes
+            not o.failed and o.measures.severity == Severity.CONTACT for o in self.run.cases
         )
         if passing:
             yield say(
@@ -337,7 +337,7 @@ class BoardModel:
             )
         for level, found in self.summary.levels.items():
             yield self._found_at(level, found)
-        worst = failures(self.run.outcomes)
+        worst = failures(self.run.cases)
         if worst:
             yield self._worst(worst[0])
 

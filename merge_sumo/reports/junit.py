@@ -25,6 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
+from merge_sumo.values.chance import by_case
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -67,11 +68,13 @@ def junit(
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, verdict, gates)
     _against(root, run)
+    repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
+    shares = {one.shown(run.tolerated).index: f", {one.in_words}" for one in repeated}
     for level in levels:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
-        for outcome in run.outcomes:
+        for outcome in run.cases:
             if outcome.case.level == level:
-                _case(suite, outcome)
+                _case(suite, outcome, shares.get(outcome.index, ""))
         _count(suite)
     suites = root.findall("testsuite")
     for key in ("tests", "failures", "errors"):
@@ -108,9 +111,9 @@ def _against(root: etree._Element, run: Run) -> None:
     _count(suite)
 
 
-def _case(suite: etree._Element, outcome: Outcome) -> None:
+def _case(suite: etree._Element, outcome: Outcome, runs: str) -> None:
     case, measures = outcome.case, outcome.measures
-    name = f"case {outcome.index}: {described(case)}"
+    name = f"case {outcome.index}: {described(case)}{runs}"
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
     if measures.end.is_error:
         _wrong(test, "error", measures.end.value, message_of(outcome))

@@ -65,18 +65,18 @@ class ReportModel:
         """
         self.run = run
         self.road = road_of_run(run)
-        self.summary = summary or summarise(run.outcomes, run.levels)
-        self.verdict = judge(run.outcomes)
+        self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
+        self.verdict = judge(run.cases)
         self.levels = list(self.summary.levels)
         share = run.people if people is None else people
-        self.people = beside_people(run.outcomes, share, self.levels)
+        self.people = beside_people(run.cases, share, self.levels)
         # The surrogate of each level; the cases; the text; the data.
         self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
         self._counting = threading.Lock()
         on_part(0, self._parts)
         self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers, self.part_ended))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
-        self.worst = failures(run.outcomes)
+        self.worst = failures(run.cases)
         self.regions = regions_of(self.worst)
         self.stress = stress_of(run.folder)
         robust = set() if self.stress is None else set(self.stress.robust)

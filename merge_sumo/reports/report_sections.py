@@ -250,7 +250,7 @@ def _stress(model: ReportModel) -> dict[str, Any] | None:
         "stress": found,
         "sentence": text[:1].upper() + text[1:],
         "repeats": repeats if unchanged else "",
-        "is_older": found.cases != sum(outcome.is_tested for outcome in model.run.outcomes),
+        "is_older": found.cases != sum(outcome.is_tested for outcome in model.run.cases),
     }
 
 

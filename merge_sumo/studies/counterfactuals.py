@@ -145,7 +145,7 @@ def read_avoidance(run: Run) -> dict[int, Avoidance]:
 
     Empty where it says nothing. Raises `UserError` for a line that is not of one of its failures.
     """
-    failing = {outcome.index for outcome in run.outcomes if outcome.failed}
+    failing = {outcome.index for outcome in run.cases if outcome.failed}
     return read_indexed(run.folder / AVOIDANCE, Avoidance, failing, _upgrade_from_0_1)
 
 
@@ -205,7 +205,7 @@ def avoidance(
         check: called whenever a worker is done with some of them; may raise to stop there.
         on_part: told how many failures are done, and how many there are, from 0 on.
     """
-    worst = sorted(failures(run.outcomes)[:MOST], key=lambda outcome: outcome.index)
+    worst = sorted(failures(run.cases)[:MOST], key=lambda outcome: outcome.index)
     failing = [(o.index, motion) for o in worst if (motion := _trajectory(run, o)) is not None]
     if not failing:
         return []

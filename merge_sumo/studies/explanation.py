@@ -168,11 +168,11 @@ def listed_failures(run: Run, indices: Sequence[int] = ()) -> list[Outcome]:
     Raises `UserError` for a case that is there no more, or did not fail.
     """
     if not indices:
-        return spread_failures(run.outcomes)[:LISTED]
+        return spread_failures(run.cases)[:LISTED]
     chosen = [run.outcome(index) for index in dict.fromkeys(indices)]
     for outcome in chosen:
         if not outcome.failed:
-            worst = [o.index for o in failures(run.outcomes)[:1]]
+            worst = [o.index for o in failures(run.cases)[:1]]
             such = f", such as {worst[0]}" if worst else ", and this campaign has none"
             raise UserError(f"case {outcome.index} did not fail: name a failure{such}")
     return chosen

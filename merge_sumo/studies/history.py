@@ -305,23 +305,22 @@ def _notes(runs: Sequence[Run], levels_by_run: Sequence[list[int]]) -> list[str]
 def _version(run: Run, levels: Sequence[int]) -> Version:
     known = read_avoidance(run)
     by_level: dict[int | None, list[Outcome]] = {
-        level: [outcome for outcome in run.outcomes if outcome.case.level == level]
-        for level in levels
+        level: [outcome for outcome in run.cases if outcome.case.level == level] for level in levels
     }
-    cases = by_level | {None: run.outcomes}
+    cases = by_level | {None: run.cases}
     return Version(
         folder=str(run.folder),
         vut=run.vut,
         sampler=str(run.settings.get("sampler")),
-        verdict=judge(run.outcomes),
+        verdict=judge(run.cases),
         levels={level: _level(run, level, known) for level in levels},
         merging={level: found for level, ran in cases.items() if (found := merging_of(ran))},
-        people=beside_people(run.outcomes, run.people, levels),
+        people=beside_people(run.cases, run.people, levels),
     )
 
 
 def _level(run: Run, level: int, known: dict[int, Avoidance]) -> LevelOfVersion:
-    outcomes = [outcome for outcome in run.outcomes if outcome.case.level == level]
+    outcomes = [outcome for outcome in run.cases if outcome.case.level == level]
     failed = [outcome for outcome in outcomes if outcome.failed]
     points = to_unit((outcome.case for outcome in failed), level, run.scenario)
     motions = run.trajectories(outcome.index for outcome in failed)
@@ -374,7 +373,7 @@ class _Tested:
     """The cases of a version at a level that have a verdict, and their points, (n, d)."""
 
     def __init__(self, run: Run, level: int) -> None:
-        self.outcomes = [o for o in run.outcomes if o.case.level == level and o.is_tested]
+        self.outcomes = [o for o in run.cases if o.case.level == level and o.is_tested]
         self.failures = [outcome for outcome in self.outcomes if outcome.failed]
         self.points, self.failing = (
             to_unit((o.case for o in some), level, run.scenario)

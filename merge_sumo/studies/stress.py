@@ -160,7 +160,7 @@ def stress_of(folder: Path) -> Stress | None:
 
 def check_stress_of(run: Run, known: Stress) -> None:
     """Raise `UserError` where a stress test is of other cases than a run; it may have more."""
-    tested = [outcome for outcome in run.outcomes if outcome.is_tested][: known.cases]
+    tested = [outcome for outcome in run.cases if outcome.is_tested][: known.cases]
     failing = tuple(outcome.index for outcome in failures(tested))
     if (run.vut, len(tested), failing) != (known.vut, known.cases, known.failures):
         raise UserError(
@@ -300,7 +300,7 @@ def stress(study: RunStudy, *, draws: int = DEFAULT_DRAWS, seed: int = 0) -> Str
         raise UserError(f"--seed is {seed}: it must be 0 or more")
     study.check_same_system()
     run = study.run
-    tested = [outcome for outcome in run.outcomes if outcome.is_tested]
+    tested = [outcome for outcome in run.cases if outcome.is_tested]
     if not tested:
         raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
     with workers_or_here(study.workers) as opened:

@@ -56,7 +56,7 @@ def assert_no_failures(
 
 def _message(run: CampaignRun, seed: int) -> str | None:
     """Return the message of an assertion; None for a campaign without failures and errors."""
-    outcomes = run.run.outcomes
+    outcomes = run.run.cases
     failed = failures(outcomes)
     wrong = [*failed, *(outcome for outcome in outcomes if outcome.measures.end.is_error)]
     if run.verdict.tested and not wrong:

@@ -17,6 +17,7 @@ from typing import Final
 from scipy.special import betainc
 
 from merge_sumo.errors import UserError
+from merge_sumo.system.printable import counted
 from merge_sumo.values.case import Case
 from merge_sumo.values.score import Outcome
 
@@ -55,6 +56,11 @@ class RunsOfCase:
     def share(self) -> float:
         """Share of the runs that fail."""
         return self.failures / self.runs
+
+    @property
+    def in_words(self) -> str:
+        """How many of the runs fail."""
+        return f"{self.failures} of {counted(self.runs, 'run')} fail{'s' * (self.failures == 1)}"
 
     def shown(self, tolerated: float = 0.0) -> Outcome:
         """Return the run that stands for the case, failing where the case does: the worst such."""

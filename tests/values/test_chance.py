@@ -1,5 +1,7 @@
 """Draws of a case, and cases that fail in a share of their runs."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import json
@@ -10,9 +12,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from merge_sumo.analysis.chance import ChanceSummary, chance_in
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase, to_unit
-from merge_sumo.values.chance import by_case, check_tolerated, failing_cases, fails_above
+from merge_sumo.values.chance import (
+    by_case,
+    check_tolerated,
+    failing_cases,
+    fails_above,
+    is_decided,
+    one_per_case,
+    runs_needed,
+)
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
@@ -105,3 +116,53 @@ def test_the_interval_is_that_of_clopper_and_pearson():
 def test_what_is_no_share_is_not_tolerated(share):
     with pytest.raises(UserError, match="--tolerate is"):
         check_tolerated(share)
+
+
+def test_the_run_that_stands_for_a_case_fails_as_the_case_does():
+    other = replace(CASE, x_pov0_m=-200.0)
+    runs = [(CASE, draw, (PASSES, FAILS, FAILS - 9.0, PASSES - 9.0)[draw]) for draw in range(4)]
+    told = outcomes([*runs, (other, 0, None), (other, 1, PASSES)])
+    assert [outcome.index for outcome in one_per_case(told)] == [2, 4, 5]
+    assert [outcome.index for outcome in one_per_case(told, 0.5)] == [3, 4, 5]
+    first = [outcome for outcome in told if not outcome.case.draw]
+    assert one_per_case(first) == first
+
+
+def test_a_case_is_decided_by_the_posterior_of_its_runs():
+    # Beta(1.5, .5): P(share > .2) = .976; Beta(.5, 6.5): P(share > .2) = .083, Beta(.5, 8.5): .045.
+    assert is_decided(1, 1, 0.2)
+    assert not is_decided(0, 6, 0.2)
+    assert is_decided(0, 8, 0.2)
+    assert (runs_needed(0, 0, 0.2), runs_needed(0, 6, 0.2)) == (1, 2)
+    assert runs_needed(3, 19, 0.2, most=19) == 0
+    assert [runs_needed(failures, 5, 0.0) for failures in (0, 1)] == [1, 0]
+
+
+def test_what_repeats_show_is_counted():
+    other = replace(CASE, x_pov0_m=-200.0)
+    told = outcomes(
+        [
+            (CASE, 0, FAILS),
+            (CASE, 1, PASSES),
+            (other, 0, PASSES),
+            (other, 1, PASSES),
+            (CASE, 2, None),
+        ]
+    )
+    assert chance_in(told[:1]) is None
+    assert chance_in(told) == ChanceSummary(
+        runs=4,
+        cases=2,
+        repeated=2,
+        varied=1,
+        both_ways=1,
+        tolerated=0.0,
+        failures=1,
+        undecided=0,
+    )
+    tolerant = chance_in(told, 0.4)
+    assert (tolerant.failures, tolerant.undecided) == (1, 1)
+    assert "a case fails where more than 40% of its runs do, which 1 of 1 failure" in (
+        tolerant.sentence
+    )
+    assert chance_in(told[2:4]).sentence.endswith("each time alike: no chance was seen")

@@ -1,0 +1,86 @@
+"""What the repeats of a campaign show of chance, in a few numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from merge_sumo.system.printable import counted
+from merge_sumo.values.chance import MOST_RUNS, by_case, fails_above, is_decided
+from merge_sumo.values.score import Outcome
+
+
+@dataclass(frozen=True, slots=True)
+class ChanceSummary:
+    """Cases of a campaign that ran more than once.
+
+    Attributes:
+        runs: runs of all cases, those that ran once among them.
+        cases: cases.
+        repeated: cases that ran more than once.
+        varied: those of them whose runs differ in a measure: chance is in them.
+        both_ways: those of them that fail in some runs and pass in others.
+        tolerated: the share of its runs in which a case may fail.
+        failures: cases that fail in more than that.
+        undecided: failing cases that ran too seldom to tell; the failure by which a case was
+            noticed is not counted.
+    """
+
+    runs: int
+    cases: int
+    repeated: int
+    varied: int
+    both_ways: int
+    tolerated: float
+    failures: int
+    undecided: int
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what JSON shows."""
+        return asdict(self)
+
+    @property
+    def sentence(self) -> str:
+        """What it says, in a line."""
+        said = (
+            f"{counted(self.runs, 'run')} of {counted(self.cases, 'case')}: {self.repeated} ran "
+            "more than once, "
+        )
+        if not self.varied:
+            return f"{said}each time alike: no chance was seen"
+        said += f"{self.varied} of them not alike, and {self.both_ways} both failed and passed"
+        if self.tolerated:
+            said += f"; a case fails where more than {self.tolerated:.0%} of its runs do"
+        if self.undecided:
+            said += f", which {self.undecided} of {counted(self.failures, 'failure')} ran too "
+            said += "seldom to tell"
+        return said
+
+
+def chance_in(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> ChanceSummary | None:
+    """Return what repeats show; None where no case ran more than once and none is tolerated."""
+    known = list(outcomes)
+    if not (tolerated or any(outcome.case.draw for outcome in known)):
+        return None
+    cases = by_case(known)
+    repeated = [one for one in cases if one.runs > 1]
+    failing = [one for one in cases if fails_above(one, tolerated)]
+    varied = [one for one in repeated if len({o.measures for o in one.outcomes}) > 1]
+    untold = [
+        one
+        for one in failing
+        if tolerated
+        and one.runs < MOST_RUNS
+        and not is_decided(one.failures - 1, one.runs - 1, tolerated)
+    ]
+    return ChanceSummary(
+        runs=sum(one.runs for one in cases),
+        cases=len(cases),
+        repeated=len(repeated),
+        varied=len(varied),
+        both_ways=sum(0 < one.failures < one.runs for one in varied),
+        tolerated=tolerated,
+        failures=len(failing),
+        undecided=len(untold),
+    )
