@@ -33,7 +33,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
 from merge_sumo.system.hashing import Files, sha256_of
@@ -379,7 +379,7 @@ def _search(
     if against is not None:
         return _against(campaign, against, workers, on_case)
     settings, plan, history = campaign.settings, campaign.plan, campaign.history
-    picks = make_sampler(settings.sampler, settings.pool, settings.seed, twin_of(settings, plan))
+    picks = settings.new_sampler(twin_of(settings, plan))
     search_on_two_cores(picks, workers, settings.cases - len(history))
     sampler = settings.audited(picks)
     motions = None
@@ -404,7 +404,7 @@ def _against(
     """
     settings = campaign.settings
     twins = twins_of(settings, campaign.plan, against.plan)
-    sampler = make_sampler(settings.sampler, settings.pool, settings.seed, twins)
+    sampler = settings.new_sampler(twins)
     search = PairedSearch(
         sampler, twins if sampler.uses_predictions else None, settings.stopping_rule()
     )
@@ -435,7 +435,7 @@ def _in_batches(
 ) -> Generator[list[Batch], None, None]:
     """Run batch by batch what is missing of a campaign; yield batches that ended together."""
     proposed = proposals(
-        settings.audited(make_sampler(settings.sampler, settings.pool, settings.seed)),
+        settings.audited(settings.new_sampler()),
         *(history, settings.cases, settings.batch),
     )
     missing = settings.cases - len(history)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -22,6 +21,7 @@ from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
@@ -139,7 +139,7 @@ class CampaignSettings:
                 )
 
     def _check_sampler(self) -> None:
-        sampler = make_sampler(self.sampler, self.pool, self.seed)
+        sampler = self.new_sampler()
         if self.learn_from and not sampler.uses_predictions:
             able = [name for name, kind in SAMPLERS.items() if kind.uses_predictions]
             raise UserError(
@@ -199,11 +199,10 @@ class CampaignSettings:
         """Return what says of the outcomes so far whether the search is over, if anything does."""
         if self.stop_after_converged is None:
             return None
-        fresh = partial(make_sampler, self.sampler, self.pool, self.seed)
         rule = StoppingRule(
             self.stop_after_converged,
             self.batch or self.in_flight,
-            fresh,
+            self.new_sampler,
             self._missed,
             tolerated=self.tolerated,
         )
@@ -214,6 +213,12 @@ class CampaignSettings:
     def audit_plan(self) -> Audit | None:
         """Which cases are audit cases; None without any."""
         return None if self.audit is None else Audit(self.audit, self.cases, self.pool, self.seed)
+
+    def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
+        """Return the sampler, which was told nothing; `predictor` as of `make_sampler`."""
+        sampler = make_sampler(self.sampler, self.pool, self.seed, predictor)
+        sampler.tolerated = self.tolerated
+        return sampler
 
     def with_repeats(self, sampler: Sampler) -> Sampler:
         """Return a sampler that was told nothing, with repeats among its picks."""

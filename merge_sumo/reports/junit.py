@@ -69,7 +69,7 @@ def junit(
     _gates(root, verdict, gates)
     _against(root, run)
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
-    shares = {one.shown(run.tolerated).index: f", {one.in_words}" for one in repeated}
+    shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
     for level in levels:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.cases:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.samplers.history import LevelHistory, deciding_run
+from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
 from merge_sumo.values.chance import RunsOfCase, by_case
 from merge_sumo.values.prediction import Prediction
@@ -150,7 +150,7 @@ class Sampler(ABC):
     def _repeated_history(self, level: int) -> LevelHistory:
         """Return the history of a level where cases ran with more than one draw."""
         cases = self.runs(level)
-        decisive = [deciding_run(one.outcomes, self.tolerated) for one in cases]
+        decisive = [one.deciding(self.tolerated) for one in cases]
         scores = [[run.score for run in one.outcomes] for one in cases]
         return replace(
             self._rows_of(decisive, level),

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.score import Outcome
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,14 +88,3 @@ class LevelHistory:
         """Return the fields with a row for each case, by name."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return {name: rows for name, rows in values.items() if isinstance(rows, np.ndarray)}
-
-
-def deciding_run(runs: Sequence[Outcome], tolerated: float) -> Outcome:
-    """Return the run of a case that decides whether more than a share of its runs failed.
-
-    The runs have verdicts. Its score is below lambda exactly where the case fails.
-    """
-    total = len(runs)
-    spared = sum(not failures / total > tolerated for failures in range(1, total + 1))
-    ordered = sorted(runs, key=lambda run: run.score or 0.0)
-    return ordered[min(spared, total - 1)]

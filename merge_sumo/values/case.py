@@ -155,7 +155,7 @@ class Case:
     @property
     def told_seed(self) -> int:
         """The same for a controller, by what it is told: neither level nor orientation decide."""
-        return self._hashed(self.starts())
+        return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
     def _hashed(self, known: object) -> int:
         """Return a number below 2**32 for each draw, other than those of further draws."""

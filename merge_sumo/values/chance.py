@@ -62,10 +62,15 @@ class RunsOfCase:
         """How many of the runs fail."""
         return f"{self.failures} of {counted(self.runs, 'run')} fail{'s' * (self.failures == 1)}"
 
-    def shown(self, tolerated: float = 0.0) -> Outcome:
-        """Return the run that stands for the case, failing where the case does: the worst such."""
-        alike = [o for o in self.outcomes if o.failed is fails_above(self, tolerated)]
-        return min(alike, key=lambda outcome: (_score(outcome), outcome.index))
+    def deciding(self, tolerated: float = 0.0) -> Outcome:
+        """Return the run that decides whether more than a tolerated share of the runs failed.
+
+        Of the runs from the worst to the best it is the first one behind those that are tolerated:
+        it fails exactly where the case does.
+        """
+        spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
+        ordered = sorted(self.outcomes, key=lambda outcome: (_score(outcome), outcome.index))
+        return ordered[spared]
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
         """Return where the failure probability is with a confidence (Clopper and Pearson, 1934).
@@ -108,15 +113,14 @@ def failing_cases(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[R
 
 
 def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Outcome]:
-    """Return of each case the run that stands for it, and outcomes without a verdict as they are.
+    """Return the deciding run of each case, and outcomes without a verdict as they are.
 
-    Of a failing case it is the worst of its runs; of another one the worst that passes. In the
-    order of the index of the first run. Without repeats, these are the outcomes.
+    In the order of the first run of each case. Without repeats, these are the outcomes.
     """
     known = list(outcomes)
     if not any(outcome.case.draw for outcome in known):
         return known
-    shown = [(one.outcomes[0].index, one.shown(tolerated)) for one in by_case(known)]
+    shown = [(one.outcomes[0].index, one.deciding(tolerated)) for one in by_case(known)]
     errors = [(outcome.index, outcome) for outcome in known if outcome.score is None]
     return [outcome for _, outcome in sorted(shown + errors, key=itemgetter(0))]
 

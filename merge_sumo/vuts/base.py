@@ -373,9 +373,11 @@ class PerCorridor(Driver):
 
     Attributes:
         renewal: begins the reason where that fails.
+        seed: of the episode that begins, for controllers that draw random numbers.
     """
 
     renewal = "made anew"
+    seed = 0
 
     def __init__(self, corridors: int, deadline_s: float) -> None:
         super().__init__(corridors)
@@ -411,7 +413,7 @@ class PerCorridor(Driver):
                 if self._renew_first[corridor]:
                     deadline.call(corridor, self.renew, corridor)
                     self._renew_first[corridor] = False
-                activity = "reset"
+                activity, self.seed = "reset", case.told_seed
                 deadline.call(corridor, self.reset, corridor, seen_at_start(case))
         except BaseException as error:
             self._fault(corridor, f"{activity}: {self._deadline.reason(error)}")

@@ -8,6 +8,7 @@ import inspect
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
@@ -36,7 +37,7 @@ from merge_sumo.vuts.base import (
 )
 from merge_sumo.vuts.blame_cell import ALL_CORRIDORS, NO_CORRIDOR, current_call
 from merge_sumo.vuts.parameters import Parameters
-from merge_sumo.vuts.signatures import check_call, check_methods, fits
+from merge_sumo.vuts.signatures import check_call, check_methods, fits, takes_seed
 
 GROUP: Final = "merge_sumo.vuts"
 """Entry points of this group are VUTs by their name."""
@@ -134,9 +135,9 @@ def vut_of(
 class PythonVut(PerCorridor):
     """Drives by one object per corridor, with `act(seen)` or called itself.
 
-    An object with `reset(seen)` drives one episode after the other in its corridor. One without is
-    never told that an episode begins, so each episode has a new one; a function has nothing to
-    begin anew. `close()` is called in the end where an object has it.
+    An object with `reset(seen)`, or `reset(seen, seed)`, drives one episode after the other in its
+    corridor. One without is never told that an episode begins, so each episode has a new one; a
+    function has nothing to begin anew. `close()` is called in the end where an object has it.
     """
 
     def __init__(
@@ -164,7 +165,7 @@ class PythonVut(PerCorridor):
         """Call `reset`; an object without is replaced before the next episode."""
         vut = self._objects[corridor]
         if getattr(vut, "reset", None) is not None:
-            vut.reset(seen)
+            _reset(vut.reset, seen, seed=self.seed)
         elif not inspect.isroutine(vut):
             self.renewal = "made anew for this episode, as it has no `reset`"
             self.renew_next(corridor)
@@ -192,8 +193,8 @@ class BatchedVut(Driver):
     """Drives by one object that acts in all corridors at once.
 
     It is made with the number of corridors K, has `act_batch(seen)`, which returns K
-    accelerations, (K,), or these and whether to merge, (2, K), and perhaps `reset(corridor, seen)`
-    and `close()`.
+    accelerations, (K,), or these and whether to merge, (2, K), and perhaps `reset(corridor, seen)`,
+    or `reset(corridor, seen, seed)`, and `close()`.
     """
 
     def __init__(
@@ -228,7 +229,9 @@ class BatchedVut(Driver):
                     self._renew_first = False
                 reset = getattr(self._object, "reset", None)
                 if reset is not None:
-                    deadline.call(corridor, reset, corridor, seen_at_start(case))
+                    begun = seen_at_start(case)
+                    again = partial(_reset, reset, seed=case.told_seed)
+                    deadline.call(corridor, again, corridor, begun)
         except BaseException as error:
             self._wrong[corridor] = f"reset: {self._deadline.reason(error)}"
 
@@ -346,6 +349,14 @@ def _made(target: type, spec: str, *arguments: int, **keywords: float) -> Any:
         given = f" with {arguments[0]} corridors" if arguments else " without arguments"
         what = f"{type(error).__name__}: {text_of(error)}"
         raise UserError(f"{spec} cannot be made{given}: {what}") from error
+
+
+def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
+    """Call a reset, with the seed of the episode where it takes one."""
+    if takes_seed(reset):
+        reset(*arguments, seed=seed)
+    else:
+        reset(*arguments)
 
 
 def _copied(target: Any, name: str) -> Any:

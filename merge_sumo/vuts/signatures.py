@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import os
 from collections.abc import Callable
+from functools import partial
 from inspect import Parameter
 from pathlib import Path
 from typing import Any, Final
@@ -14,7 +15,7 @@ from merge_sumo.system.printable import printable
 
 OF_ONE: Final = {"act": ("seen",), "reset": ("seen",), "close": ()}
 OF_A_BATCH: Final = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
-"""Methods of a VUT, and what each is called with."""
+"""Methods of a VUT, and what each is called with; a `reset` may have a `seed` besides."""
 _VARIABLE: Final[dict[object, str]] = {
     Parameter.VAR_POSITIONAL: "*",
     Parameter.VAR_KEYWORD: "**",
@@ -39,12 +40,27 @@ def check_methods(vut: Any) -> None:
         else:
             first = ("self",)
         if inspect.isfunction(method):
-            check_call(method, (*first, *arguments))
+            seeded = name == "reset" and takes_seed(method)
+            check_call(method, (*first, *arguments), seeded=seeded)
 
 
-def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None:
-    """Raise `UserError` where a function cannot be called with so many arguments in order."""
-    if fits(function, len(arguments)) in (True, None):
+def takes_seed(reset: Callable[..., Any]) -> bool:
+    """Return whether a `reset` has a parameter `seed`: then it is called with the episode's."""
+    try:
+        return "seed" in inspect.signature(reset).parameters
+    except (TypeError, ValueError):
+        return False
+
+
+def check_call(
+    function: Callable[..., Any], arguments: tuple[str, ...], *, seeded: bool = False
+) -> None:
+    """Raise `UserError` where a function cannot be called with so many arguments in order.
+
+    One that is `seeded` is called with `seed` besides.
+    """
+    known = partial(function, seed=0) if seeded else function
+    if fits(known, len(arguments)) in (True, None):
         return
     parameters = inspect.signature(function).parameters.values()
     name, count = printable(getattr(function, "__name__", "it")), len(parameters)

@@ -170,5 +170,5 @@ def test_decisions_that_add_coverage_come_first():
     sampler = RepeatedWhereItMatters(make_sampler("uniform", POOL, 1), 0.2, known=True)
     sampler.tell([Outcome(index, 0, case, fails) for index, case in enumerate(runs)])
     first, second, *_ = sampler.ask(4)
-    # By Jeffreys' prior a second failure decides: P(share > .2) = .976 with Beta(1.5, .5).
+    # By Jeffreys' prior a second failure decides: P(share > .2) = .959 with Beta(1.5, .5).
     assert (first, second) == (replace(far, draw=1), replace(beside, draw=1))

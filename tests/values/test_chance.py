@@ -90,7 +90,7 @@ def test_runs_are_counted_by_case_in_the_order_of_the_first_run():
     one, two = by_case(told)
     assert (one.case, one.runs, one.failures, one.share) == (CASE, 3, 2, 2 / 3)
     assert [outcome.index for outcome in one.outcomes] == [0, 2, 5]
-    assert one.shown().index == 5
+    assert one.deciding().index == 5
     assert (two.case, two.runs, two.failures) == (other, 2, 0)
     assert failing_cases(told) == [one]
     assert failing_cases(told, 0.66) == [one]
@@ -102,7 +102,7 @@ def test_without_repeats_each_outcome_with_a_verdict_is_a_case():
     """Also where a sampler proposes a case twice."""
     told = outcomes([(CASE, 0, FAILS), (CASE, 0, FAILS), (CASE, 0, None), (CASE, 0, PASSES)])
     assert [one.outcomes for one in by_case(told)] == [(told[0],), (told[1],), (told[3],)]
-    assert [one.shown() for one in failing_cases(told)] == [o for o in told if o.failed]
+    assert [one.deciding() for one in failing_cases(told)] == [o for o in told if o.failed]
 
 
 def test_the_interval_is_that_of_clopper_and_pearson():
@@ -124,16 +124,17 @@ def test_the_run_that_stands_for_a_case_fails_as_the_case_does():
     told = outcomes([*runs, (other, 0, None), (other, 1, PASSES)])
     assert [outcome.index for outcome in one_per_case(told)] == [2, 4, 5]
     assert [outcome.index for outcome in one_per_case(told, 0.5)] == [3, 4, 5]
+    assert [outcome.index for outcome in one_per_case(told, 0.25)] == [1, 4, 5]
     first = [outcome for outcome in told if not outcome.case.draw]
     assert one_per_case(first) == first
 
 
 def test_a_case_is_decided_by_the_posterior_of_its_runs():
-    # Beta(1.5, .5): P(share > .2) = .976; Beta(.5, 6.5): P(share > .2) = .083, Beta(.5, 8.5): .045.
+    # P(share > .2) is .959 with Beta(1.5, .5), .055 with Beta(.5, 8.5) and .042 with Beta(.5, 9.5).
     assert is_decided(1, 1, 0.2)
-    assert not is_decided(0, 6, 0.2)
-    assert is_decided(0, 8, 0.2)
-    assert (runs_needed(0, 0, 0.2), runs_needed(0, 6, 0.2)) == (1, 2)
+    assert not is_decided(0, 8, 0.2)
+    assert is_decided(0, 9, 0.2)
+    assert (runs_needed(0, 0, 0.2), runs_needed(0, 7, 0.2)) == (1, 2)
     assert runs_needed(3, 19, 0.2, most=19) == 0
     assert [runs_needed(failures, 5, 0.0) for failures in (0, 1)] == [1, 0]
 

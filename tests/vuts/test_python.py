@@ -6,8 +6,10 @@ from __future__ import annotations
 
 import json
 import pickle
+import random
 import re
 import sys
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import MAX_STEPS, US23
+from merge_sumo.values.scenario import MAX_STEPS, US23, VUT
 from merge_sumo.values.trajectory import End
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
@@ -323,3 +325,39 @@ def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     assert hashes[0] != hashes[1]
     built_in = CampaignSettings(vut="level0", levels=(0,), scenario=US23)
     assert record_of(built_in, resolve(built_in))["vut_files"] is None
+
+
+SEEDED = """
+import random
+class Vut:
+    def reset(self, seen, seed):
+        self.a_mps2 = random.Random(seed).uniform(0.0, 1.0)
+    def act(self, seen):
+        return self.a_mps2
+"""
+SEEDED_BATCH = """
+import random
+class Vut:
+    def __init__(self, corridors):
+        self.a_mps2 = [0.0] * corridors
+    def reset(self, corridor, seen, *, seed):
+        self.a_mps2[corridor] = random.Random(seed).uniform(0.0, 1.0)
+    def act_batch(self, seen):
+        return self.a_mps2
+"""
+
+
+@pytest.mark.parametrize("source", [SEEDED, SEEDED_BATCH])
+def test_a_controller_that_takes_a_seed_draws_anew_for_each_draw_and_the_same_again(vut, source):
+    first, *_ = cases_of(1)
+    second = replace(first, draw=1)
+    ran = run_cases(in_process(vut(source)), [first, second, first, second])
+    commands = [trajectory.motion[0, VUT, 2] for trajectory in ran]
+    drawn = [random.Random(case.told_seed).uniform(0.0, 1.0) for case in (first, second)]  # noqa: S311
+    assert commands == drawn * 2
+
+
+def test_a_reset_with_a_seed_and_no_place_for_what_it_sees_is_refused(vut):
+    source = SEEDED.replace("self, seen, seed", "self, seed")
+    with pytest.raises(UserError, match=r"reset\(self, seed\) takes 2 arguments"):
+        in_process(vut(source))

@@ -106,8 +106,8 @@ def numbers_from_json(content: bytes) -> dict[str, float]:
 _TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
 """What a VUT is told of its scenario, besides the acceleration lane."""
 _NO_LANE: Final = (math.nan, math.nan)
-_BEGIN: Final = struct.Struct(f"<I{len(_TOLD) + len(_NO_LANE)}d")
-"""Corridor, and what is told; position and speed of each vehicle follow."""
+_BEGIN: Final = struct.Struct(f"<II{len(_TOLD) + len(_NO_LANE)}d")
+"""Corridor, draw, and what is told; position and speed of each vehicle follow."""
 _HEAD: Final = struct.Struct("<IIIII")
 """Episodes that begin, corridors, vehicles, whether the cars that are met are told, and whether
 VUTs have merged."""
@@ -124,7 +124,7 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
     parts = [_HEAD.pack(len(begun), corridors, vehicles, *tells)]
     for corridor, case in begun:
         told = (getattr(case.scenario, name) for name in _TOLD)
-        parts.append(_BEGIN.pack(corridor, *told, *(lane_of(case.scenario) or _NO_LANE)))
+        parts.append(_BEGIN.pack(corridor, case.draw, *told, *(lane_of(case.scenario) or _NO_LANE)))
         parts.append(np.array(case.starts(), dtype=np.float64).tobytes())
     arrays = (scene.active, scene.step, scene.x_m, scene.v_mps, *optional)
     parts += [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
@@ -144,14 +144,14 @@ def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     at = _HEAD.size
     begun: list[tuple[int, Case]] = []
     for _ in range(count):
-        corridor, *told, begin_m, end_m = _BEGIN.unpack_from(content, at)
+        corridor, draw, *told, begin_m, end_m = _BEGIN.unpack_from(content, at)
         at += _BEGIN.size
         starts = np.frombuffer(content, np.float64, 2 * vehicles, at).reshape(vehicles, 2)
         at += starts.nbytes
         rows = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
         lane_m = None if math.isnan(begin_m) else (begin_m, end_m)
         scenario = _any_scenario(lane_m, *told)
-        begun.append((corridor, ToldCase(level=0, scenario=scenario, told=rows)))
+        begun.append((corridor, ToldCase(level=0, draw=draw, scenario=scenario, told=rows)))
     active = np.frombuffer(content, np.bool_, k, at)
     step = np.frombuffer(content, np.int64, k, at + k)
     at += 9 * k
