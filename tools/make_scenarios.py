@@ -51,7 +51,7 @@ def _case(
     v_pov0_mps: float,
     svo_rad: float | None = None,
     scenario: Scenario = US23,
-    **headways_s: float,
+    **headways_s: Any,
 ) -> Case:
     """Return a case with the VUT's own speed in its scenario."""
     return MergeCase(

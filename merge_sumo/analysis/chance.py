@@ -23,8 +23,7 @@ class ChanceSummary:
         both_ways: those of them that fail in some runs and pass in others.
         tolerated: the share of its runs in which a case may fail.
         failures: cases that fail in more than that.
-        undecided: failing cases that ran too seldom to tell; the failure by which a case was
-            noticed is not counted.
+        undecided: failing cases that ran too seldom to tell (`is_decided`).
     """
 
     runs: int
@@ -70,9 +69,7 @@ def chance_in(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> ChanceSumm
     untold = [
         one
         for one in failing
-        if tolerated
-        and one.runs < MOST_RUNS
-        and not is_decided(one.failures - 1, one.runs - 1, tolerated)
+        if tolerated and one.runs < MOST_RUNS and not is_decided(one.failures, one.runs, tolerated)
     ]
     return ChanceSummary(
         runs=sum(one.runs for one in cases),

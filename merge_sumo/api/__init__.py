@@ -131,7 +131,7 @@ from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.run_study import RunStudy, same_system
 from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
-from merge_sumo.studies.truth import Truth
+from merge_sumo.studies.truth import Repeats, Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
@@ -150,6 +150,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.workers import Workers, open_workers, workers_or_cores
+from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -729,6 +730,8 @@ def truth(
     cases: int | None = None,
     seed: int = 0,
     engine: str | None = None,
+    repeat: int | None = None,
+    tolerated: float = 0.0,
     **given: Unpack[StudyKeywords],
 ) -> Truth:
     """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
@@ -737,7 +740,15 @@ def truth(
         raise UserError(f"--level all does not go here: choose {ONE_LEVEL}")
     settings, runner = settings_for(vut, {**given, "level": level})
     with _study(settings, runner, engine) as study:
-        return study.truth(settings.levels[0], cases, seed)
+        repeats = _repeats_of(settings, repeat, tolerated)
+        return study.truth(settings.levels[0], cases, seed, repeats)
+
+
+def _repeats_of(settings: CampaignSettings, repeat: int | None, tolerated: float) -> Repeats | None:
+    """Return how often the cases of a truth run; None for once, also where nothing is random."""
+    most = repeat if repeat is not None else MOST_RUNS if tolerated else 1
+    repeats = Repeats(most, tolerated)
+    return repeats if repeats.most > 1 and settings.may_vary else None
 
 
 def truths(
@@ -747,6 +758,8 @@ def truths(
     cases: int | None = None,
     seed: int = 0,
     engine: str | None = None,
+    repeat: int | None = None,
+    tolerated: float = 0.0,
     **given: Unpack[StudyKeywords],
 ) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases; the same as `merge-sumo truth`.
@@ -758,6 +771,9 @@ def truths(
         seed: same seed, same cases.
         engine: "sumo", or "kinematic" for the equations of motion alone, with SUMO for at least one
             case of a hundred; by default "kinematic" where VUT and POV are of this package.
+        repeat: runs of a case, at most, each with another draw of what is random: it runs until it
+            is decided whether it fails. By default 1, or 20 where a share of the runs is tolerated.
+        tolerated: share of its runs in which a case may fail: it fails where more do.
         given: how a case is run and judged, and where: see `StudyKeywords`.
 
     A cached truth is used again. The truth of an object of this process is not kept: its name does
@@ -766,7 +782,8 @@ def truths(
     check_keywords("truths", given, StudyKeywords)
     settings, runner = settings_for(vut, {**given, "level": level})
     with _study(settings, runner, engine) as study:
-        by_level = {number: study.truth(number, cases, seed) for number in settings.levels}
+        repeats = _repeats_of(settings, repeat, tolerated)
+        by_level = {one: study.truth(one, cases, seed, repeats) for one in settings.levels}
     if study.plan.vut.vut.named_only and not is_here(settings.vut):
         warnings.warn(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
@@ -774,7 +791,7 @@ def truths(
             Notice,
             stacklevel=2,
         )
-    return TruthResult(settings.vut, by_level, settings.criterion)
+    return TruthResult(settings.vut, by_level, settings.criterion, tolerated)
 
 
 @contextmanager

@@ -390,11 +390,13 @@ class TruthResult(Result):
         truths: `Truth` by level: `points` in the unit cube, (n, d), their `score`, (n,), and the
             points of the `failures`, (m, d).
         criterion: what counts as a failure.
+        tolerated: share of its runs in which a case may fail.
     """
 
     vut: str
     truths: dict[int, Truth]
     criterion: Criterion
+    tolerated: float = 0.0
 
     @property
     def cases(self) -> int:
@@ -436,6 +438,7 @@ class TruthResult(Result):
                 "too_small": truth.is_small,
                 "fail_when": self.criterion.text,
                 "in_sumo": truth.in_sumo,
+                **self._runs_of(truth),
             }
             for level, truth in self.truths.items()
         ]
@@ -444,6 +447,11 @@ class TruthResult(Result):
         sums = {name: getattr(self, name) for name in ("cases", "failures", "fmc", "real_regions")}
         text = self.criterion.text
         return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": records}
+
+    def _runs_of(self, truth: Truth) -> dict[str, Any]:
+        if truth.runs is None:
+            return {}
+        return {"runs": truth.all_runs, "tolerated": self.tolerated}
 
     def lines(self) -> list[str]:
         """Return a line for each level, and any criterion but the default one in words."""
@@ -456,6 +464,11 @@ class TruthResult(Result):
                 f"{_regions_of(truth)}{_engine_of(truth)}"
             )
             lines += [f"  {remark}" for remark in truth.remarks()]
+            if truth.runs is not None:
+                said = f"more than {self.tolerated:.0%} of its runs do" if self.tolerated else ""
+                lines.append(
+                    f"  {truth.all_runs} runs; a case fails where {said or 'any of its runs does'}"
+                )
         if not self.criterion.is_papers:
             lines.append(f"  a case fails when {self.criterion.words}")
         return lines
@@ -471,7 +484,7 @@ def _regions_of(truth: Truth) -> str:
 
 def _engine_of(truth: Truth) -> str:
     """Return in words which cases SUMO did not run; "" where it ran all."""
-    if truth.in_sumo == len(truth.score):
+    if truth.in_sumo == truth.all_runs:
         return ""
     cases = counted(truth.in_sumo, "case")
     return f"; by the equations of motion, and {cases} in SUMO as well, all alike"

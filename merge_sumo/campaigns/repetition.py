@@ -220,8 +220,7 @@ class RepeatedWhereItMatters(RepeatingSampler):
         """Return how many further runs of a failing case its decision takes at least."""
         if not self._tolerated:
             return max(FEWEST - one.runs, 0)
-        # The failure by which the case was chosen says nothing of its probability.
-        return runs_needed(one.failures - 1, one.runs - 1, self._tolerated, MOST_RUNS - 1)
+        return runs_needed(one.failures, one.runs, self._tolerated)
 
     def _cases(self) -> list[RunsOfCase]:
         """Return the runs of the cases, whatever the order in which they were told."""

@@ -225,7 +225,9 @@ class CampaignSettings:
         if self.repeat == "auto" and self.may_vary:
             known = self.scenario.sense.is_random
             return RepeatedWhereItMatters(sampler, self.tolerated, known=known)
-        return sampler if self.repeat in (1, "auto") else EachCaseRepeated(sampler, self.repeat)
+        if isinstance(self.repeat, str) or self.repeat == 1:
+            return sampler
+        return EachCaseRepeated(sampler, self.repeat)
 
     @property
     def may_vary(self) -> bool:

@@ -26,9 +26,17 @@ TRUTH_CASES: Final = "10000, at level 2 20000"
 
 
 @app.verb(
-    options=("level", *SETUP, "dask", "quiet"),
+    options=("level", *SETUP, "tolerate", "dask", "quiet"),
     own={
         "cases": option(int | None, None, "Uniform cases of a level.", show_default=TRUTH_CASES),
+        "repeat": option(
+            int | None,
+            None,
+            "Run each case until it is decided whether it fails, so often at most, with another "
+            "draw of what is random.",
+            metavar="N",
+            show_default="1, with --tolerate 20",
+        ),
         "seed": SEED,
         "engine": option(
             str | None,
@@ -49,7 +57,12 @@ def truth(given: Given, vut: VutOption) -> None:
     and used again while all files that the VUT has loaded are the same. The output says how many
     cases SUMO has run where the kinematic engine ran the others.
 
+    With --tolerate, a case fails where more than that share of its runs do; it runs until that is
+    decided with 95 % probability, up to 20 times.
+
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
+
+    Example:  merge-sumo truth --vut design2 --level 1 --cases 200 --sense noise_x_m=2 --tolerate .2
     """
     from merge_sumo import api
 

@@ -123,9 +123,9 @@ class CaseResults(Sequence[CaseResult]):
 class CasesAt(Sequence[Case]):
     """Cases by their points in the unit cube, made when they run: they travel as numbers."""
 
-    def __init__(self, pool: Pool, level: int, points: FloatArray) -> None:
-        """Take points, (n, d), of a level of a pool."""
-        self.pool, self.level, self.points = pool, level, points
+    def __init__(self, pool: Pool, level: int, points: FloatArray, draw: int = 0) -> None:
+        """Take points, (n, d), of a level of a pool, and the draw of all."""
+        self.pool, self.level, self.points, self.draw = pool, level, points, draw
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -138,12 +138,13 @@ class CasesAt(Sequence[Case]):
     def __getitem__(self, place: int | slice) -> Case | CasesAt:
         """Return a case, or some of them."""
         if isinstance(place, slice):
-            return CasesAt(self.pool, self.level, self.points[place])
-        return self.pool.cases(self.points[place][None], self.level)[0]
+            return CasesAt(self.pool, self.level, self.points[place], self.draw)
+        return next(iter(CasesAt(self.pool, self.level, self.points[place][None], self.draw)))
 
     def __iter__(self) -> Iterator[Case]:
         """Make the cases."""
-        return iter(self.pool.cases(self.points, self.level))
+        cases = self.pool.cases(self.points, self.level)
+        return iter(cases if self.draw == 0 else [replace(case, draw=self.draw) for case in cases])
 
 
 Keep = Callable[[CaseResults], Sequence[R]]

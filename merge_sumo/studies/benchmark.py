@@ -25,7 +25,14 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.truth import DENSE_CASES, TRUTH_CASES, Truth, ground_truth, known_truth
+from merge_sumo.studies.truth import (
+    DENSE_CASES,
+    TRUTH_CASES,
+    Repeats,
+    Truth,
+    ground_truth,
+    known_truth,
+)
 from merge_sumo.system.printable import counted
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
@@ -447,7 +454,13 @@ class Study:
     on_part: OnPart = lambda *_: None
     engine: str | None = None
 
-    def truth(self, level: int, cases: int | None = None, seed: int = 0) -> Truth:
+    def truth(
+        self,
+        level: int,
+        cases: int | None = None,
+        seed: int = 0,
+        repeats: Repeats | None = None,
+    ) -> Truth:
         """Return the truth at a level, from the cache where it is kept."""
         total, ended = TRUTH_CASES[level] if cases is None else cases, 0
         size = "dense truth" if total == DENSE_CASES else "truth"
@@ -459,9 +472,8 @@ class Study:
             self.on_part(title, ended, total, "cases", "")
 
         plan = self.plan.at_level(level).with_engine(self.engine)
-        return ground_truth(
-            plan, level, total, seed, workers=self.workers, cache=self.cache, on_cases=ran
-        )
+        where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
+        return ground_truth(plan, level, total, seed, repeats=repeats, **where)
 
     def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:
         """Return the dense truths by level: made where `wanted`, where that is None the kept."""

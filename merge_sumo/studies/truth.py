@@ -25,7 +25,8 @@ from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.signature import CACHE, signed, user_key, verified
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.fmc import fmc, growth_bound, has_neighbour, radius_for, regions
+from merge_sumo.values.chance import MOST_RUNS, check_tolerated, is_decided
+from merge_sumo.values.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
 from merge_sumo.values.scenario import OWN, Scenario
 from merge_sumo.values.score import FAILURE_SCORE
 
@@ -34,7 +35,9 @@ TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 DENSE_CASES: Final = 1_000_000
 """Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
 COLUMNS: Final = ("points", "score", "in_sumo")
-"""Arrays of a truth in the cache."""
+"""Arrays of a truth in the cache,"""
+COUNTS: Final = ("runs", "failed_runs")
+"""and those of one whose cases ran several times."""
 MOST_FILES_BYTES: Final = 1 << 26
 """Of a truth, besides its numbers: names and hashes of files."""
 PROGRESS_CASES: Final = 100
@@ -56,18 +59,28 @@ class Truth:
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        score: that of the criterion, P for the paper's, (n,), NaN without a verdict.
-        in_sumo: number of cases that SUMO ran; by default all.
+        score: that of the criterion, P for the paper's, (n,), NaN without a verdict; of cases that
+            ran several times that of the deciding run (`RunsOfCase.deciding`).
+        in_sumo: number of runs in SUMO; by default all.
+        runs: runs with a verdict of each case, (n,), where chance was looked for.
+        failed_runs: those of them that failed, (n,).
     """
 
     points: FloatArray
     score: FloatArray
     in_sumo: int = -1
+    runs: IntArray | None = None
+    failed_runs: IntArray | None = None
 
     def __post_init__(self) -> None:
         """Count the cases."""
         if self.in_sumo < 0:
-            object.__setattr__(self, "in_sumo", len(self.score))
+            object.__setattr__(self, "in_sumo", self.all_runs)
+
+    @property
+    def all_runs(self) -> int:
+        """Number of runs of all cases."""
+        return len(self.score) if self.runs is None else int(self.runs.sum())
 
     @property
     def failures(self) -> FloatArray:
@@ -123,6 +136,25 @@ class Truth:
         return [group for group in groups if len(group) >= REAL_REGION * len(points)]
 
 
+@dataclass(frozen=True, slots=True)
+class Repeats:
+    """How often a case of a truth runs: until it is decided whether it fails.
+
+    Attributes:
+        most: runs of a case, at most.
+        tolerated: share of them that may fail.
+    """
+
+    most: int = MOST_RUNS
+    tolerated: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check that the numbers mean something."""
+        check_tolerated(self.tolerated)
+        if self.most < 1:
+            raise UserError(f"--repeat is {self.most}: it must be 1 or more")
+
+
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
 
@@ -133,6 +165,7 @@ def ground_truth(
     cases: int | None = None,
     seed: int = 0,
     *,
+    repeats: Repeats | None = None,
     workers: Workers | None = None,
     cache: Path | None = None,
     on_cases: OnCases | None = None,
@@ -153,6 +186,7 @@ def ground_truth(
         level: POV level.
         cases: uniform cases; by default those of the paper at the level.
         seed: of their points.
+        repeats: how often a case runs; by default once.
         workers: where they run, by default in this process.
         cache: folder of truths, by default the user's.
         on_cases: told how many cases have just ended.
@@ -165,7 +199,8 @@ def ground_truth(
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
-    kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
+    of_runs = {} if repeats is None else asdict(repeats)
+    kept = TruthKey({**plan.key(level), **of_runs}, level, count, seed, plan.engine)
     known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
     if known is not None:
         return known
@@ -175,12 +210,41 @@ def ground_truth(
     key = user_key()
     dims = len(plan.scenario.dimensions(level))
     points = np.random.default_rng([seed, level]).random((count, dims))
-    truth, files = _run(plan, level, points, workers, on_cases)
-    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
+    told = _Told(count, on_cases)
+    if repeats is None:
+        truth, files = _run(plan, level, points, workers, told)
+    else:
+        truth, files = _run_repeatedly(plan, level, points, repeats, workers, told)
+    told.end()
+    names = COLUMNS if truth.runs is None else (*COLUMNS, *COUNTS)
+    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in names}
     np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
     make_place(path.parent, CACHE)
     replace_own(path, signed(arrays.getvalue(), path.stem, key))
     return truth
+
+
+class _Told:
+    """Tells a person how many cases have ended: some at a time, and the rest in the end."""
+
+    def __init__(self, cases: int, on_cases: OnCases | None) -> None:
+        self._cases, self._on_cases, self._ended, self._said = cases, on_cases, 0, 0
+
+    def ended(self, cases: int = 1) -> None:
+        """Count cases that have ended."""
+        self._ended += cases
+        if self._ended - self._said >= PROGRESS_CASES:
+            self._say(self._ended)
+
+    def end(self) -> None:
+        """Say what is left."""
+        if self._said < self._cases:
+            self._say(self._cases)
+
+    def _say(self, ended: int) -> None:
+        if self._on_cases is not None:
+            self._on_cases(ended - self._said)
+        self._said = ended
 
 
 def _run(
@@ -188,23 +252,61 @@ def _run(
     level: int,
     points: FloatArray,
     workers: Workers | None,
-    on_cases: OnCases | None,
+    told: _Told | None,
+    draw: int = 0,
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
     pool, count = Pool(levels=(level,), scenario=plan.scenario), len(points)
     scores = np.full(count, np.nan)
     plan = plan.at_level(level)
     files = (plan.vut.files or {}) | plan.povs.files
-    scored = evaluate(plan, CasesAt(pool, level, points), workers, _scores)
+    scored = evaluate(plan, CasesAt(pool, level, points, draw), workers, _scores)
     in_sumo = 0
-    for ended, (place, (score, by_sumo, loaded)) in enumerate(scored, start=1):
+    for place, (score, by_sumo, loaded) in scored:
         scores[place] = score
         in_sumo += by_sumo
         for name, sha256 in loaded.items():
             files.setdefault(name, sha256)
-        if on_cases is not None and (ended % PROGRESS_CASES == 0 or ended == count):
-            on_cases((ended - 1) % PROGRESS_CASES + 1)
+        if told is not None:
+            told.ended()
     return Truth(points, scores, in_sumo), files
+
+
+def _run_repeatedly(
+    plan: SimulationPlan,
+    level: int,
+    points: FloatArray,
+    repeats: Repeats,
+    workers: Workers | None,
+    told: _Told,
+) -> tuple[Truth, Files]:
+    """Run the cases at points, (n, d), draw by draw, each until it is decided whether it fails."""
+    scores = np.full((repeats.most, len(points)), np.nan)
+    runs, failed = np.zeros((2, len(points)), dtype=np.int64)
+    open_, in_sumo, files = np.arange(len(points)), 0, Files()
+    for draw in range(repeats.most):
+        ran, loaded = _run(plan, level, points[open_], workers, None, draw)
+        files, in_sumo = {**loaded, **files}, in_sumo + ran.in_sumo
+        scores[draw, open_] = ran.score
+        runs[open_] += ~np.isnan(ran.score)
+        failed[open_] += ran.score < FAILURE_SCORE
+        pairs = zip(failed[open_].tolist(), runs[open_].tolist(), strict=True)
+        decided = [n > 0 and is_decided(k, n, repeats.tolerated) for k, n in pairs]
+        told.ended(sum(decided))
+        open_ = open_[~np.array(decided)]
+        if not len(open_):
+            break
+    # NaN, of what did not run or has no verdict, comes last.
+    spared = _spared(runs, repeats.tolerated)
+    score = np.sort(scores, axis=0)[spared, np.arange(len(points))]
+    return Truth(points, score, in_sumo, runs, failed), files
+
+
+def _spared(runs: IntArray, tolerated: float) -> IntArray:
+    """Return how many failing runs of each case are tolerated, (n,)."""
+    numbers = np.arange(1, runs.max(initial=1) + 1)
+    tolerable = numbers[:, None] / np.maximum(runs, 1) <= tolerated
+    return np.asarray(tolerable.sum(axis=0), dtype=np.int64)
 
 
 def known_truth(
@@ -270,11 +372,13 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     """
     dims = len(scenario.dimensions(level))
     try:
-        content = _signed_content(path, most_bytes=8 * cases * (dims + 1) + MOST_FILES_BYTES)
+        numbers_bytes = 8 * cases * (dims + 1 + len(COUNTS))
+        content = _signed_content(path, most_bytes=numbers_bytes + MOST_FILES_BYTES)
         if content is None:
             return None
-        data = read_arrays(io.BytesIO(content), *COLUMNS, "files", "of")
+        data = read_arrays(io.BytesIO(content))
         points, score, in_sumo = (data[name] for name in COLUMNS)
+        counts = [data[name] for name in COUNTS if name in data]
         files = decode(str(data["files"]), dict[str, str | None])
         if str(data["of"]) != path.stem or changed(files):
             return None
@@ -282,12 +386,16 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         return None
     fits = points.shape == (cases, dims) and score.shape == (cases,)
     numbers = points.dtype == score.dtype == np.float64
-    counted = in_sumo.shape == () and in_sumo.dtype == np.int64 and 0 <= in_sumo <= cases
+    counted = in_sumo.shape == () and in_sumo.dtype == np.int64 and in_sumo >= 0
     if not (fits and numbers and counted):
         return None
     inside = bool(((points >= 0.0) & (points <= 1.0)).all())
     scores = not (np.isinf(score) | (score > 0.0)).any()
-    return Truth(points, score, int(in_sumo)) if inside and scores else None
+    counts_fit = all(c.shape == (cases,) and c.dtype == np.int64 and (c >= 0).all() for c in counts)
+    if not (inside and scores and counts_fit and len(counts) in (0, len(COUNTS))):
+        return None
+    truth = Truth(points, score, int(in_sumo), *counts)
+    return truth if truth.in_sumo <= truth.all_runs else None
 
 
 def _signed_content(path: Path, most_bytes: int) -> bytes | None:

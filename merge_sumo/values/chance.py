@@ -129,11 +129,13 @@ def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Ou
 def is_decided(failures: int, runs: int, tolerated: float) -> bool:
     """Return whether runs show if a case fails in more than a tolerated share of its runs.
 
-    By the posterior of Jeffreys' prior. With none tolerated a failure decides, and nothing else.
+    By the posterior of Jeffreys' prior. The first failure is left out: by it the case was noticed.
+    With none tolerated a failure decides, and nothing else.
     """
     if not tolerated:
         return failures > 0
-    below = float(betainc(failures + 0.5, runs - failures + 0.5, tolerated))
+    further = max(failures - 1, 0)
+    below = float(betainc(further + 0.5, runs - failures + 0.5, tolerated))
     return not DOUBT < below < 1.0 - DOUBT
 
 

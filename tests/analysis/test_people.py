@@ -147,7 +147,7 @@ class TestFailuresBesidePeople:
 
     def test_are_all_inside_where_the_figures_are_of_faster_roads(self):
         roundabout = named_scenario("roundabout")
-        start = {"x_pov0_m": -50.0, "v_pov0_mps": 8.0, "v_vut0_mps": 6.0}
+        start: dict[str, Any] = {"x_pov0_m": -50.0, "v_pov0_mps": 8.0, "v_vut0_mps": 6.0}
         case = MergeCase(level=1, scenario=roundabout, **start)
         found = beside_people([replace(failing(0, 4.0), case=case)])
         assert (found.inside, found.places, found.findings) == (1, {}, [])

@@ -8,6 +8,7 @@ import math
 import os
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,8 +27,10 @@ CHECK = Path(__file__).with_name("commonroad_check.py")
 
 def episode(scenario: Scenario = US23, rows: int = 3) -> Trajectory:
     """Return an episode in which all keep their speeds."""
-    more = {"headway_ahead_s": 1.0, "headway_behind_s": 1.0} if scenario.vehicles > 2 else {}
-    speeds = {
+    more: dict[str, Any] = (
+        {"headway_ahead_s": 1.0, "headway_behind_s": 1.0} if scenario.vehicles > 2 else {}
+    )
+    speeds: dict[str, Any] = {
         "v_pov0_mps": min(30.0, scenario.v_start_max_mps),
         "v_vut0_mps": scenario.bounds("v_vut0_mps")[0],
     }

@@ -131,11 +131,14 @@ def test_the_run_that_stands_for_a_case_fails_as_the_case_does():
 
 def test_a_case_is_decided_by_the_posterior_of_its_runs():
     # P(share > .2) is .959 with Beta(1.5, .5), .055 with Beta(.5, 8.5) and .042 with Beta(.5, 9.5).
-    assert is_decided(1, 1, 0.2)
+    # Beta(.5, .5), of a case that failed once, leaves .705.
+    assert not is_decided(1, 1, 0.2)
+    assert is_decided(2, 2, 0.2)
     assert not is_decided(0, 8, 0.2)
     assert is_decided(0, 9, 0.2)
-    assert (runs_needed(0, 0, 0.2), runs_needed(0, 7, 0.2)) == (1, 2)
-    assert runs_needed(3, 19, 0.2, most=19) == 0
+    assert is_decided(1, 10, 0.2)
+    assert (runs_needed(1, 1, 0.2), runs_needed(0, 7, 0.2), runs_needed(1, 8, 0.2)) == (1, 2, 2)
+    assert (runs_needed(4, 19, 0.2), runs_needed(4, 20, 0.2)) == (1, 0)
     assert [runs_needed(failures, 5, 0.0) for failures in (0, 1)] == [1, 0]
 
 
