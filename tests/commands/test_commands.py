@@ -68,7 +68,7 @@ class TestOptions:
         }
         assert set(COMMANDS) == has["as_json"]
         again = {"crosscheck", "explain", "repair", "stress"}
-        fresh = {*again, "failures-per-merge", "probability"}
+        fresh = {*again, "benchmark", "failures-per-merge", "probability"}
         runs_cases = {"campaign", "certify", "compare", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}
