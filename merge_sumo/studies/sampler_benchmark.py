@@ -104,7 +104,12 @@ class BenchmarkSettings:
     @property
     def curve(self) -> tuple[int, ...]:
         """The numbers of cases at which curves have points."""
-        return (*(n for n in CURVE if n < self.cases), self.cases)
+        return curve_of(self.cases)
+
+
+def curve_of(cases: int) -> tuple[int, ...]:
+    """Return the numbers of cases at which the curve of a search of so many has points."""
+    return (*(n for n in CURVE if n < cases), cases)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,12 +197,11 @@ def _run_search(task: Task) -> Found:
                 failures += [_row(outcome) for outcome in outcomes if outcome.failed]
     except SamplerFaultError as error:
         fault = str(error)
-    settings = BenchmarkSettings(seeds=1, cases=task.cases, problems=(problem,), limit_s=1.0)
     return Found(
         task=task,
         ran=ran,
         failures=failures,
-        fmc=[(n, fmc_of(failures, n)) for n in settings.curve],
+        fmc=[(n, fmc_of(failures, n)) for n in curve_of(task.cases)],
         cases_to_most=cases_to(MOST * truth.fmc, failures),
         sampler_s=round(watch.cpu_s, 3),
         fault=fault,
@@ -232,12 +236,11 @@ def _row(outcome: Outcome) -> list[float]:
 
 def _lost(task: Task) -> Found:
     """Return what is recorded of a search that ended its worker each time."""
-    settings = BenchmarkSettings(seeds=1, cases=task.cases, problems=(), limit_s=1.0)
     return Found(
         task=task,
         ran=0,
         failures=[],
-        fmc=[(n, 0.0) for n in settings.curve],
+        fmc=[(n, 0.0) for n in curve_of(task.cases)],
         cases_to_most=None,
         sampler_s=0.0,
         fault="it ended its process each time, or did not return from native code",
