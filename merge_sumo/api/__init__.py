@@ -129,6 +129,7 @@ from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.entrants import LIMIT_S, check_spec
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
+from merge_sumo.studies.parameter_ranges import Range, default_ranges
 from merge_sumo.studies.run_study import RunStudy, same_system
 from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
 from merge_sumo.studies.truth import Repeats, Truth
@@ -1147,7 +1148,7 @@ def repair(
     mending.require_optuna()
     if cost not in list(mending.Cost):
         raise UserError(f"--cost is {cost!r}: choose {' or '.join(mending.Cost)}")
-    ranges = tuple(map(mending.Range.parsed, params))
+    ranges = tuple(map(Range.parsed, params))
     asked = mending.RepairSettings(ranges, mending.Cost(cost), trials, rounds, cases, seed)
     before = _opened(run).run
     folder = dated(f"repair-{before.folder.name}") if out is None else Path(out)
@@ -1230,6 +1231,8 @@ def _fresh_campaign(
 def explain(
     run: AnyRun,
     indices: Iterable[int] | int = (),
+    *,
+    params: Iterable[str] = (),
     **given: Unpack[RerunKeywords],
 ) -> ExplanationResult:
     """Find the smallest changes with which failures pass; the same as `merge-sumo explain`.
@@ -1237,6 +1240,8 @@ def explain(
     Args:
         run: the campaign, or its folder, into which `explanations.jsonl` is written.
         indices: its failures; the ten that the report lists by default.
+        params: parameters of the controller with the ranges that are searched, "headway_s=0.5..3";
+            by default those of a VUT of this package, from half of today's value to double.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """
@@ -1245,9 +1250,11 @@ def explain(
     target = before.folder / explanation.EXPLANATIONS
     check_own(target)
     chosen = explanation.listed_failures(before, _listed(indices))
+    asked = tuple(map(Range.parsed, params))
     with _study_of(before, given, "explained", len(chosen), "failures", engine=None) as study:
         found = explanation.explain(
             *(before, study.settings, study.plan, chosen),
+            ranges=asked or default_ranges(study.plan.vut),
             workers=study.workers,
             on_failures=study.on_cases,
         )

@@ -29,6 +29,12 @@ from merge_sumo.values.score import Outcome
 AGAINST: Final = "against"
 """Folder of the earlier version, and the key of `campaign.json` that names that."""
 
+FIRST_BATCH: Final = 5
+"""Cases of each level in the first batch where twins predict, which they do from four cases on.
+Measured with design2 and design2?x1_m=120 at level 2, seeds 0 to 4: after 40 cases .81 of what
+broke is found in the median, and .69 with ten.
+"""
+
 BothBatches = tuple[Batch, Batch]
 """The same cases with the new version and with the earlier one."""
 
@@ -81,7 +87,7 @@ class PairedSearch:
         sampler = self._sampler
         number, first = (0, 0) if last is None else (last.batch + 1, last.index + 1)
         while first < cases and not (self._stop is not None and self._stop(sampler.observed())):
-            proposed = sampler.ask(min(batch or sampler.batch_size(), cases - first))
+            proposed = sampler.ask(min(batch or self._batch_size(first), cases - first))
             foretold = [sampler.prediction(place) for place in range(len(proposed))]
             unknown = [None] * len(proposed)
             # The simulator of the version that ran last is still open.
@@ -93,6 +99,13 @@ class PairedSearch:
             self.tell(new, old)
             yield new, old
             number, first = number + 1, first + len(proposed)
+
+    def _batch_size(self, ran: int) -> int:
+        """Return the size of the next batch, after so many cases."""
+        size = self._sampler.batch_size()
+        if ran or self._twins is None:
+            return size
+        return min(size, FIRST_BATCH * len(self._sampler.pool.levels))
 
 
 def _batch(

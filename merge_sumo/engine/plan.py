@@ -6,6 +6,7 @@ import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from enum import StrEnum
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -44,7 +45,13 @@ def versions() -> dict[str, str]:
     """
     extensions = sorted({*MEASURES.packages, *CRITERIA.packages})
     packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn", *extensions)
-    return {"python": platform.python_version()} | {name: version(name) for name in packages}
+    return {"python": platform.python_version()} | {name: _installed(name) for name in packages}
+
+
+@cache
+def _installed(package: str) -> str:
+    """Return the version of a package, as it was when this process first asked: it is loaded."""
+    return version(package)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -20,6 +20,8 @@ from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.studies.explanation import in_sentences
+from merge_sumo.studies.parameter_ranges import Range
+from merge_sumo.system.records import to_plain
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import Measure
@@ -181,7 +183,7 @@ def _share_range(place: Place | None) -> tuple[float, float] | None:
 
 
 def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:
-    """Return by index the sentences on a failure, and its changes by coordinate."""
+    """Return by index the sentences on a failure, and its changes by coordinate and parameter."""
     found = {}
     for o in facts.shown:
         known = facts.explanations.get(o.index)
@@ -192,6 +194,10 @@ def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:
                     one.field: [one.lowest, one.below, one.above, one.highest]
                     for one in known.alone
                 },
+                "parameters": [
+                    {**to_plain(one), "digits": max(0, Range(one.name, one.low, one.high).digits)}
+                    for one in known.parameters
+                ],
             }
     return found
 

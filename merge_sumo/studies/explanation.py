@@ -9,6 +9,7 @@ last digit with which its coordinate is written, so that what a sentence says ha
 - *Together*: all coordinates move. The nearest pass in the unit cube is searched for in balls that
   shrink to it, and near what was found: no proof that nothing is nearer.
 - *Other POVs*: the same start with each other level, and at level 2 with values of psi.
+- *Parameters* of the controller, one at a time: see `parameter_changes`.
 
 A case passes where it has a verdict and does not fail. What is said of a case runs a second time,
 in SUMO.
@@ -28,6 +29,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Annotated, Final
 
+import msgspec
 import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
@@ -35,10 +37,17 @@ from numpy.typing import NDArray
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.campaigns.store import Run, failures, spread_failures
-from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
+from merge_sumo.engine.evaluate import evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.counterfactuals import Avoidance
+from merge_sumo.studies.parameter_changes import (
+    ParameterChange,
+    in_words,
+    parameter_changes,
+    pass_of,
+)
+from merge_sumo.studies.parameter_ranges import Range, check_names, todays_values
 from merge_sumo.studies.run_study import same_system
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, to_plain
@@ -120,6 +129,7 @@ class Explanation(Record, frozen=True):
             those of the unit cube. None where no start passes that was tried.
         povs: the POVs that were tried in the place of the case's.
         cases: cases that ran for it.
+        parameters: by parameter of the controller, where these were searched.
     """
 
     index: Annotated[int, Meta(ge=0)]
@@ -127,6 +137,7 @@ class Explanation(Record, frozen=True):
     together: dict[str, float] | None
     povs: tuple[OtherPov, ...]
     cases: Annotated[int, Meta(ge=0)]
+    parameters: tuple[ParameterChange, ...] = ()
 
 
 def changed(case: Case, changes: Mapping[str, float]) -> Case:
@@ -152,6 +163,8 @@ def read_explanations(run: Run) -> dict[int, Explanation]:
             *fields
         }:
             raise UserError(f"{path} is not as it was written: case {index} has other coordinates")
+        if not all(change.low < change.high for change in one.parameters):
+            raise UserError(f"{path} is not as it was written: case {index} has an empty range")
     return known
 
 
@@ -205,6 +218,7 @@ def explain(
     plan: SimulationPlan,
     chosen: Sequence[Outcome],
     *,
+    ranges: Sequence[Range] = (),
     workers: Workers | None = None,
     on_failures: Callable[[int], None] = lambda _: None,
 ) -> list[Explanation]:
@@ -215,22 +229,27 @@ def explain(
         settings: those of the campaign, except for what may be elsewhere.
         plan: that of the settings, with the engine on which the search runs.
         chosen: the failures.
+        ranges: parameters of the controller that are searched, too, with their ranges.
         workers: where cases run, by default in this process.
         on_failures: told how many have just been explained; those are in the folder.
 
     Raises:
-        UserError: for a campaign with a net or policies of another day, without a failure, and
-            where a case that is run a second time ends otherwise.
+        UserError: for a campaign with a net or policies of another day, without a failure, for a
+            parameter that the controller does not have, and where a case that is run a second time
+            ends otherwise.
     """
     same_system(run, record_of(settings, plan))
     if not chosen:
         raise UserError(f"{run.folder} has no failure: nothing can be explained")
+    check_names(ranges)
+    todays_values(plan.vut, ranges)
     # Without SUMO many cases at a time cost little; with it, each failure is kept as it is done.
     size = len(chosen) if plan.engine is Engine.KINEMATIC else 1
     found: list[Explanation] = []
     with workers_or_here(workers) as opened:
         for first in range(0, len(chosen), size):
-            some = _found(plan, chosen[first : first + size], opened)
+            part = chosen[first : first + size]
+            some = _with_parameters(plan, part, _found(plan, part, opened), ranges, opened)
             _write(run, some)
             found += some
             on_failures(len(some))
@@ -262,6 +281,26 @@ def _found(
         check()
     _confirm(plan, chosen, found, workers)
     return found
+
+
+def _with_parameters(
+    plan: SimulationPlan,
+    chosen: Sequence[Outcome],
+    found: Sequence[Explanation],
+    ranges: Sequence[Range],
+    workers: Workers | None,
+) -> list[Explanation]:
+    """Return explanations with the smallest change of each parameter."""
+    if not ranges:
+        return list(found)
+    cases = {outcome.index: outcome.case for outcome in chosen}
+    changes, counts = parameter_changes(plan, cases, ranges, workers)
+    return [
+        msgspec.structs.replace(
+            one, parameters=changes[one.index], cases=one.cases + counts[one.index]
+        )
+        for one in found
+    ]
 
 
 def _by_index(asked: Mapping[int, Sequence[Case]], passes: Sequence[bool]) -> dict[int, list[bool]]:
@@ -303,11 +342,7 @@ def _passes(plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None
     """Return of each case whether it passes."""
     if not cases:
         return []
-    return [passed for _, passed in sorted(evaluate(plan, cases, workers, keep=_passed))]
-
-
-def _passed(results: CaseResults) -> list[bool]:
-    return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
+    return [passed for _, passed in sorted(evaluate(plan, cases, workers, keep=pass_of))]
 
 
 def claims(explanation: Explanation, case: Case) -> Iterator[tuple[Case, bool]]:
@@ -594,7 +629,7 @@ def in_sentences(
     sentences = [*_alone_in_words(explanation, named), *_together_in_words(explanation, named)]
     if explanation.povs:
         sentences.append(_povs_in_words(explanation.povs))
-    return [*sentences, *_last_moment(outcome, avoidance)]
+    return [*sentences, *in_words(explanation.parameters), *_last_moment(outcome, avoidance)]
 
 
 def amount(coordinate: Coordinate, change: float) -> str:

@@ -45,18 +45,16 @@ from merge_sumo.campaigns.store import OUTCOMES, Run, spread_failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.studies.parameter_ranges import Range, check_names, spec_with, todays_values
 from merge_sumo.studies.versions import Change, RunComparison
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import add_to, make_folder, replace_own
-from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, decode, to_plain
-from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.score import Outcome
-from merge_sumo.vuts.base import with_options
-from merge_sumo.vuts.registry import VutFactory, parameters_of
+from merge_sumo.vuts.registry import VutFactory
 
 if TYPE_CHECKING:
     import optuna
@@ -71,8 +69,6 @@ DEFAULT_TRIALS: Final = 60
 DEFAULT_ROUNDS: Final = 3
 SHARE: Final = 0.2
 """Share of the passing cases, besides near misses, that run in each trial."""
-DIGITS: Final = 3
-"""A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
 COST_STEP: Final = 0.1
 """Extra costs are compared in steps of 0.1 s, or of 0.1 m/s2. Chosen, not tuned."""
 BISECTIONS: Final = 4
@@ -99,40 +95,6 @@ class Cost(StrEnum):
 
 MEASURED_BY: Final = {Cost.TIME: ("t_end_s", "s"), Cost.BRAKING: ("vut_max_brake_mps2", "m/s2")}
 """The measure of a cost, whose mean over the cases is compared, and its unit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Range:
-    """The values that a parameter may take.
-
-    Attributes:
-        name: the parameter.
-        low: its least value.
-        high: its largest value.
-    """
-
-    name: str
-    low: float
-    high: float
-
-    @classmethod
-    def parsed(cls, text: str) -> Range:
-        """Return the range of NAME=LOW..HIGH; `UserError` for what is none."""
-        name, _, bounds = text.partition("=")
-        try:
-            low, high = map(float, bounds.split("..", 1))
-        except ValueError:
-            low = high = math.nan
-        if not name.strip() or not (math.isfinite(low) and math.isfinite(high)):
-            raise UserError(f"--param {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
-        if not low < high:
-            raise UserError(f"--param {text}: the range is empty: give the lower end first")
-        return cls(name.strip(), low, high)
-
-    def rounded(self, value: float) -> float:
-        """Return a value of the range with few digits."""
-        digits = DIGITS - math.floor(math.log10(self.high - self.low))
-        return min(max(round(value, digits), self.low), self.high)
 
 
 Index = Annotated[int, Meta(ge=0)]
@@ -191,13 +153,10 @@ class RepairSettings:
 
     def __post_init__(self) -> None:
         """Raise `UserError` for values that make no search."""
-        names = [one.name for one in self.ranges]
-        if not names:
+        if not self.ranges:
             raise UserError("name what may change: --param NAME=LOW..HIGH")
-        for name in names:
-            if names.count(name) > 1:
-                raise UserError(f"--param {name} is given twice: give each parameter once")
-        least = 1 + 2 * len(names)
+        check_names(self.ranges)
+        least = 1 + 2 * len(self.ranges)
         for option, number, lowest in (
             ("trials", self.trials, least),
             ("rounds", self.rounds, 1),
@@ -318,15 +277,6 @@ def change_of(
     return sum(abs(values[r.name] - today[r.name]) / (r.high - r.low) for r in ranges)
 
 
-def spec_with(
-    vut: str, values: Mapping[str, float], today: Mapping[str, float] | None = None
-) -> str:
-    """Return the spec of a controller with values of its parameters, but not with `today`'s."""
-    known = today or {}
-    changed = {name: f"{v:.12g}" for name, v in values.items() if known.get(name) != v}
-    return with_options(vut, changed) if changed else vut
-
-
 def fresh_settings(
     today: CampaignSettings, asked: RepairSettings, spec: str, number: int
 ) -> CampaignSettings:
@@ -354,28 +304,6 @@ def require_optuna() -> None:
     """Raise `UserError` where optuna is not installed."""
     if find_spec("optuna") is None:
         raise UserError("repair needs optuna: run `pip install 'merge-sumo[repair]'`")
-
-
-def todays_values(vut: VutFactory, ranges: Sequence[Range]) -> dict[str, float]:
-    """Return today's values of the parameters; `UserError` where one is unknown or out of range."""
-    known = parameters_of(vut)
-    is_sumo = vut.vut.vut_type is not None
-    for one in ranges:
-        if one.name not in known and is_sumo:
-            raise UserError(
-                f"--param {one.name}: its value today is not known; name it, as in "
-                f"--vut {quoted(spec_with(vut.spec, {one.name: one.low}))}"
-            )
-        if one.name not in known:
-            hint = meant(one.name, known)
-            names = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
-            raise UserError(f"--param {one.name}: {vut.spec} has no such parameter: {names}")
-        if not one.low <= known[one.name] <= one.high:
-            raise UserError(
-                f"--param {one.name}={one.low:g}..{one.high:g}: it is {known[one.name]:g} today, "
-                "which is not in that range: give a range around it"
-            )
-    return {one.name: float(known[one.name]) for one in ranges}
 
 
 class RepairJournal:

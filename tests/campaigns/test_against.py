@@ -117,7 +117,7 @@ class TestBytes:
             run_campaign(settings(), Path("run"), check=stop)
         ran = len(Run(Path("run")).outcomes)
         # The batch of the old version is written first: here the new one's was not.
-        kept = (Path("run") / OUTCOMES).read_bytes().splitlines(keepends=True)[:10]
+        kept = (Path("run") / OUTCOMES).read_bytes().splitlines(keepends=True)[:5]
         (Path("run") / OUTCOMES).write_bytes(b"".join(kept))
         assert len(kept) < ran == len(Run(Path("run") / AGAINST).outcomes)
         resume_campaign(Path("run"))

@@ -38,6 +38,7 @@ from merge_sumo.studies.explanation import (
     OtherPov,
     in_sentences,
 )
+from merge_sumo.studies.parameter_changes import ParameterChange
 from merge_sumo.studies.versions import compare_runs
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.scenario import POV, US23
@@ -829,7 +830,8 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         Alone("v_pov0_mps", 0.06, -5.0, 5.0, -0.4, None),
     )
     povs = (OtherPov(0, None, True), OtherPov(2, 0.3, False))
-    known = Explanation(first.index, alone, {"x_pov0_m": -3.1}, povs, 400)
+    gap = ParameterChange("gap_m", 16.2, 8.1, 32.4, below=14.1)
+    known = Explanation(first.index, alone, {"x_pov0_m": -3.1}, povs, 400, (gap,))
     line = json.dumps(to_plain(known))
     (run.folder / EXPLANATIONS).write_text(f"{line}\n", encoding="utf-8")
     sentences = in_sentences(known, first)
@@ -843,7 +845,8 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         assert "It passes if the POV starts 3.1 m further back, 0.40 m/s slower" in sentences[0]
         texts = page.locator("#why-changes text:not(.edge)").all_text_contents()
         x, v = (f"{first.case.x_pov0_m:.1f}".replace("-", "\u2212"), first.case.v_pov0_mps)
-        assert texts == [f"x_POV0 {x} m", "\u22123.1", "+12.0", f"v_POV0 {v:.2f} m/s", "\u22120.40"]
+        of_start = [f"x_POV0 {x} m", "\u22123.1", "+12.0", f"v_POV0 {v:.2f} m/s", "\u22120.40"]
+        assert texts == [*of_start, "vut: gap_m 16.2", "\u22122.10"]
         # What fails is between the two changes that pass: 15.1 m of the 36 m that are drawn.
         stuck, track = (page.locator(f"#why-changes .{name}").first for name in ("stuck", "track"))
         assert _box(stuck)["width"] / _box(track)["width"] == pytest.approx(15.1 / 36.0, abs=0.01)

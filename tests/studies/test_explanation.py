@@ -28,6 +28,8 @@ from merge_sumo.studies.explanation import (
     in_sentences,
     read_explanations,
 )
+from merge_sumo.studies.parameter_changes import ParameterChange
+from merge_sumo.studies.parameter_ranges import Range, default_ranges
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import US23
@@ -150,7 +152,7 @@ class TestACampaign:
 
     def test_is_not_explained_where_the_engines_differ(self, made, tmp_path, monkeypatch):
         monkeypatch.setattr(
-            "merge_sumo.studies.explanation._passed", lambda results: [True] * len(results)
+            "merge_sumo.studies.explanation.pass_of", lambda results: [True] * len(results)
         )
         run = uniform("level0", tmp_path / "run", 60, level=0)
         assert run.failures
@@ -211,6 +213,84 @@ def test_the_smallest_change_by_hand(tmp_path):
     assert len(read_explanations(run)) > 4
 
 
+VALUES = re.compile(r"(\w+) is ([\d., or-]+) \((\S+) today, searched from (\S+) to (\S+)\)")
+
+
+def claimed_of_parameters(sentences):
+    """Return (name, value, passes) of what sentences say: values that pass, a unit nearer not."""
+    found = []
+    for sentence in sentences:
+        if not sentence.startswith("The same start passes if the VUT's"):
+            continue
+        for name, values, *numbers in VALUES.findall(sentence):
+            today, low, high = map(float, numbers)
+            for text in values.split(" or "):
+                value = float(text)
+                nearer = value + math.copysign((high - low) / 320.0, today - value)
+                found += [(name, value, True), (name, nearer, False)]
+    return found
+
+
+class TestParameters:
+    def test_of_a_built_in_vut_are_changed_as_said(self, made, tmp_path):
+        again = shutil.copytree(made.folder, tmp_path / "run")
+        case = next(o.case for o in made.outcomes if o.failed)
+        index = next(o.index for o in made.outcomes if o.failed)
+        result = ms.explain(again, index, params=["gap_m=8..32", "kp=1..2"])
+        claims = claimed_of_parameters(result.sentences()[index])
+        assert {name for name, _, _ in claims} == {"gap_m"}
+        for name, value, passes in claims:
+            (verdict,) = run_cases(plan_for(f"design2?{name}={value!r}"), [case]).verdicts()
+            assert passes == (verdict.is_tested and not verdict.failed), (name, value)
+        none = "No value of the VUT's kp (searched from 1 to 2) was found with which this start"
+        assert f"{none} passes." in result.sentences()[index]
+        # What the file says is what the report says.
+        assert read_explanations(Run(again))[index] == result.found[0]
+        assert "The same start passes if the VUT" in ms.report(again).read_text(encoding="utf-8")
+
+    def test_of_ones_own_controller_by_hand(self, tmp_path):
+        mine = tmp_path / "mine.py"
+        mine.write_text(
+            "class Brakes:\n"
+            "    def __init__(self, brake_mps2=3.0):\n"
+            "        self.brake_mps2 = brake_mps2\n"
+            "    def act(self, seen):\n"
+            "        return -self.brake_mps2 if seen.t_s < 0.05 else 1.0\n"
+        )
+        keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.001"}
+        run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, in_process=True, **keywords)
+        (one,) = ms.explain(run, 0, params=["brake_mps2=0..4"]).found
+        # In steps of .1 from 3 on, then in eighths of that: it fails above 2.001.
+        assert one.parameters == (ParameterChange("brake_mps2", 3.0, 0.0, 4.0, below=2.0),)
+        (plain,) = ms.explain(run, 0).found
+        assert plain.parameters == ()
+
+    def test_ends_of_a_range_are_values(self):
+        change = ParameterChange("gap_m", 16.2, 8.1, 32.4, below=8.1, above=32.4)
+        assert [value for value, passes in change.claims() if passes] == [8.1, 32.4]
+        nearer = [value for value, passes in change.claims() if not passes]
+        assert nearer == pytest.approx([8.1 + 0.076, 32.4 - 0.076], abs=0.05)
+
+    def test_ranges_by_default_are_from_half_to_double(self):
+        ranges = default_ranges(plan_for("design2?gap_m=20").vut)
+        assert ranges[2] == Range("gap_m", 10.0, 40.0)
+        assert [one.name for one in ranges] == ["x1_m", "x2_m", "gap_m", "target_m", "kp", "lag_s"]
+        assert default_ranges(plan_for("sumo:IDM?tau=1").vut) == ()
+
+    @pytest.mark.parametrize(
+        ("params", "words"),
+        [
+            (["gap=1..2"], "has no such parameter: did you mean gap_m"),
+            (["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
+            (["gap_m=8..32", "gap_m=8..32"], "--param gap_m is given twice"),
+            (["gap_m=8"], "write NAME=LOW..HIGH"),
+        ],
+    )
+    def test_that_cannot_be_searched_are_refused_in_a_sentence(self, made, params, words):
+        with pytest.raises(UserError, match=words):
+            ms.explain(made.folder, params=params)
+
+
 class TestTheFile:
     @pytest.mark.slow
     def test_is_the_same_wherever_its_cases_ran(self, made, tmp_path):
@@ -223,7 +303,14 @@ class TestTheFile:
         assert (again / EXPLANATIONS).read_bytes() == before
 
     @pytest.mark.parametrize(
-        "changes", [{"index": 10**6}, {"alone": []}, {"together": {"level": 1.0}}, {"cases": -1}]
+        "changes",
+        [
+            {"index": 10**6},
+            {"alone": []},
+            {"together": {"level": 1.0}},
+            {"cases": -1},
+            {"parameters": [{"name": "kp", "today": 1.0, "low": 1.0, "high": 1.0}]},
+        ],
     )
     def test_of_somebody_else_is_refused_in_a_sentence(self, made, tmp_path, changes):
         folder = shutil.copytree(made.folder, tmp_path / "run")

@@ -16,7 +16,8 @@ import pytest
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.studies import repair as mending
-from merge_sumo.studies.repair import BISECTIONS, RESERVE, Range, Round, Trial
+from merge_sumo.studies.parameter_ranges import Range, todays_values
+from merge_sumo.studies.repair import BISECTIONS, RESERVE, Round, Trial
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import US23
@@ -206,7 +207,7 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
     with pytest.raises(UserError, match="--cost is 'money': choose time or braking"):
         api.repair(run, ["brake=0..4"], cost="money", **given)
     with pytest.raises(UserError, match="the parameters of a network are its weights"):
-        mending.todays_values(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
+        todays_values(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 
