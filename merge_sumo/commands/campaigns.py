@@ -9,34 +9,32 @@ import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Given, app
-from merge_sumo.commands.options import HOSTING, RUNNING, SETUP, RunArgument, Shared, option
-from merge_sumo.commands.printing import print_json, quoted, say, show, stoppable
+from merge_sumo.commands.options import (
+    HOSTING,
+    RUNNING,
+    SETUP,
+    RunArgument,
+    Shared,
+    flag,
+    option,
+    optional,
+)
+from merge_sumo.commands.printing import folder_of, print_json, quoted, say, show, stoppable
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
     from merge_sumo.api import CampaignRun, CaseRun, RunComparison
 
 SETTINGS: Final = (
-    *(
-        "vut",
-        "against",
-        "level",
-        "sampler",
-        "cases",
-        "batch",
-        "in_flight",
-        "seed",
-        "learn_from",
-        "v_vut0",
-    ),
+    *("vut", "against", "level", "sampler", "cases", "batch", "in_flight", "seed", "learn_from"),
+    "v_vut0",
 )
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
 SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
 
 
-PEOPLE_OF_REPORT: Final = option(
-    float | None,
-    None,
+PEOPLE_OF_REPORT: Final = optional(
+    float,
     "Share of published drivers beside whom failures are held.",
     metavar="SHARE",
     show_default="the campaign's",
@@ -44,13 +42,8 @@ PEOPLE_OF_REPORT: Final = option(
 
 
 def _vut_option(help: str, show_default: str) -> Shared:
-    return option(
-        str | None,
-        None,
-        help,
-        metavar="SPEC",
-        show_default=show_default,
-        autocompletion=complete.vuts,
+    return optional(
+        str, help, metavar="SPEC", show_default=show_default, autocompletion=complete.vuts
     )
 
 
@@ -115,9 +108,7 @@ def campaign(
     """
     from merge_sumo import api
 
-    if resume is not None and out is not None:
-        raise UserError("--resume names the folder: leave --out away")
-    folder, gates = resume or out or api.dated(given.keywords["vut"]), gate or []
+    folder, gates = folder_of(out, resume, given.keywords["vut"]), gate or []
     for_ci: dict[str, Any] = {"gates": gates, "junit": junit}
 
     def how_to_go_on() -> str:
@@ -149,18 +140,14 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
     options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"),
     own={
         "vut": _vut_option("Vehicle under test.", "with --case the campaign's"),
-        "level": option(
-            str | None,
-            None,
+        "level": optional(
+            str,
             "POV level: 0, 1, 2 or own.",
             show_default="0, with --case the campaign's",
             autocompletion=complete.one_level,
         ),
-        "debug": option(
-            bool,
-            False,
-            "Run the VUT in this process without a deadline: breakpoints work.",
-            "--debug",
+        "debug": flag(
+            "Run the VUT in this process without a deadline: breakpoints work.", "--debug"
         ),
     },
 )
@@ -278,11 +265,8 @@ def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
             "--format",
             autocompletion=complete.formats,
         ),
-        "out": option(
-            Path | None,
-            None,
-            "Folder to write into.",
-            show_default="RUN/scenarios for sumo, else RUN/exports",
+        "out": optional(
+            Path, "Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
         ),
     },
 )
@@ -361,11 +345,8 @@ def _say_interruption(opened: CampaignRun) -> None:
 
 @app.verb(
     own={
-        "certificate": option(
-            Path | None,
-            None,
-            "Folder of a certificate of the same VUT, as `certify` writes it.",
-            metavar="DIR",
+        "certificate": optional(
+            Path, "Folder of a certificate of the same VUT, as `certify` writes it.", metavar="DIR"
         ),
         "people": PEOPLE_OF_REPORT,
     }

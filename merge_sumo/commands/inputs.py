@@ -9,7 +9,7 @@ import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Commands, Given, app
-from merge_sumo.commands.options import HOSTING, Shared, option
+from merge_sumo.commands.options import HOSTING, Shared, flag, option, optional
 from merge_sumo.commands.printing import print_json, show
 
 scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
@@ -19,13 +19,8 @@ app.add_typer(policies, name="policies")
 
 
 def _scenario_option(help: str, show_default: str) -> Shared:
-    return option(
-        str | None,
-        None,
-        help,
-        metavar="NAME|FILE",
-        show_default=show_default,
-        autocompletion=complete.scenarios,
+    return optional(
+        str, help, metavar="NAME|FILE", show_default=show_default, autocompletion=complete.scenarios
     )
 
 
@@ -84,9 +79,7 @@ def list_scenarios(given: Given) -> None:
         ),
         "mainline": option(str, ..., 'Edges of the mainline, past M: "e1 e2".'),
         "ramp": option(str, ..., 'Edges of the ramp, past M: "r1 e2".'),
-        "point": option(
-            bool, False, "Make M a point, also where the ramp has an acceleration lane.", "--point"
-        ),
+        "point": flag("Make M a point, also where the ramp has an acceleration lane.", "--point"),
     },
 )
 def new_scenario(
@@ -126,32 +119,24 @@ def check_scenario(
 @app.verb(
     options=["quiet"],
     own={
-        "only": option(
-            list[str] | None,
-            None,
+        "only": optional(
+            list[str],
             "Network to train: pov1, vut1, pov2 or vut2.",
             autocompletion=complete.networks,
         ),
         "seed": option(int, 0, "Same seed, same weights on one machine."),
         "scenario": _scenario_option("Scenario, or a file of one.", "us23"),
-        "out": option(
-            Path | None,
-            None,
-            "Folder to write.",
-            show_default="the shipped policies, for us23 only",
+        "out": optional(
+            Path, "Folder to write.", show_default="the shipped policies, for us23 only"
         ),
-        "a_min": option(
-            float | None,
-            None,
+        "a_min": optional(
+            float,
             "Hardest braking of the POVs in m/s2, below 0, such as -2.",
             "--a-min",
             show_default="that of the scenario",
         ),
-        "check": option(
-            bool,
-            False,
-            "Train nothing: measure the regret of the networks in the folder.",
-            "--check",
+        "check": flag(
+            "Train nothing: measure the regret of the networks in the folder.", "--check"
         ),
         "cases": option(int, 300, "Random cases of a check."),
     },

@@ -19,21 +19,8 @@ from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
         *("vut", "vut_command", "against", "level", "pov", "policies", "scenario", "net", "v_vut0"),
-        *(
-            "mainline",
-            "ramp",
-            "point",
-            "follow_up",
-            "sense",
-            "act",
-            "case",
-            "at",
-            "x",
-            "v",
-            "psi",
-            "headway_ahead",
-        ),
-        *("headway_behind", "only", "a_min", "check"),
+        *("mainline", "ramp", "point", "follow_up", "sense", "act", "case", "at", "x", "v", "psi"),
+        *("headway_ahead", "headway_behind", "only", "a_min", "check"),
     ),
     "How many cases, and which": (
         *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
@@ -89,6 +76,16 @@ def option(kind: Any, default: object, help: str, *flags: str, **others: Any) ->
     return Annotated[kind, typer.Option(*flags, help=help, **others)], default
 
 
+def optional(kind: Any, help: str, *flags: str, **others: Any) -> Shared:
+    """Return an option that may be left out."""
+    return option(kind | None, None, help, *flags, **others)
+
+
+def flag(help: str, *flags: str) -> Shared:
+    """Return an option without a value."""
+    return option(bool, False, help, *flags)
+
+
 VutOption = Annotated[
     str,
     typer.Option(
@@ -117,34 +114,28 @@ def _runs_of_a_case(text: str) -> int | str:
     return int(text)
 
 
-CORES: Final = option(
-    int | None,
-    None,
-    "Processes that run cases; the outcomes are the same.",
-    show_default="one a core",
+CORES: Final = optional(
+    int, "Processes that run cases; the outcomes are the same.", show_default="one a core"
 )
 SEED: Final = option(int, 0, "Same seed, same cases.")
 OPTIONS: Final[Mapping[str, Shared]] = {
     "vut": (VutOption, ""),
     "level": option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
-    "against": option(
-        str | None,
-        None,
+    "against": optional(
+        str,
         "An earlier version of the VUT, of any kind but traci: each case runs with both, and the "
         "sampler looks for those that the VUT alone fails.",
         metavar="SPEC",
         autocompletion=complete.vuts,
     ),
-    "pov": option(
-        str | None,
-        None,
+    "pov": optional(
+        str,
         "A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
         metavar="SPEC",
         autocompletion=complete.vuts,
     ),
-    "policies": option(
-        Path | None,
-        None,
+    "policies": optional(
+        Path,
         "Folder of learned drivers, as `train --out DIR` makes it, or a shipped library such as "
         "human, instead of the default ones.",
         metavar="NAME|DIR",
@@ -157,40 +148,34 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME|FILE",
         autocompletion=complete.scenarios,
     ),
-    "net": option(Path | None, None, "SUMO net to use instead of the shipped US-23 ramp."),
-    "follow_up": option(
-        float | None,
-        None,
+    "net": optional(Path, "SUMO net to use instead of the shipped US-23 ramp."),
+    "follow_up": optional(
+        float,
         "Time for which both drive on after the merge, with measures of its own.",
         metavar="SECONDS",
         show_default="the scenario's, 0",
     ),
-    "sense": option(
-        str | None,
-        None,
+    "sense": optional(
+        str,
         "How the VUT senses other cars: delay_s, noise_x_m, noise_v_mps, dropout, range_m, "
         "occluded_until_m; a range, as delay_s=0..0.5, is tested as a whole.",
         metavar="NAME=NUMBER,...",
         show_default="the scenario's, perfectly",
     ),
-    "act": option(
-        str | None,
-        None,
+    "act": optional(
+        str,
         "How the VUT obeys its controller: lag_s, delay_s, power_w_per_kg; with ranges as --sense.",
         metavar="NAME=NUMBER,...",
         show_default="the scenario's, perfectly",
     ),
-    "x": option(float | None, None, "Initial position of the POV in m; M is 0.", "--x"),
-    "v": option(float | None, None, "Initial speed of the POV in m/s.", "--v"),
-    "psi": option(float | None, None, "Social value orientation of the POV in rad, at level 2."),
-    "v_vut0": option(
-        float | None,
-        None,
-        "Initial speed of the VUT in m/s.",
-        show_default="the scenario's, 18 in us23",
+    "x": optional(float, "Initial position of the POV in m; M is 0.", "--x"),
+    "v": optional(float, "Initial speed of the POV in m/s.", "--v"),
+    "psi": optional(float, "Social value orientation of the POV in rad, at level 2."),
+    "v_vut0": optional(
+        float, "Initial speed of the VUT in m/s.", show_default="the scenario's, 18 in us23"
     ),
-    "headway_ahead": option(float | None, None, "Headway to the car ahead in s, in traffic."),
-    "headway_behind": option(float | None, None, "Headway of the car behind in s, in traffic."),
+    "headway_ahead": optional(float, "Headway to the car ahead in s, in traffic."),
+    "headway_behind": optional(float, "Headway of the car behind in s, in traffic."),
     "sampler": option(
         str,
         DEFAULT_SAMPLER,
@@ -198,38 +183,31 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         autocompletion=complete.samplers,
     ),
     "cases": option(int, 800, "Number of test cases."),
-    "batch": option(
-        int | None,
-        None,
-        "Cases per batch.",
-        show_default="few, later more, for coverage; 40 for others",
+    "batch": optional(
+        int, "Cases per batch.", show_default="few, later more, for coverage; 40 for others"
     ),
-    "in_flight": option(
-        int | None,
-        None,
+    "in_flight": optional(
+        int,
         "Most cases that run or wait for a worker while the sampler is asked for more, instead of "
         "batches: for controllers that take seconds for a case. About three times the workers.",
         metavar="N",
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
-    "learn_from": option(
-        list[Path] | None,
-        None,
+    "learn_from": optional(
+        list[Path],
         "An earlier campaign, of another version or at other levels, to learn the VUT from. May be "
         "given several times.",
         metavar="RUN",
         autocompletion=complete.runs,
     ),
-    "stop_after_converged": option(
-        float | None,
-        None,
+    "stop_after_converged": optional(
+        float,
         "Stop early when, three batches in a row, the next batch is expected to add less than this "
         "share to the coverage. Needs a sampler that can tell: coverage.",
         metavar="SHARE",
     ),
-    "audit": option(
-        int | None,
-        None,
+    "audit": optional(
+        int,
         "Of the cases, so many are uniform, whatever was found: they bound, with confidence, the "
         "share of the pool where the campaign has missed failures.",
         metavar="N",
@@ -243,29 +221,23 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         callback=_runs_of_a_case,
     ),
     "tolerate": option(
-        float,
-        0.0,
-        "A case fails where more than this share of its runs do.",
-        metavar="SHARE",
+        float, 0.0, "A case fails where more than this share of its runs do.", metavar="SHARE"
     ),
-    "dense": option(
-        bool | None,
-        None,
+    "dense": optional(
+        bool,
         "Make the dense truths, of 1,000,000 cases, or go without.",
         "--dense/--no-dense",
         show_default="those kept",
     ),
-    "fail_when": option(
-        str | None,
-        None,
+    "fail_when": optional(
+        str,
         "What counts as a failure: {criteria} (paper: front bumpers within 6 m at the merge), or a "
         "condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == \"TIMEOUT\"'.",
         metavar="EXPR",
         show_default="the scenario's: paper where M is a point, unsafe on a lane",
     ),
-    "require": option(
-        str | None,
-        None,
+    "require": optional(
+        str,
         "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
@@ -292,28 +264,21 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME",
         autocompletion=complete.engines,
     ),
-    "workers": option(
-        int | None,
-        None,
+    "workers": optional(
+        int,
         "Processes that run cases; the outcomes are the same. By default one a core, as soon as "
         "cases take longer than starting processes.",
     ),
-    "dask": option(
-        str | None,
-        None,
-        "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT.",
+    "dask": optional(
+        str, "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT."
     ),
-    "quiet": option(bool, False, "Show no progress.", "--quiet", "-q"),
-    "trust_vut": option(
-        bool,
-        False,
+    "quiet": flag("Show no progress.", "--quiet", "-q"),
+    "trust_vut": flag(
         "Run the controller that a folder names although it is not known to be yours.",
         "--trust-vut",
     ),
-    "vut_command": option(
-        str | None,
-        None,
-        "Command that starts the controller of --vut traci; {port} stands for the port.",
+    "vut_command": optional(
+        str, "Command that starts the controller of --vut traci; {port} stands for the port."
     ),
     "deadline": option(
         float, DEADLINE_S, "Seconds that a VUT may take for a step before it is a VUT_ERROR."
@@ -321,9 +286,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "vut_memory": option(
         float, MEMORY_GIB, "GiB of memory that the process of a VUT of your own may take."
     ),
-    "in_process": option(
-        bool,
-        False,
+    "in_process": flag(
         "Run a VUT of your own in this process, within reach of a debugger, instead of in one of "
         "its own.",
         "--in-process",

@@ -6,18 +6,21 @@ import json
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from merge_sumo.errors import Notice
+from merge_sumo.errors import Notice, UserError
+from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Interrupt, Stopped
 from merge_sumo.system.printable import printable, quoted
 
 if TYPE_CHECKING:
     from merge_sumo.analysis.result import Result
 
-__all__ = ["notices_printed", "print_json", "print_result", "quoted", "say", "show", "stoppable"]
+__all__ = ["folder_of", "notices_printed", "print_json", "print_result", "quoted"]
+__all__ += ["same_command", "say", "show", "stoppable"]
 
 
 def show(line: object) -> None:
@@ -46,6 +49,19 @@ def print_result(result: Result, *, as_json: bool, **more: object) -> None:
         return
     for line in (*result.lines(), *(f"{name}: {path}" for name, path in paths.items())):
         show(line)
+
+
+def folder_of(out: Path | None, resume: Path | None, what: str) -> Path:
+    """Return the folder that a command writes, or goes on in; without both a dated one."""
+    if resume is not None and out is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    return resume or out or dated(what)
+
+
+def same_command(folder: Path) -> str | None:
+    """Return how to go on with what was stopped in a folder; None where nothing was written."""
+    same = f"stopped; go on with the same command and --resume {quoted(folder)}"
+    return same if folder.exists() else None
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -17,30 +18,31 @@ from merge_sumo.commands.options import (
     SETUP,
     RunArgument,
     VutOption,
+    flag,
     option,
+    optional,
 )
-from merge_sumo.commands.printing import quoted, say, stoppable
-from merge_sumo.errors import UserError
+from merge_sumo.commands.printing import folder_of, same_command, say, stoppable
 
+OF_RECORDED: Final = ("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut")
+"""Options of the studies that run cases of a recorded campaign."""
 TRUTH_CASES: Final = "10000, at level 2 20000"
 
 
 @app.verb(
     options=("level", *SETUP, "tolerate", "dask", "quiet"),
     own={
-        "cases": option(int | None, None, "Uniform cases of a level.", show_default=TRUTH_CASES),
-        "repeat": option(
-            int | None,
-            None,
+        "cases": optional(int, "Uniform cases of a level.", show_default=TRUTH_CASES),
+        "repeat": optional(
+            int,
             "Run each case until it is decided whether it fails, so often at most, with another "
             "draw of what is random.",
             metavar="N",
             show_default="1, with --tolerate 20",
         ),
         "seed": SEED,
-        "engine": option(
-            str | None,
-            None,
+        "engine": optional(
+            str,
             "kinematic: the equations of motion alone, and SUMO for at least one case of a "
             "hundred. Or sumo for all.",
             metavar="NAME",
@@ -74,18 +76,12 @@ def truth(given: Given, vut: VutOption) -> None:
     own={
         "seeds": option(int, 10, "Runs of each sampler."),
         "cases": option(int, 400, "Cases of each run."),
-        "batch": option(
-            int | None,
-            None,
-            "Cases per batch.",
-            show_default="what coverage wants, 20 for the others",
+        "batch": optional(
+            int, "Cases per batch.", show_default="what coverage wants, 20 for the others"
         ),
-        "truth_cases": option(int | None, None, "Cases of the truth.", show_default=TRUTH_CASES),
-        "figure": option(
-            Path | None,
-            None,
-            "New file for FMC against cases: .png, .svg or .html.",
-            metavar="FILE",
+        "truth_cases": optional(int, "Cases of the truth.", show_default=TRUTH_CASES),
+        "figure": optional(
+            Path, "New file for FMC against cases: .png, .svg or .html.", metavar="FILE"
         ),
         "workers": CORES,
     },
@@ -236,15 +232,8 @@ def certify(
     """
     from merge_sumo import api
 
-    if out is not None and resume is not None:
-        raise UserError("--resume names the folder: leave --out away")
-    folder = resume or out or api.dated(f"certify-{vut}")
-
-    def how_to_go_on() -> str | None:
-        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
-        return same if folder.exists() else None
-
-    with stoppable("block", how_to_go_on) as check:
+    folder = folder_of(out, resume, f"certify-{vut}")
+    with stoppable("block", partial(same_command, folder)) as check:
         again = resume is not None
         result = api.certify(vut, out=folder, resume=again, check=check, **given.keywords)
     given.print(result)
@@ -252,24 +241,16 @@ def certify(
 
 
 @app.verb(
-    options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"),
+    options=("engine", *OF_RECORDED),
     own={
         "cases": option(int, 4000, "Fresh cases to run."),
-        "distribution": option(
-            Path | None,
-            None,
-            "JSON: how often cases occur.",
-            metavar="FILE",
-            show_default="uniform",
+        "distribution": optional(
+            Path, "JSON: how often cases occur.", metavar="FILE", show_default="uniform"
         ),
         "confidence": option(float, 0.95, "Chance that the interval holds the probability."),
         "seed": SEED,
-        "out": option(
-            Path | None,
-            None,
-            "New file to write.",
-            metavar="FILE",
-            show_default="RUN/probability.json",
+        "out": optional(
+            Path, "New file to write.", metavar="FILE", show_default="RUN/probability.json"
         ),
     },
 )
@@ -289,11 +270,10 @@ def probability(given: Given, run: RunArgument) -> None:
 
 @app.verb(
     "failures-per-merge",
-    options=("net", "policies", "pov", *HOSTING, "engine", *RUNNING, "trust_vut"),
+    options=("engine", *OF_RECORDED),
     own={
-        "density": option(
-            float | None,
-            None,
+        "density": optional(
+            float,
             "Cars per km of the mainline's lane.",
             metavar="VEH_PER_KM",
             show_default="that of the traffic",
@@ -301,12 +281,8 @@ def probability(given: Given, run: RunArgument) -> None:
         "cases": option(int, 8000, "Fresh cases to run."),
         "confidence": option(float, 0.95, "Chance that an interval holds."),
         "seed": SEED,
-        "out": option(
-            Path | None,
-            None,
-            "New file to write.",
-            metavar="FILE",
-            show_default="RUN/failures-per-merge.json",
+        "out": optional(
+            Path, "New file to write.", metavar="FILE", show_default="RUN/failures-per-merge.json"
         ),
     },
 )
@@ -337,7 +313,7 @@ def failures_per_merge(
 
 
 @app.verb(
-    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    options=OF_RECORDED,
     own={
         "draws": option(
             int, 5, "Times that all cases run where a change is drawn at random, 1 to 1,000."
@@ -359,7 +335,7 @@ def stress(given: Given, run: RunArgument) -> None:
     given.print(api.stress(run, **given.written))
 
 
-@app.verb(options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"))
+@app.verb(options=OF_RECORDED)
 def explain(
     given: Given,
     run: RunArgument,
@@ -392,19 +368,17 @@ def explain(
 
 
 @app.verb(
-    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    options=OF_RECORDED,
     own={
-        "cases": option(
-            int | None,
-            None,
+        "cases": optional(
+            int,
             "Cases that drive there. Fewer than recorded: those with the lowest scores, mostly "
             "failures. More: fresh uniform ones, too.",
             show_default="those recorded",
         ),
         "seed": SEED,
-        "crime": option(
-            Path | None,
-            None,
+        "crime": optional(
+            Path,
             "Python of an environment with commonroad-crime, to compare measures, too.",
             metavar="PYTHON",
         ),
@@ -430,11 +404,10 @@ def crosscheck(given: Given, run: RunArgument) -> None:
 
 
 @app.verb(
-    options=("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut"),
+    options=OF_RECORDED,
     own={
-        "vut": option(
-            str | None,
-            None,
+        "vut": optional(
+            str,
             "The controller to repair.",
             metavar="SPEC",
             show_default="the campaign's, as its files are now",
@@ -451,8 +424,8 @@ def crosscheck(given: Given, run: RunArgument) -> None:
         "rounds": option(
             int, 3, "Most rounds: the failures of a fresh campaign join the cases of the next."
         ),
-        "cases": option(
-            int | None, None, "Cases of a fresh campaign.", show_default="as many as the campaign"
+        "cases": optional(
+            int, "Cases of a fresh campaign.", show_default="as many as the campaign"
         ),
         "seed": option(int, 0, "Same seed, same values."),
     },
@@ -489,15 +462,8 @@ def repair(
     """
     from merge_sumo import api
 
-    if out is not None and resume is not None:
-        raise UserError("--resume names the folder: leave --out away")
-    folder = resume or out or api.dated(f"repair-{run.name}")
-
-    def how_to_go_on() -> str | None:
-        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
-        return same if folder.exists() else None
-
-    with stoppable("trial or batch", how_to_go_on) as check:
+    folder = folder_of(out, resume, f"repair-{run.name}")
+    with stoppable("trial or batch", partial(same_command, folder)) as check:
         result = api.repair(
             run, param, out=folder, resume=resume is not None, check=check, **given.written
         )
@@ -508,15 +474,9 @@ def repair(
 @app.verb(
     options=["dense", "policies", "dask", "quiet"],
     own={
-        "seeds": option(
-            int | None, None, "Runs of each sampler.", show_default="10, with --quick 2"
-        ),
-        "out": option(
-            Path | None, None, "New folder to write.", show_default="runs/reproduce-DATE"
-        ),
-        "quick": option(
-            bool, False, "Few and short runs and a small truth: a first look.", "--quick"
-        ),
+        "seeds": optional(int, "Runs of each sampler.", show_default="10, with --quick 2"),
+        "out": optional(Path, "New folder to write.", show_default="runs/reproduce-DATE"),
+        "quick": flag("Few and short runs and a small truth: a first look.", "--quick"),
         "workers": CORES,
     },
 )

@@ -271,7 +271,7 @@ class TestAHundredNames:
     def test_of_fresh_cases_touch_nothing(
         self, world, call, run, monkeypatch, names, study, command
     ):
-        def ran(_plan, cases, notes, lines, _on_case, _workers):
+        def ran(_study, cases, notes, lines):
             chosen = run.outcomes[: len(cases)]
             probability.append_lines(lines, chosen, notes)
             return chosen
