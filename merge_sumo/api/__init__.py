@@ -62,7 +62,6 @@ from merge_sumo.api.results import (
 )
 from merge_sumo.campaigns.campaign import (
     SCENARIOS,
-    OnCase,
     case_name,
     resume_campaign,
     run_campaign,
@@ -215,11 +214,7 @@ def campaign(
     folder = dated(settings.vut) if out is None else Path(out)
     plan = resolve(settings, _path(net))
     _notice_untrained(settings, plan, given)
-
-    def run(opened: Workers, _: CampaignPanel, on_case: OnCase) -> Run:
-        return run_campaign(settings, plan, folder, on_case, workers=opened, check=runner.checks)
-
-    return _concluded(settings, plan, folder, run, runner)
+    return _concluded(settings, plan, folder, runner)
 
 
 def resume(
@@ -254,35 +249,24 @@ def resume(
         levels = parse_levels(str(named["level"]), policies, scenario_levels, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
-    plan = resolve(settings, _path(net))
-
-    def go_on(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
-        return resume_campaign(
-            settings,
-            plan,
-            folder,
-            on_case,
-            on_before=panel.ran_before,
-            force=force,
-            workers=opened,
-            check=runner.checks,
-            warn=lambda sentence: warnings.warn(sentence, Notice, stacklevel=2),
-        )
-
-    return _concluded(settings, plan, folder, go_on, runner)
+    return _concluded(
+        settings, resolve(settings, _path(net)), folder, runner, goes_on=True, force=force
+    )
 
 
 def _concluded(
     settings: CampaignSettings,
     plan: SimulationPlan,
     folder: Path,
-    run: Callable[[Workers, CampaignPanel, OnCase], Run],
     runner: Runner,
+    *,
+    goes_on: bool = False,
+    force: bool = False,
 ) -> CampaignRun:
     """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
 
-    `run` runs its cases on workers, with the panel that shows it and what is called with every
-    case. An interruption has a note on how to go on.
+    It begins in a new folder, or goes on in one, also with `force` where something differs. An
+    interruption has a note on how to go on.
     """
     gates = list(runner.gates)
     parse_gates(gates, against=settings.against is not None)
@@ -303,7 +287,19 @@ def _concluded(
                 if runner.on_case is not None:
                     runner.on_case(outcome)
 
-            done = run(opened, panel, case_ended)
+            if goes_on:
+                done = resume_campaign(
+                    *(settings, plan, folder, case_ended),
+                    on_before=panel.ran_before,
+                    force=force,
+                    workers=opened,
+                    check=runner.checks,
+                    warn=_notice,
+                )
+            else:
+                done = run_campaign(
+                    settings, plan, folder, case_ended, workers=opened, check=runner.checks
+                )
             result = CampaignRun(done, gates)
             _write_findings(result, plan, opened, panel, runner)
     except (KeyboardInterrupt, Stopped) as stop:
@@ -333,6 +329,10 @@ def _write_findings(
     local = opened if runner.dask is None and opened.count <= workers_or_cores(None) else None
     expected()
     write_report(done, result.summary, local, page)
+
+
+def _notice(sentence: str) -> None:
+    warnings.warn(sentence, Notice, stacklevel=2)
 
 
 def _title(settings: CampaignSettings) -> str:
@@ -1212,20 +1212,7 @@ def _fresh_campaign(
     begun = folder.exists()
     if begun:
         check_report(folder)
-
-    def run(opened: Workers, panel: CampaignPanel, on_case: OnCase) -> Run:
-        if not begun:
-            return run_campaign(
-                settings, plan, folder, on_case, workers=opened, check=runner.checks
-            )
-        return resume_campaign(
-            *(settings, plan, folder, on_case),
-            on_before=panel.ran_before,
-            workers=opened,
-            check=runner.checks,
-        )
-
-    return _concluded(settings, plan, folder, run, runner).run
+    return _concluded(settings, plan, folder, runner, goes_on=begun).run
 
 
 def explain(

@@ -7,7 +7,7 @@ lane coordinate: bodies do not meet, as they do not where SUMO moves them by com
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib.metadata import version
 from typing import Any, Final
@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import Simulator
+from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import MAX_SPEED_MPS
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, Scenario
-from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.registry import VutFactory, kind_of
 
 PACKAGE: Final = "highway-env"
@@ -148,15 +146,6 @@ class HighwayEnvSimulator(Simulator):
         """Start the drivers; `UserError` where they drive in SUMO alone."""
         if why := why_sumo_alone(plan):
             raise UserError(why)
-        corridors = min(plan.corridors, plan.vut.vut.max_corridors or plan.corridors)
-        corridors = plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
         with ExitStack() as opened:
-            world = HighwayEnvWorld(corridors, plan.road, plan.scenario)
+            world = HighwayEnvWorld(corridors_of(plan, plan.corridors), plan.road, plan.scenario)
             self._open_drivers(plan, world, None, opened)
-
-    def run(
-        self, cases: Sequence[Case], ran_again: set[int] | None = None
-    ) -> Iterator[tuple[int, Trajectory]]:
-        """Run cases; yield (place in `cases`, trajectory) as they end."""
-        self.in_sumo = ()
-        return rollout(self.world, self.pov, self.vut, cases, ran_again)

@@ -21,7 +21,7 @@ import numpy as np
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import Simulator
+from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.values.case import Case, FloatArray
@@ -140,16 +140,9 @@ class SubstepSimulator(Simulator):
         """Start the drivers; `UserError` for those that drive in SUMO only."""
         with ExitStack() as opened:
             most = CORRIDORS if plan.needs_sumo is None else plan.corridors
-            corridors = min(most, plan.vut.vut.max_corridors or most)
-            corridors = plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
+            corridors = corridors_of(plan, most)
             world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
             self._open_drivers(plan, world, None, opened)
-
-    def run(
-        self, cases: Sequence[Case], ran_again: set[int] | None = None
-    ) -> Iterator[tuple[int, Trajectory]]:
-        """Run cases; yield (place in `cases`, trajectory)."""
-        return rollout(self.world, self.pov, self.vut, cases, ran_again)
 
 
 def drawn(cases: Sequence[Case]) -> set[int]:

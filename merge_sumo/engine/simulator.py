@@ -44,15 +44,12 @@ class Simulator:
 
         `binding` takes the place of libsumo: see `World`.
         """
-        povs, scenario = plan.povs, plan.scenario
-        corridors = min(plan.corridors, plan.vut.vut.max_corridors or plan.corridors)
-        corridors = povs.corridors(corridors, scenario.vehicles - 1)
-        car_type = None if povs.own is None else povs.own.vut.vut_type
-        vut_type = plan.vut.vut.vut_type
+        own = plan.povs.own
+        car_type = None if own is None else own.vut.vut_type
         with ExitStack() as opened:
             world = World(
-                *(corridors, plan.road, vut_type),
-                scenario=scenario,
+                *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut.vut_type),
+                scenario=plan.scenario,
                 car_type=car_type,
                 binding=binding,
             )
@@ -81,7 +78,7 @@ class Simulator:
 
         `ran_again` gets the places of those that ran again: see `rollout`.
         """
-        self.in_sumo = range(len(cases))
+        self.in_sumo = range(len(cases)) if isinstance(self.world, World) else ()
         return rollout(self.world, self.pov, self.vut, cases, ran_again)
 
     def close(self) -> None:
@@ -95,6 +92,12 @@ class Simulator:
     def __exit__(self, *_: object) -> None:
         """Close it."""
         self.close()
+
+
+def corridors_of(plan: SimulationPlan, most: int) -> int:
+    """Return the number of corridors, at most so many, that VUT and POVs of a plan can serve."""
+    corridors = min(most, plan.vut.vut.max_corridors or most)
+    return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
 
 
 def imperfect(vut: Driver, scenario: Scenario) -> Driver:
