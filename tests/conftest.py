@@ -17,16 +17,14 @@ from typing import Any
 import pytest
 from accounts import Account, second_account
 from calling import Said
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from foreign_nets import corridor_of
 from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.values.scenario import US23
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
@@ -69,9 +67,7 @@ def no_simulation_left() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory) -> Run:
     """Return a small finished campaign with failures: design1 against level 0."""
-    settings = CampaignSettings(
-        vut="design1", levels=(0,), cases=60, batch=20, seed=1, scenario=US23
-    )
+    settings = campaign_settings(vut="design1", cases=60, batch=20, seed=1)
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 

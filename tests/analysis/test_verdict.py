@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from calling import invoke
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from handmade import write_run
 from lxml import etree
 from typer.testing import Result
@@ -19,13 +19,11 @@ import merge_sumo as ms
 from merge_sumo.analysis.people import beside_people
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Gate, judge, parse_gates
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run, failures, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import check_junit, junit, write_junit
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import printable
-from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
@@ -317,15 +315,8 @@ class TestACampaignThatTestedNothing:
 @pytest.fixture(scope="module")
 def mixed(vuts, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mixed") / "run"
-    settings = CampaignSettings(
-        vut=vuts["mixed"],
-        levels=(0,),
-        sampler="uniform",
-        cases=20,
-        batch=10,
-        seed=1,
-        scenario=US23,
-        in_process=True,
+    settings = campaign_settings(
+        vut=vuts["mixed"], sampler="uniform", cases=20, batch=10, seed=1, in_process=True
     )
     found = judge(run_campaign(settings, folder).outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
@@ -403,15 +394,7 @@ class TestACampaignOfFewCasesThatIsResumed:
         def check() -> None:
             raise Stopped(signal.SIGINT)
 
-        settings = CampaignSettings(
-            vut="design2",
-            levels=(0,),
-            sampler="annealing",
-            cases=20,
-            batch=10,
-            seed=1,
-            scenario=US23,
-        )
+        settings = campaign_settings(vut="design2", sampler="annealing", cases=20, batch=10, seed=1)
         with pytest.raises(Stopped):
             run_campaign(settings, tmp_path / "run", check=check)
         assert len(Run(tmp_path / "run").outcomes) == 10
@@ -440,15 +423,8 @@ def folders(vuts, tmp_path_factory) -> dict[str, Path]:
     """Return campaigns of a good VUT and of broken ones, by name."""
     place = tmp_path_factory.mktemp("versions")
     for name, vut in {"good": "design2", **vuts}.items():
-        settings = CampaignSettings(
-            vut=vut,
-            levels=(0,),
-            sampler="uniform",
-            cases=20,
-            batch=10,
-            seed=1,
-            scenario=US23,
-            in_process=True,
+        settings = campaign_settings(
+            vut=vut, sampler="uniform", cases=20, batch=10, seed=1, in_process=True
         )
         run_campaign(settings, place / name)
     return {path.name: path for path in place.iterdir()}

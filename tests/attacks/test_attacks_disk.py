@@ -15,16 +15,14 @@ from pathlib import Path
 
 import pytest
 from attacks import World, tell
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import require
 from plans import plan_for
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.folders import TEMPORARY
-from merge_sumo.values.scenario import US23
 
 CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
 SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")
@@ -226,9 +224,7 @@ class Vanishing:
 
 
 class TestAFolderThatVanishes:
-    SETTINGS = CampaignSettings(
-        vut="design1", levels=(0,), sampler="uniform", cases=40, batch=20, seed=1, scenario=US23
-    )
+    SETTINGS = campaign_settings(vut="design1", sampler="uniform", cases=40, batch=20, seed=1)
 
     def test_under_a_campaign_ends_it_in_a_sentence(self, tmp_path):
         with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):

@@ -11,7 +11,7 @@ from collections import Counter
 
 import pytest
 from attacks import World, tell
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from test_workers import cluster, workers_at
 
 import merge_sumo as ms
@@ -68,9 +68,7 @@ def test_campaigns_in_one_process_keep_nothing(vut, count, tmp_path):
 
 
 SETTINGS = {
-    name: CampaignSettings(
-        vut="design1", levels=(0,), sampler=name, cases=40, batch=20, seed=4, scenario=US23
-    )
+    name: campaign_settings(vut="design1", sampler=name, cases=40, batch=20, seed=4)
     for name in ("uniform", "gpr")
 }
 

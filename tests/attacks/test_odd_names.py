@@ -11,14 +11,13 @@ from pathlib import Path
 
 import pytest
 from calling import assert_refused
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import some
 from handmade import write_run
 from plans import plan_for
 
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
@@ -26,7 +25,6 @@ from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.report import write_report
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.values.scenario import US23
 
 VUT = "def drive(seen):\n    return 1.0\n"
 NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")
@@ -102,7 +100,7 @@ class TestAVutFile:
 
     def test_in_a_command_that_is_no_text_is_refused_from_python_too(self):
         with pytest.raises(UserError, match="not UTF-8"):
-            CampaignSettings(vut="half\ud800.py:drive", levels=(0,), scenario=US23)
+            campaign_settings(vut="half\ud800.py:drive")
 
 
 class TestATerminal:
@@ -207,7 +205,7 @@ def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch
     folder = folder / ("r" * (left // 2)) / ("r" * (left - left // 2))
     assert len(os.fsencode(folder)) == size
     monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
-    settings = CampaignSettings(vut="design1", levels=(0,), cases=99_999, scenario=US23)
+    settings = campaign_settings(vut="design1", cases=99_999)
     with pytest.raises((UserError, ZeroDivisionError)) as error:
         run_campaign(settings, folder)
     assert list(tmp_path.iterdir()) == []

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import assert_refused
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.against import AGAINST, earlier_run
@@ -56,9 +56,9 @@ def both(tmp_path, monkeypatch) -> None:
 
 
 def settings(**changes) -> CampaignSettings:
-    values = {"vut": "new.py:f", "against": "old.py:f", "levels": (0,), "cases": 20, "seed": 3}
+    values = {"vut": "new.py:f", "against": "old.py:f", "cases": 20, "seed": 3}
     values["in_process"] = True  # quicker than a process for each version
-    return CampaignSettings(scenario=US23, **{**values, **changes})
+    return campaign_settings(**{**values, **changes})
 
 
 def lines(folder: Path) -> bytes:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from scipy.stats import kstest
 
 from merge_sumo.analysis.audit import (
@@ -296,10 +296,9 @@ class TestACampaign:
             )
 
     def test_stops_only_when_little_may_have_been_missed(self):
-        settings = CampaignSettings(
-            vut="design1", levels=(0,), cases=400, audit=200, stop_after_converged=0.05,
-            sampler="coverage", scenario=US23,
-        )  # fmt: skip
+        settings = campaign_settings(
+            vut="design1", cases=400, audit=200, stop_after_converged=0.05, sampler="coverage"
+        )
         stop, audit = settings.stopping_rule(), settings.audit_plan
         assert isinstance(stop, StoppingRule)
         stop._expected = dict.fromkeys(range(100), 0.0)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.in_flight import AGE, GROUPS, Flight, by_rounds, conduct_in_flight
@@ -35,8 +35,8 @@ LEARNING = sorted(name for name, kind in SAMPLERS.items() if kind.learns)
 
 
 def settings(sampler: str = "coverage", **changes: Any) -> CampaignSettings:
-    values = {"vut": "design1", "levels": (0,), "cases": 60, "in_flight": 12, "seed": 2}
-    return CampaignSettings(sampler=sampler, **{"scenario": US23, **{**values, **changes}})
+    values = {"vut": "design1", "cases": 60, "in_flight": 12, "seed": 2}
+    return campaign_settings(sampler=sampler, **{**values, **changes})
 
 
 def outcomes(folder: Path) -> bytes:

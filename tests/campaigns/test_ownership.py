@@ -15,17 +15,15 @@ from pathlib import Path
 
 import pytest
 from calling import assert_refused
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 
 from merge_sumo.campaigns.ownership import check_own_code
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import CHECKSUM, SETTINGS, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.trust import RUNS, Code, doubt, note_own
-from merge_sumo.values.scenario import US23
 
 VUT = """
 import pathlib
@@ -81,9 +79,7 @@ def project(folder: Path, answer: float = 1.0, *, vut: str = "my_vut.py:Vut") ->
     made.change(answer)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        settings = CampaignSettings(
-            vut=vut, levels=(0,), cases=12, batch=6, sampler="uniform", scenario=US23
-        )
+        settings = campaign_settings(vut=vut, cases=12, batch=6, sampler="uniform")
         run_campaign(settings, Path("run"))
     assert made.ran()
     return made
@@ -196,9 +192,7 @@ class TestAReceivedFolder:
 
     @pytest.mark.parametrize("vut", ["level0", "design1", "sumo:IDM"])
     def test_runs_what_is_of_this_package_or_of_sumo(self, tmp_path, stranger, vut):
-        settings = CampaignSettings(
-            vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
-        )
+        settings = campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2)
         run = run_campaign(settings, tmp_path / "run")
         stranger()
         assert len(resume_campaign(run.folder).outcomes) == 2

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections import Counter
 
 import pytest
+from campaigning import campaign_settings
 
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.values.scenario import US23
 from merge_sumo.vuts import registry
 from merge_sumo.vuts.host import hosted
 
@@ -50,15 +49,13 @@ def calls(monkeypatch):
 
 
 def test_settings_load_no_vut_and_start_no_process(spec, calls):
-    CampaignSettings(vut=spec, levels=(0,), cases=4, sampler="uniform", scenario=US23)
-    CampaignSettings(vut="nowhere.py:f", levels=(0,), cases=4, sampler="uniform", scenario=US23)
+    campaign_settings(vut=spec, cases=4, sampler="uniform")
+    campaign_settings(vut="nowhere.py:f", cases=4, sampler="uniform")
     assert not calls
 
 
 def test_a_plan_asks_a_vut_once_what_it_is(spec, calls):
-    plan = resolve(
-        CampaignSettings(vut=spec, levels=(0,), cases=4, sampler="uniform", scenario=US23)
-    )
+    plan = resolve(campaign_settings(vut=spec, cases=4, sampler="uniform"))
     assert calls == {"processes": 1, "found": 1}
     assert plan.workers(2) == 2
     plan.for_cases(4)
@@ -74,4 +71,4 @@ def test_a_campaign_starts_a_vut_to_ask_it_and_to_let_it_drive(spec, calls, tmp_
 
 def test_settings_of_a_vut_that_nobody_knows_have_no_plan():
     with pytest.raises(UserError, match="there is no VUT 'desgin2'"):
-        resolve(CampaignSettings(vut="desgin2", levels=(0,), scenario=US23))
+        resolve(campaign_settings(vut="desgin2"))

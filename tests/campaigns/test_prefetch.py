@@ -6,11 +6,10 @@ from typing import Any
 
 import pytest
 from calling import contents
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from test_store import episode
 
 from merge_sumo.campaigns.prefetch import Prefetch, proposals
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Journal
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
@@ -18,9 +17,7 @@ from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import Pool
 from merge_sumo.values.scenario import US23
 
-SETTINGS = CampaignSettings(
-    vut="design1", levels=(0,), sampler="uniform", cases=90, batch=20, scenario=US23
-)
+SETTINGS = campaign_settings(vut="design1", sampler="uniform", cases=90, batch=20)
 
 
 def recorded(folder) -> dict[str, bytes]:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 from typer.testing import CliRunner
 
@@ -199,7 +199,7 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
 
 
 def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
-    settings = CampaignSettings(vut=vut(IN_ITS_CLASS), levels=(0,), scenario=US23, in_process=True)
+    settings = campaign_settings(vut=vut(IN_ITS_CLASS), in_process=True)
     plan = resolve(settings)
     with open_workers(1) as there:
         run = runs_points_on(there, settings, plan, tmp_path)
@@ -222,21 +222,16 @@ def Vut(seen):
 
 
 def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
-    settings = CampaignSettings(vut="traci", levels=(0,), scenario=US23)
+    settings = campaign_settings(vut="traci")
     assert chosen_again(run.outcomes, settings) == []
-    started = CampaignSettings(
-        vut="traci", vut_command="python3 client.py {port}", levels=(0,), scenario=US23
-    )
+    started = campaign_settings(vut="traci", vut_command="python3 client.py {port}")
     assert len(chosen_again(run.outcomes, started)) == 8
 
 
 def test_drivers_of_the_package_run_once(run, tmp_path):
     assert read_repeats(run) == []
     assert not (run.folder / REPEATS).exists()
-    assert (
-        chosen_again(run.outcomes, CampaignSettings(vut="design1", levels=(0,), scenario=US23))
-        == []
-    )
+    assert chosen_again(run.outcomes, campaign_settings(vut="design1")) == []
 
 
 def test_a_campaign_that_went_on_says_the_same_as_one_that_never_stopped(vut, tmp_path):

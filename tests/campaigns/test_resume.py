@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from calling import contents, invoke
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 from processes import wait_for
 
@@ -36,7 +36,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import folders, interrupt
 from merge_sumo.system.interrupt import Interrupt, Stopped
-from merge_sumo.values.scenario import US23
 
 BATCH = 8
 MOUNT = shutil.which("mount")
@@ -44,8 +43,8 @@ KILLER = Path(__file__).resolve().parents[2] / "tools" / "kill_campaigns.py"
 
 
 def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
-    values = {"vut": "design1", "levels": (0,), "cases": 28, "batch": BATCH, "seed": 2}
-    return CampaignSettings(sampler=sampler, **{"scenario": US23, **{**values, **changes}})
+    values = {"vut": "design1", "cases": 28, "batch": BATCH, "seed": 2}
+    return campaign_settings(sampler=sampler, **{**values, **changes})
 
 
 class StopAfter:

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import PATIENCE, StoppingRule, covered_balls, gained
@@ -114,7 +114,7 @@ class TestTheRule:
 def test_a_share_that_is_none_and_a_sampler_that_cannot_tell_are_refused(sampler, share, said):
     asked: dict[str, Any] = {"sampler": sampler, "stop_after_converged": share}
     with pytest.raises(UserError, match=said):
-        CampaignSettings(vut="design1", levels=(0,), scenario=US23, **asked)
+        campaign_settings(vut="design1", **asked)
 
 
 @pytest.mark.slow

@@ -10,13 +10,11 @@ from pathlib import Path
 
 import pytest
 import typer
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import require
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.values.scenario import US23
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"--cases": "20", "--seeds": "1", "--radius": "0.3"}
@@ -46,7 +44,7 @@ def place(tmp_path_factory) -> Path:
     """Return a folder with what the examples name: two campaigns, and the shipped scenarios."""
     folder = tmp_path_factory.mktemp("examples")
     for vut in ("design1", "design2"):
-        settings = CampaignSettings(vut=vut, levels=(0,), cases=60, batch=20, seed=1, scenario=US23)
+        settings = campaign_settings(vut=vut, cases=60, batch=20, seed=1)
         run_campaign(settings, folder / "runs" / vut)
     shutil.copytree(ROOT / "scenarios" / "stalemate", folder / "scenarios" / "stalemate")
     net = (ROOT / "sumo_net" / "us23.net.xml").read_text()

@@ -8,10 +8,9 @@ import signal
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import some
 
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -21,7 +20,6 @@ from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
 from merge_sumo.system.pulse import PAUSE_S, AwakeClock, Pulse
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
@@ -61,10 +59,7 @@ class Vut:
 
 
 def settings(spec: str, **more: object) -> CampaignSettings:
-    values: dict[str, Any] = {"scenario": US23, **more}
-    return CampaignSettings(
-        vut=spec, levels=(0,), cases=12, batch=12, seed=1, sampler="uniform", **values
-    )
+    return campaign_settings(vut=spec, cases=12, batch=12, seed=1, sampler="uniform", **more)
 
 
 def outcomes(run: Run) -> bytes:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from calling import assert_refused
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from numpy.typing import NDArray
 from plans import key_of, plan_for
 
@@ -98,9 +98,7 @@ def with_layers(
 
 def settings(policies: Path | None, **changes) -> CampaignSettings:
     named = None if policies is None else str(policies)
-    return CampaignSettings(
-        vut="design2", policies=named, **{"scenario": US23, **{**SMALL, **changes}}
-    )
+    return campaign_settings(vut="design2", policies=named, **{**SMALL, **changes})
 
 
 class TestACampaign:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from calling import assert_refused
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
 from plans import plan_for
@@ -91,7 +91,7 @@ def pov(source: str, name: str = "my_pov.py") -> str:
 
 
 def settings(spec: str, **changes) -> CampaignSettings:
-    return CampaignSettings(pov=spec, **{"scenario": US23, **{**SMALL, **changes}})
+    return campaign_settings(pov=spec, **{**SMALL, **changes})
 
 
 def outcomes(folder: Path) -> bytes:

@@ -15,13 +15,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import require, some
 from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
@@ -880,9 +879,7 @@ class Vut:
 def test_signals_are_drawn_beside_the_motion_and_follow_its_slider(browser, tmp_path):
     (tmp_path / "my_vut.py").write_text(LEAVES, encoding="utf-8")
     vut = f"{tmp_path / 'my_vut.py'}:Vut"
-    settings = CampaignSettings(
-        vut=vut, levels=(0,), cases=24, batch=24, sampler="uniform", scenario=US23
-    )
+    settings = campaign_settings(vut=vut, cases=24, batch=24, sampler="uniform")
     run = run_campaign(settings, tmp_path / "run")
     with shown(browser, report.write_report(run)) as page:
         page.evaluate(f"location.hash = '#case-{ReportModel(run).shown[0].index}'")

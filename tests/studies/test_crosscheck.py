@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import assert_refused
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import require
 
 import merge_sumo as ms
@@ -94,7 +94,7 @@ class TestItsVehicles:
 @pytest.mark.usefixtures("peer")
 class TestMotion:
     def test_of_records_is_that_of_highway_env(self, run):
-        settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
+        settings = campaign_settings(vut="design1")
         known = run.trajectories(range(len(run.outcomes)))
         with open_workers(1) as here:
             found = motion_of(resolve(settings), known, here)
@@ -104,7 +104,7 @@ class TestMotion:
         assert found.largest_mps < 1e-10
 
     def test_shows_the_case_that_is_a_millimetre_off(self, run):
-        settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
+        settings = campaign_settings(vut="design1")
         known = run.trajectories(range(3))
         known[1].motion[40:, POV, 0] += 1e-3
         with open_workers(1) as here:
@@ -148,7 +148,7 @@ class TestVerdicts:
         assert verdicts.other_motion <= 10
 
     def test_of_the_lowest_scores_come_first_where_few_are_wanted(self, run):
-        settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
+        settings = campaign_settings(vut="design1")
         found = crosscheck(RunStudy(run, settings, resolve(settings)), cases=5)
         result = CrosscheckResult(found, run.folder / CROSSCHECK)
         assert "5 recorded cases, those with the lowest scores, and 0 fresh" in str(result)

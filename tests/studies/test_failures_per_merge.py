@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from check_failures_per_merge import merges
 from scipy.stats import norm
 
@@ -25,7 +25,6 @@ from merge_sumo.analysis.traffic import (
     shipped_traffics,
 )
 from merge_sumo.api.results import _mixed
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.failures_per_merge import (
@@ -74,7 +73,7 @@ def known(n=2000, seed=0, density=8.7, confidence=0.95) -> Part:
     """Return a part by cases of such failures."""
     stated, strata = stated_with_strata(density, n, confidence)
     draws = strata.draw(np.random.default_rng(seed))
-    settings = CampaignSettings(vut="design1", levels=(0,), scenario=US23)
+    settings = campaign_settings(vut="design1")
     drawn = cases_of(settings, stated.distribution, draws)
     failed = np.array([fails(case.x_pov0_m, case.v_pov0_mps) for case in drawn])
     return part_of(stated, strata, draws, failed, np.ones(n, dtype=bool), confidence)
@@ -272,9 +271,7 @@ class TestATraffic:
 
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory):
-    settings = CampaignSettings(
-        vut="design1", levels=(0,), cases=80, batch=20, seed=1, scenario=US23
-    )
+    settings = campaign_settings(vut="design1", cases=80, batch=20, seed=1)
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 

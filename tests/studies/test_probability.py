@@ -7,14 +7,14 @@ import math
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import binom, kstest, norm, truncnorm
 
 from merge_sumo.analysis.exposure import read_distribution
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.studies import probability
 from merge_sumo.studies.run_study import RunStudy
@@ -323,9 +323,7 @@ def failure_probability(run, out, **other):
 
 class TestOfACampaign:
     def test_is_estimated_with_fresh_cases_and_kept(self, tmp_path):
-        settings = CampaignSettings(
-            vut="design1", levels=(0,), cases=160, batch=20, seed=1, scenario=US23
-        )
+        settings = campaign_settings(vut="design1", cases=160, batch=20, seed=1)
         run = run_campaign(settings, tmp_path / "run")
         out = tmp_path / "p.json"
         found = failure_probability(run, out, cases=600)

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import pytest
 from calling import assert_refused
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from lxml import html
 from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports import version_pages
@@ -31,23 +30,18 @@ from merge_sumo.studies.versions import (
     rerun,
     settings_today,
 )
-from merge_sumo.values.scenario import US23
 
 
 @pytest.fixture(scope="module")
 def fixed(tmp_path_factory) -> Run:
     """Return a campaign of a VUT that does not fail at level 0: design2."""
-    settings = CampaignSettings(
-        vut="design2", levels=(0,), cases=60, batch=20, seed=1, scenario=US23
-    )
+    settings = campaign_settings(vut="design2", cases=60, batch=20, seed=1)
     return run_campaign(settings, tmp_path_factory.mktemp("fixed") / "run")
 
 
 @pytest.fixture(scope="module")
 def other_seed(tmp_path_factory) -> Run:
-    settings = CampaignSettings(
-        vut="design1", levels=(0,), cases=60, batch=20, seed=2, scenario=US23
-    )
+    settings = campaign_settings(vut="design1", cases=60, batch=20, seed=2)
     return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
 
 

@@ -10,6 +10,12 @@ from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import Run, read_settings
+from merge_sumo.values.scenario import US23
+
+
+def campaign_settings(**settings: Any) -> CampaignSettings:
+    """Return settings of a campaign, at level 0 of the paper's scenario unless they say others."""
+    return CampaignSettings(**{"levels": (0,), "scenario": US23, **settings})
 
 
 def run_campaign(

@@ -11,14 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from plans import plan_for
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.signature import KEY, KEY_BYTES, signed, user_key, verified
-from merge_sumo.values.scenario import US23
 
 CASES = 40
 TRUTH = ("truth", "--vut", "design1", "--level", "0", "--cases", CASES, "--workers", "1")
@@ -142,9 +140,7 @@ class TestACacheThatOthersCanWrite:
         cache.chmod(0o777)
         (tmp_path / "my_vut.py").write_text("def Vut(seen):\n    return 0.0\n")
         monkeypatch.chdir(tmp_path)
-        settings = CampaignSettings(
-            vut="my_vut.py:Vut", levels=(0,), cases=2, sampler="uniform", scenario=US23
-        )
+        settings = campaign_settings(vut="my_vut.py:Vut", cases=2, sampler="uniform")
         run = run_campaign(settings, tmp_path / "run")
         with pytest.raises(UserError, match=r"chmod go-w .*--trust-vut"):
             resume_campaign(run.folder)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import campaign_settings, resume_campaign, run_campaign
 from hypothesis import given
 from hypothesis import strategies as st
 from plans import key_of, plan_for
@@ -16,7 +16,7 @@ from test_score import CASE, ending
 
 from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
@@ -428,12 +428,7 @@ class TestOutcomes:
 
 
 def settings(**other):
-    return CampaignSettings(
-        **{
-            "scenario": US23,
-            **{"vut": "design2", "levels": (0,), "cases": 40, "batch": 20, **other},
-        }
-    )
+    return campaign_settings(**{"vut": "design2", "cases": 40, "batch": 20, **other})
 
 
 @pytest.fixture(scope="module")

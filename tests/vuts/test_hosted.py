@@ -16,12 +16,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from misbehaviours import STUBBORN
 from processes import none_left, wait_for
 from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS
@@ -202,7 +201,7 @@ def test_a_host_that_cannot_start_is_a_sentence(spec, monkeypatch):
 def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
     vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
     run = run_campaign(
-        CampaignSettings(vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23),
+        campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2),
         tmp_path / "run",
     )
     log = (run.folder / "controller.log").read_bytes()
@@ -372,9 +371,7 @@ def test_the_outcomes_hold_no_address_and_no_control_characters(spec, tmp_path):
     vut = spec("def Vut(seen):\n    raise ValueError(object(), '\\x1b[0m')\n")
     lines = []
     for name in ("a", "b"):
-        settings = CampaignSettings(
-            vut=vut, levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
-        )
+        settings = campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2)
         run = run_campaign(settings, tmp_path / name)
         lines.append((run.folder / "outcomes.jsonl").read_bytes())
     assert lines[0] == lines[1]

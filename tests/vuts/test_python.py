@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import some
 from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
@@ -317,13 +317,11 @@ def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
 def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
     hashes = []
     for source in (FUNCTION, FUNCTION + "# changed"):
-        settings = CampaignSettings(
-            vut=vut(source), levels=(0,), cases=2, sampler="uniform", batch=2, scenario=US23
-        )
+        settings = campaign_settings(vut=vut(source), cases=2, sampler="uniform", batch=2)
         (sha256,) = record_of(settings, resolve(settings))["vut_files"].values()
         hashes.append(sha256)
     assert hashes[0] != hashes[1]
-    built_in = CampaignSettings(vut="level0", levels=(0,), scenario=US23)
+    built_in = campaign_settings(vut="level0")
     assert record_of(built_in, resolve(built_in))["vut_files"] is None
 
 

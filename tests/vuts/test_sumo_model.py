@@ -6,10 +6,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from vut_contract import cases_of, factory, run_cases, run_on
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
@@ -48,9 +47,7 @@ def test_every_model_reacts_to_the_pov(model):
 
 
 def test_a_campaign_finds_failures_that_replay_identically(model, tmp_path):
-    settings = CampaignSettings(
-        vut=model, levels=(0,), sampler="uniform", cases=120, batch=40, seed=2, scenario=US23
-    )
+    settings = campaign_settings(vut=model, sampler="uniform", cases=120, batch=40, seed=2)
     run = run_campaign(settings, tmp_path / "run")
     assert {o.measures.end for o in run.outcomes} <= {End.MERGED}
     (worst, *_) = failures(run.outcomes)
