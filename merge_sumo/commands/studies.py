@@ -117,32 +117,23 @@ def compare(
 @app.verb(
     options=("quiet",),
     own={
-        "seeds": option(
-            int | None,
-            None,
+        "seeds": optional(
+            int,
             "Searches of each sampler on each problem, with the seeds 100, 101 and so on.",
             show_default="3, with --quick 1",
         ),
-        "cases": option(
-            int | None,
-            None,
-            "Cases of a search, at most 400.",
-            show_default="400, with --quick 50",
+        "cases": optional(
+            int, "Cases of a search, at most 400.", show_default="400, with --quick 50"
         ),
-        "quick": option(
-            bool, False, "Two problems, one seed and 50 cases: a first look.", "--quick"
-        ),
+        "quick": flag("Two problems, one seed and 50 cases: a first look.", "--quick"),
         "limit": option(
             float,
             1800.0,
             "Time that a sampler may take in a search, without simulation.",
             metavar="SECONDS",
         ),
-        "workers": option(
-            int | None,
-            None,
-            "Processes that search; the results are the same.",
-            show_default="one a core",
+        "workers": optional(
+            int, "Processes that search; the results are the same.", show_default="one a core"
         ),
     },
 )
@@ -179,16 +170,9 @@ def benchmark(
     """
     from merge_sumo import api
 
-    if out is not None and resume is not None:
-        raise UserError("--resume names the folder: leave --out away")
-    folder = resume or out or api.dated("benchmark")
+    folder = folder_of(out, resume, "benchmark")
     names = None if problems is None else [name.strip() for name in problems.split(",")]
-
-    def how_to_go_on() -> str | None:
-        same = f"stopped; go on with the same command and --resume {quoted(folder)}"
-        return same if folder.exists() else None
-
-    with stoppable("search", how_to_go_on) as check:
+    with stoppable("search", partial(same_command, folder)) as check:
         result = api.benchmark(
             samplers,
             problems=names,
