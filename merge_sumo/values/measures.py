@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from traceback import extract_tb
 from typing import Final, Literal
 
@@ -53,6 +53,10 @@ class Measure:
         return f"{name} {self.unit}".replace("s2", "s²").rstrip()
 
 
+_low = partial(Measure, missing=math.inf, worse="low")
+"""Makes a measure of which low values are worse; cars that never meet have none, which is high."""
+_high = partial(Measure, missing=0.0, worse="high")
+"""Makes one of which high values are worse."""
 OURS: Final = (
     Measure("end", "why the episode ended"),
     Measure(
@@ -78,47 +82,39 @@ OURS: Final = (
         column="Δx at M",
         missing=math.inf,
     ),
-    Measure(
+    _low(
         "bumper_gap_m",
         "smallest gap at M between the front bumper of the car behind and the rear bumper of the "
         "car ahead, negative where bodies overlap; None without a merge",
         unit="m",
         label="bumper gap at M",
         column="bumper gap at M",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "clearance_m",
         "smallest gap between bumpers from M on, to the end of the follow-up, or without one for "
         "0.75 s at the speeds of M; 0 or less where bodies touch, None without a merge",
         unit="m",
         label="smallest gap, driving on",
         column="clearance",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "before_clearance_m",
         "smallest distance of bodies before M, where the lanes run together; 0 or less where they "
         "overlap, None where the VUT never came there",
         unit="m",
         label="smallest clearance before M",
         column="clearance before M",
-        missing=math.inf,
-        worse="low",
     ),
     Measure("dv_mps", "v_POV - v_VUT", unit="m/s", label="v_POV - v_VUT", column="dv", missing=0.0),
-    Measure(
+    _low(
         "ttc_s",
         "time to collision -dx/dv where dx dv < 0, else None (infinite)",
         unit="s",
         label="time to collision",
         column="TTC",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "pet_s",
         "post-encroachment time: time between the two front bumpers at M (Allen et al., 1978); "
         "where the POV has not arrived by t1, it is taken on at its speed at t1; None when it "
@@ -126,20 +122,16 @@ OURS: Final = (
         unit="s",
         label="post-encroachment time",
         column="PET",
-        missing=math.inf,
-        worse="low",
     ),
     Measure("t_end_s", "time at which the episode ended", unit="s", column="time", missing=0.0),
-    Measure(
+    _high(
         "drac_mps2",
         "deceleration rate to avoid a crash that the follower needs at t1 (Cooper and Ferguson, "
         "1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m",
         unit="m/s2",
         label="deceleration to keep 6 m apart",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "brake_after_mps2",
         "deceleration that whoever is behind at M needs, after 0.75 s to react, not to touch a "
         "car ahead that keeps its speed (`merge.py`); None where none is in time, and without a "
@@ -147,100 +139,78 @@ OURS: Final = (
         unit="m/s2",
         label="braking that M asks of the rear",
         column="braking asked after M",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "impact_speed_mps",
         "relative speed at the first contact; None without one",
         unit="m/s",
         label="impact speed",
         column="impact",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "vut_max_brake_mps2",
         "hardest braking of the VUT, positive",
         unit="m/s2",
         label="hardest braking of the VUT",
         column="VUT brakes",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "pov_max_brake_mps2",
         "hardest braking of the POV, positive",
         unit="m/s2",
         label="hardest braking of the POV",
         column="POV brakes",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "pov_sustained_brake_mps2",
         "largest mean deceleration of the POV over 1.6 s, or over an episode that is shorter; None "
         "in records of versions without it, as the next",
         unit="m/s2",
         label="braking of the POV over 1.6 s",
         column="POV brakes over 1.6 s",
-        missing=0.0,
-        worse="high",
     ),
-    Measure(
+    _high(
         "pov_slowdown_mps",
         "speed of the POV at the start minus its lowest speed up to t1",
         unit="m/s",
         label="slow-down of the POV",
         column="POV slows by",
-        missing=0.0,
-        worse="high",
     ),
     Measure("merged_first", '"VUT" or "POV": whose front bumper is ahead at M'),
-    Measure(
+    _low(
         "last_avoidable_s",
         "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or full "
         "braking, would have kept 6 m against the recorded motion of the POV and the other cars "
         "(taken on at constant speed); None when there was no such time, and where |dx| >= 6 m",
         unit="s",
         label="avoidable until",
-        missing=math.inf,
-        worse="low",
     ),
     Measure("avoidable", "where |dx| < 6 m at M, whether there was such a time; else None"),
-    Measure(
+    _high(
         "clipped_steps",
         "steps in which the VUT asked for more than its limits of acceleration",
         digits=0,
-        missing=0.0,
-        worse="high",
     ),
     Measure("error", "what the VUT or the simulation did wrong, else None"),
     Measure("nearest", "name of the car that the measures are of; recorded in traffic only"),
-    Measure(
+    _low(
         "after_gap_m",
         "least gap between bumpers in the follow-up, 0 or less where bodies touch; this and the "
         "next two are None without a merge, and recorded where there is a follow-up only",
         unit="m",
         label="smallest bumper gap behind M",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "after_ttc_s",
         "lowest time to collision in it, between bumpers; None where no gap closes",
         unit="s",
         label="time to collision behind M",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _high(
         "after_drac_mps2",
         "hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
         unit="m/s2",
         label="braking needed behind M",
-        missing=0.0,
-        worse="high",
     ),
     Measure(
         "x_merge_m",
@@ -259,50 +229,40 @@ OURS: Final = (
         digits=2,
         missing=math.inf,
     ),
-    Measure(
+    _low(
         "gap_ahead_m",
         "bumper gap at the merge to the car ahead; None without one, as the next three",
         unit="m",
         label="gap ahead at the merge",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "gap_behind_m",
         "bumper gap at the merge to the car behind",
         unit="m",
         label="gap behind at the merge",
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "time_gap_ahead_s",
         "gap ahead over the speed of the VUT",
         unit="s",
         label="time gap ahead at the merge",
         column="time gap ahead",
         digits=2,
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _low(
         "time_gap_behind_s",
         "gap behind over the speed of the car behind",
         unit="s",
         label="time gap behind at the merge",
         column="time gap behind",
         digits=2,
-        missing=math.inf,
-        worse="low",
     ),
-    Measure(
+    _high(
         "stood_s",
         "time for which the VUT stood on the acceleration lane",
         unit="s",
         label="stood on the lane",
         column="stood",
-        missing=0.0,
-        worse="high",
     ),
 )
 """The fields of `Measures`, in the order in which an episode is listed, then measures with `of`."""
