@@ -15,10 +15,8 @@ from campaigning import campaign_settings, run_campaign
 from test_workers import cluster, workers_at
 
 import merge_sumo as ms
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.system.workers import dask_workers
-from merge_sumo.values.scenario import US23
 
 __all__ = ["cluster", "workers_at"]
 
@@ -141,8 +139,8 @@ def test_nothing_but_the_settings_decides_outcomes(sampler, cluster, tmp_path):
         assert code == 0, (name, err)
         found[name] = (world.root / "run" / OUTCOMES).read_bytes()
     address, _ = cluster
-    settings = CampaignSettings(
-        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5, scenario=US23
+    settings = campaign_settings(
+        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5
     )
     with dask_workers(address) as workers:
         run_campaign(settings, tmp_path / "dask", workers=workers)

@@ -10,20 +10,19 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import pytest
+from campaigning import campaign_settings
 from processes import wait_for
 
 from merge_sumo.campaigns import sampler_copy
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.sampler_copy import CopyBeside
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.errors import UserError
 from merge_sumo.system import workers as workers_module
 from merge_sumo.system.workers import HERE_S, open_workers
-from merge_sumo.values.scenario import US23
 
-SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=4, scenario=US23)
+SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=4)
 
 
 def ran(folder, workers=None):

@@ -280,7 +280,7 @@ class TestAShippedLibrary:
         monkeypatch.chdir(tmp_path)
         folder = policies_of(US23) / "roundabout"
         assert policies_in("roundabout") == folder
-        settings = CampaignSettings(vut="design1", policies="roundabout", scenario=US23, **SMALL)
+        settings = campaign_settings(vut="design1", policies="roundabout", **SMALL)
         run_campaign(settings, tmp_path / "run")
         assert read_settings(tmp_path / "run")["policies"] == "roundabout"
 
@@ -377,8 +377,5 @@ class TestAFolder:
         plan = resolve(ring)
         assert plan.povs.policies == shipped / "my-ring"
         assert plan.vut.options.policies == shipped / "my-ring"
-        assert (
-            resolve(CampaignSettings(vut="level1", levels=(1,), scenario=US23)).povs.policies
-            == shipped
-        )
+        assert resolve(campaign_settings(vut="level1", levels=(1,))).povs.policies == shipped
         assert US23.name == "us23"

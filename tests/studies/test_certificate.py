@@ -14,6 +14,7 @@ import check_certificate
 import numpy as np
 import pytest
 from calling import assert_refused
+from campaigning import campaign_settings
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.plan import resolve
@@ -29,14 +30,13 @@ from merge_sumo.studies.certificate import (
     lattices_of,
 )
 from merge_sumo.system.signature import signed, user_key, verified
-from merge_sumo.values.scenario import US23
 
 LOW, HIGH = np.array([-340.0, 25.0, 0.0]), np.array([-180.0, 35.0, math.pi / 2])
 """The pool of the paper, written down again: nothing here asks the lattice or the pool."""
 
 
 def settings(*levels, vut="design2"):
-    return CampaignSettings(vut=vut, levels=levels, scenario=US23)
+    return campaign_settings(vut=vut, levels=levels)
 
 
 def certify(settings, radius, folder, run, **other):

@@ -16,11 +16,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from plans import plan_for
 from processes import wait_for
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES
 from merge_sumo.engine.evaluate import _lost_result, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
@@ -39,8 +38,8 @@ from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
-SETTINGS = CampaignSettings(
-    vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3, scenario=US23
+SETTINGS = campaign_settings(
+    vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3
 )
 
 

@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import some
 from plans import POVS, plan_for
 
 from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.engine.evaluate import run_cases
@@ -46,7 +45,7 @@ from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
 
-SETTINGS = CampaignSettings(vut="design2", levels=(0, 1), cases=60, seed=2, scenario=US23)
+SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=2)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
 

@@ -20,7 +20,7 @@ from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.settings import record_of
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import MAX_STEPS, US23, VUT
@@ -64,8 +64,8 @@ def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
 ):
     lines: list = []
     for spec in ("level0", vut(source, name)):
-        settings = CampaignSettings(
-            vut=spec, levels=(0, 2), cases=20, batch=10, seed=3, sampler="gpr", scenario=US23
+        settings = campaign_settings(
+            vut=spec, levels=(0, 2), cases=20, batch=10, seed=3, sampler="gpr"
         )
         folder = tmp_path / f"run{len(lines)}"
         run_campaign(settings, folder)
