@@ -526,13 +526,15 @@ class SamplerBenchmark(Result):
             )
         shares = "  ".join(f"{self.oracle(n):5.3f}" for n in counts)
         rows.append(f"{'oracle':{width}s}  {self.oracle_number:6.3f}  {shares}  {'1':>12s}")
-        faults = [
-            f"{score.entrant.label}: {counted(score.faults, 'search', 'searches')} ended by a "
-            f"fault: {next(iter(one.faults.values()))}"
-            for score in self.samplers.values()
-            for one in [next((p for p in score.problems.values() if p.faults), None)]
-            if one is not None
-        ]
+        faults = []
+        for score in self.samplers.values():
+            by_problem = [one.faults for one in score.problems.values() if one.faults]
+            if by_problem:
+                first = next(iter(by_problem[0].values()))
+                faults.append(
+                    f"{score.entrant.label}: faults ended {score.faults} of its searches, the "
+                    f"first: {first}"
+                )
         return [
             *rows,
             f"number: {self.formula}",

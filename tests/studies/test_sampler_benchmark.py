@@ -145,7 +145,7 @@ class TestTheTruths:
 
     def test_have_the_fmc_of_their_failures(self):
         for name in ("stateful", "islands"):
-            truth = shipped_truth(*named_problems((name,)))
+            truth = shipped_truth(named_problems((name,))[0])
             assert truth.fmc == pytest.approx(sum(map(fmc, truth.failures.values())), rel=1e-9)
 
     def test_have_the_verdicts_that_cases_have_today(self):
@@ -281,6 +281,8 @@ class TestSamplersOfOthers:
             for path in Path("out/searches").iterdir()
         }
         assert ran == {"Fair": 40, "Raises": 20, "Hangs": 20, "Dies": 0, "Short": 20, "Strange": 20}
+        said = "\n".join(result.lines())
+        assert "Raises: faults ended 1 of its searches, the first: ValueError: no idea" in said
         page = Path("out/benchmark.html").read_text()
         assert "ValueError: no idea" in page
         assert "<script" not in page
