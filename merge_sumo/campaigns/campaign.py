@@ -23,6 +23,7 @@ from merge_sumo.campaigns.transfer import lessons
 from merge_sumo.engine.evaluate import (
     CaseResult,
     evaluate,
+    evaluate_anew,
     evaluate_chunks,
     open_simulators,
     workers_or_here,
@@ -340,7 +341,8 @@ class _Open:
     def ended(self, outcomes: list[Outcome], workers: Workers) -> Run:
         """Run some of all cases a second time; return the campaign."""
         done = Run(self.journal.folder, outcomes)
-        repeats = repeat(done, self.settings, partial(evaluate, self.plan, workers=workers))
+        run_cases = partial(evaluate, self.plan, workers=workers)
+        repeats = repeat(done, self.settings, run_cases, partial(evaluate_anew, self.plan))
         if repeats:
             write_repeats(done, repeats)
         return done

@@ -6,6 +6,9 @@ of workers, on the sampler, and on chance. So a few cases run again at the end o
 first ones, when the controller was new, and others, in reverse order. Their motion must be the same
 to the last bit. The VUTs of this package need no such check.
 
+Where a campaign repeats cases (`--repeat`), chance is expected, and what it keeps from one episode
+to the next is not: what differed runs twice more, each time from the beginning in a new process.
+
 repeats.jsonl           in the folder of the campaign: one line per case that ran twice
 
 The file of a folder that somebody sent is data as everything in it.
@@ -15,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -49,6 +52,8 @@ class Repeat:
         end: how the case ended the second time.
         failed: whether it failed the second time.
         other_verdict: whether it ended or failed otherwise than the first time.
+        drawn: whether it differs by chance, and not by what ran before it: it differs in two new
+            processes that run the same cases. None where that was not looked for.
     """
 
     index: int
@@ -57,6 +62,7 @@ class Repeat:
     end: End
     failed: bool
     other_verdict: bool
+    drawn: bool | None = None
 
     @property
     def same(self) -> bool:
@@ -65,17 +71,19 @@ class Repeat:
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
-        return asdict(self)
+        return {name: v for name, v in asdict(self).items() if (name, v) != ("drawn", None)}
 
 
 def repeat(
     run: Run,
     settings: CampaignSettings,
     run_cases: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
+    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
 ) -> list[Repeat]:
     """Run some cases of a campaign again; return what became of them, in the order of the cases.
 
-    Cases whose trajectory is lost, and those that end in an error now, are left out.
+    Cases whose trajectory is lost, and those that end in an error now, are left out. `run_anew`
+    runs cases in a process in which none ran before.
     """
     chosen = chosen_again(run.outcomes, settings)
     recorded = run.trajectories(outcome.index for outcome in chosen)
@@ -84,7 +92,24 @@ def repeat(
     for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
         if not ran.measures.end.is_error:  # of a slow machine, perhaps
             found.append(compared(again[place], recorded[again[place].index], ran))
+    if settings.repeat != 1 and not all(one.same for one in found):
+        drawn = _drawn([outcome.case for outcome in again], run_anew)
+        by_index = dict(zip((outcome.index for outcome in again), drawn, strict=True))
+        found = [one if one.same else replace(one, drawn=by_index[one.index]) for one in found]
     return sorted(found, key=lambda one: one.index)
+
+
+def _drawn(
+    cases: Sequence[Case],
+    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
+) -> list[bool]:
+    """Return which of some cases differ between two new processes that run the same cases."""
+    first, second = (dict(run_anew(cases)) for _ in range(2))
+    places = range(len(cases))
+    return [
+        _difference(first[place].trajectory, second[place].trajectory) != (None, None)
+        for place in places
+    ]
 
 
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
@@ -156,7 +181,7 @@ def read_repeats(run: Run) -> list[Repeat]:
 def unrepeatable(found: Iterable[Repeat]) -> str | None:
     """Return how many cases did not repeat, and what that means; None where each did."""
     known = list(found)
-    differing = [one for one in known if not one.same]
+    differing = [one for one in known if not (one.same or one.drawn)]
     if not differing:
         return None
     verdicts = sum(one.other_verdict for one in differing)
@@ -164,11 +189,15 @@ def unrepeatable(found: Iterable[Repeat]) -> str | None:
     by = {one.first for one in differing}
     who = {"vut": "VUT", "pov": "POV"}.get(next(iter(by)) or "", "") if len(by) == 1 else ""
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
+    who = who or "VUT or the POV"
+    why = cause(who)
+    if all(one.drawn is False for one in differing):
+        why = f"The {who} keeps something from earlier episodes"
     cases = "case that ran" if len(known) == 1 else "cases that ran"
     return (
         f"Not repeatable: {len(differing)} of {len(known)} {cases} twice went differently the "
         f"second time, {verdicts or 'none'} of them with another verdict (case {example.index}"
-        f"{since}). {cause(who or 'VUT or the POV')}: a result depends on more than its case, and "
+        f"{since}). {why}: a result depends on more than its case, and "
         "other workers or another order may give others."
     )
 

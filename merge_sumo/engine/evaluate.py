@@ -183,6 +183,15 @@ def evaluate(
             yield from enumerate(results, start=first)
 
 
+def evaluate_anew(plan: SimulationPlan, cases: Sequence[Case]) -> list[tuple[int, CaseResult]]:
+    """Run cases in this process, with drivers that drove nothing before; return as `evaluate`."""
+    close_simulator()
+    try:
+        return list(evaluate(plan, cases, THIS_PROCESS))
+    finally:
+        close_simulator()
+
+
 def evaluate_chunks(
     plan: SimulationPlan,
     chunks: Iterable[Sequence[Case]],

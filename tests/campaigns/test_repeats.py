@@ -189,6 +189,17 @@ def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_
     assert "It draws random numbers, reads a clock" in checked.stdout
 
 
+@pytest.mark.parametrize(("source", "chance"), [(RANDOM, True), (IN_ITS_MODULE, False)])
+def test_where_cases_repeat_chance_is_expected_and_memory_is_not(vut, tmp_path, source, chance):
+    run = campaign(vut(source), tmp_path / "run", cases=60, repeat="auto")
+    differing = [one for one in read_repeats(run) if not one.same]
+    assert differing
+    assert {one.drawn for one in differing} == {chance}
+    said = unrepeatable(differing)
+    assert (said is None) is chance
+    assert chance or "The VUT keeps something from earlier episodes: " in said
+
+
 def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path):
     run = campaign("design2", tmp_path / "run", pov=vut(IN_ITS_MODULE), levels=(0, 3), cases=80)
     repeats = read_repeats(run)
@@ -273,6 +284,7 @@ HONEST = Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=True).to_
         {"first": "<script>"},
         {"end": "GONE"},
         {"failed": None},
+        {"drawn": "no"},
         {"more": 1},
     ],
 )

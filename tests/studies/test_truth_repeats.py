@@ -11,6 +11,7 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
+from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.chance import MOST_RUNS, is_decided
 from merge_sumo.values.scenario import US23
@@ -34,7 +35,7 @@ def stops(seed: int) -> bool:
     return random.Random(seed).random() < 0.4  # noqa: S311
 
 
-def truth_of(**keywords: float) -> ms.Truth:
+def truth_of(**keywords: float) -> Truth:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it says that an object drives in this process
         fails = 'end == "TIMEOUT"'
@@ -45,6 +46,8 @@ def truth_of(**keywords: float) -> ms.Truth:
 def test_each_case_runs_until_it_is_decided_as_the_coin_says(tolerated, most):
     repeat = {} if most == MOST_RUNS else {"repeat": most}
     truth = truth_of(tolerated=tolerated, **repeat)
+    assert truth.runs is not None
+    assert truth.failed_runs is not None
     failing = []
     for place, case in enumerate(from_unit(truth.points, 0, scenario=US23)):
         fell: list[bool] = []
