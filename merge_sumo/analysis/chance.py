@@ -65,7 +65,7 @@ def chance_in(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> ChanceSumm
     cases = by_case(known)
     repeated = [one for one in cases if one.runs > 1]
     failing = [one for one in cases if fails_above(one, tolerated)]
-    varied = [one for one in repeated if len({o.measures for o in one.outcomes}) > 1]
+    varied = [one for one in repeated if one.varies]
     untold = [
         one
         for one in failing

@@ -44,6 +44,7 @@ MEANING: Final = {
     Change.BROKE: "A passes, B fails",
     Change.FIXED: "A fails, B passes",
     Change.BOTH_FAIL: "A fails, and so does B",
+    Change.WITHIN_CHANCE: "one fails and the other does not, by no more than chance",
     Change.NO_VERDICT_OF_A: "A ends with an error or a timeout",
     Change.NO_VERDICT_OF_B: "B ends with an error or a timeout",
     Change.NO_VERDICT: "both end with an error or a timeout",
@@ -180,7 +181,7 @@ def comparison_page(
         why=compared.worse(tolerance),
         tolerance=tolerance,
         counts=_counts(compared),
-        changes=list(Change),
+        changes=compared.named_changes,
         # What broke lies on top.
         maps={
             level: map_of([(c.case, MARKS.get(c.change, "unknown")) for c in reversed(cases)])

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from functools import partial
+from itertools import chain
 from operator import itemgetter
 from typing import Any, Final
 
@@ -35,6 +36,7 @@ from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.hashing import changed
 from merge_sumo.system.printable import counted
 from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.chance import RunsOfCase, by_case, one_per_case
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import US23, level_name
 from merge_sumo.values.score import Outcome
@@ -52,10 +54,16 @@ SAME_SCORE: Final = 1e-6
 VOLUME_NOISE: Final = 2e-4
 """Share of a volume in three dimensions that is rounding of the integral (see `fmc`)."""
 SHARE_ROUNDING: Final = 1e-9
+SIGNIFICANT: Final = 0.05
+"""Chance of the runs of a case in equal versions, up to which a change is none of chance."""
 
 
 class Change(StrEnum):
-    """What became of a case from A to B; an error or a timeout is no verdict."""
+    """What became of a case from A to B; an error or a timeout is no verdict.
+
+    A case whose runs are not alike may fail with one and pass with the other by chance: it is
+    `WITHIN_CHANCE` where Fisher's exact test does not tell the shares of failing runs apart.
+    """
 
     FIXED = "fixed"
     BROKE = "broke"
@@ -64,11 +72,13 @@ class Change(StrEnum):
     NO_VERDICT_OF_B = "no verdict of B"
     NO_VERDICT = "no verdict"
     NOT_RUN_AGAIN = "not run again"
+    WITHIN_CHANCE = "within chance"
 
 
 MOST_TELLING: Final = (
     *(Change.BROKE, Change.NO_VERDICT_OF_B, Change.NOT_RUN_AGAIN),
-    *(Change.NO_VERDICT, Change.BOTH_FAIL, Change.NO_VERDICT_OF_A, Change.FIXED),
+    *(Change.NO_VERDICT, Change.WITHIN_CHANCE, Change.BOTH_FAIL),
+    *(Change.NO_VERDICT_OF_A, Change.FIXED),
 )
 """The order in which cases are listed; those of the first three are to be looked at."""
 
@@ -82,12 +92,16 @@ class ComparedCase:
         index: its index there.
         a: its outcome with A; None where A was not run. One of the two is known.
         b: its outcome with B.
+        runs_a: its runs with A, of which `a` is the deciding one; None for a single one.
+        runs_b: its runs with B.
     """
 
     run: str
     index: int
     a: Outcome | None
     b: Outcome | None
+    runs_a: RunsOfCase | None = None
+    runs_b: RunsOfCase | None = None
 
     @property
     def case(self) -> Case:
@@ -102,19 +116,39 @@ class ComparedCase:
         a, b = self.a, self.b
         if a is None or b is None:
             return Change.NOT_RUN_AGAIN
-        if not (a.is_tested or b.is_tested):
-            return Change.NO_VERDICT
-        if not a.is_tested:
-            return Change.NO_VERDICT_OF_A
-        if not b.is_tested:
-            return Change.NO_VERDICT_OF_B
+        if not (a.is_tested and b.is_tested):
+            silent = {
+                (False, True): Change.NO_VERDICT_OF_A,
+                (True, False): Change.NO_VERDICT_OF_B,
+                (False, False): Change.NO_VERDICT,
+            }
+            return silent[a.is_tested, b.is_tested]
         if a.failed and b.failed:
             return Change.BOTH_FAIL
+        if self.chance is not None and self.chance > SIGNIFICANT:
+            return Change.WITHIN_CHANCE
         return Change.BROKE if b.failed else Change.FIXED
+
+    @property
+    def chance(self) -> float | None:
+        """The chance of shares of failing runs as different as these, or more, in equal versions.
+
+        By Fisher's exact test; None where the runs with each version are alike.
+        """
+        runs = [one for one in (self.runs_a, self.runs_b) if one is not None]
+        if len(runs) < 2 or not any(one.varies for one in runs):
+            return None
+        from scipy.stats import fisher_exact
+
+        table = [[one.failures, one.runs - one.failures] for one in runs]
+        return float(fisher_exact(table)[1])
 
     @property
     def became(self) -> str:
         """What it was and is in words; where these are the same, which of them is a failure."""
+        if self.chance is not None and self.runs_a is not None and self.runs_b is not None:
+            both = f"{self.runs_a.in_words} -> {self.runs_b.in_words}"
+            return f"{both}, by Fisher's exact test p = {self.chance:.2g}"
         both = [outcome for outcome in (self.a, self.b) if outcome is not None]
         words = [outcome.measures.became for outcome in both]
         if len(set(words)) == 1:
@@ -135,6 +169,9 @@ class ComparedCase:
             record[f"score_{name}"] = None if outcome is None else outcome.score
             record[f"end_{name}"] = None if measures is None else measures.end
             record[f"severity_{name}"] = None if measures is None else measures.severity
+        for name, runs in ((a, self.runs_a), (b, self.runs_b)):
+            if runs is not None:
+                record |= {f"runs_{name}": runs.runs, f"failed_runs_{name}": runs.failures}
         return record
 
 
@@ -251,14 +288,21 @@ class RunComparison(Result):
         more = {"merging": merging} if merging else {}
         return {"levels": levels, "cases": cases, "evidence": self.evidence, **more}
 
+    @property
+    def named_changes(self) -> list[Change]:
+        """The changes that tables name: chance only where it is in some case."""
+        known = {name for of_level in self.levels.values() for name in of_level.changes}
+        return [change for change in Change if change in known or change != Change.WITHIN_CHANCE]
+
     def lines(self) -> list[str]:
         """Return a table of what changed, level by level, and how that is known."""
+        shown = self.named_changes
         table = [
             f"{'level':<6} {'FMC A':>8} {'FMC B':>8} {'fixed':>8} {'broke':>8}   "
-            f"cases: {', '.join(Change)}"
+            f"cases: {', '.join(shown)}"
         ]
         for level, of_level in self.levels.items():
-            changes = ", ".join(str(of_level.changes[change]) for change in Change)
+            changes = ", ".join(str(of_level.changes.get(change, 0)) for change in shown)
             table.append(
                 f"{level_name(level):<6} {of_level.fmc_a:8.4f} {of_level.fmc_b:8.4f} "
                 f"{of_level.fmc_fixed:8.4f} {of_level.fmc_broke:8.4f}   {changes}"
@@ -297,7 +341,7 @@ def _level_change(
     fails_b = [c.case for c in cases if c.b is not None and c.b.failed]
     # Where one fails and the other gives no verdict, or could not be run, nothing is known to be
     # fixed and nothing to be broken. Records alone are compared as they are.
-    silent = {Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B}
+    silent = {Change.NO_VERDICT_OF_A, Change.NO_VERDICT_OF_B, Change.WITHIN_CHANCE}
     silent |= set() if records_only else {Change.NOT_RUN_AGAIN}
     unknown = [
         c.case for c in cases if c.change in silent and any(o and o.failed for o in (c.a, c.b))
@@ -328,8 +372,15 @@ def _level_change(
         fmc_b=fmc_b,
         fmc_fixed=max(either - volume(fails_b + unknown), 0.0),
         fmc_broke=max(either - volume(fails_a + unknown), 0.0),
-        changes={change.value: sum(case.change is change for case in cases) for change in Change},
+        changes=_counts(cases),
     )
+
+
+def _counts(cases: Sequence[ComparedCase]) -> dict[str, int]:
+    """Return how many cases changed how; chance is named where it is in them."""
+    counts = Counter(case.change for case in cases)
+    named = [change for change in Change if counts[change] or change != Change.WITHIN_CHANCE]
+    return {change.value: counts[change] for change in named}
 
 
 def _comparison(
@@ -393,7 +444,7 @@ def compare_runs(
     if not levels:
         raise UserError(f"{a.folder} and {b.folder} have no POV level in common")
     check_comparable(a, b, levels)
-    own_a, own_b = ([o for o in run.outcomes if o.case.level in levels] for run in (a, b))
+    own_a, own_b = ([o for o in run.cases if o.case.level in levels] for run in (a, b))
     for run, own in ((a, own_a), (b, own_b)):
         if not own:
             raise UserError(f"{run.folder} has no case at a POV level of both: it shows nothing")
@@ -409,11 +460,20 @@ def compare_runs(
                     f"{run.folder} was run on another net than {road.path}: give that with --net, "
                     "or compare the records with --no-rerun"
                 )
-        again_b = _run_again(b, telling_a, road, given, partial(on_motion, "A"), trust=trust)
-        again_a = _run_again(a, telling_b, road, given, partial(on_motion, "B"), trust=trust)
+        again_b = _run_again(b, a, telling_a, road, given, partial(on_motion, "A"), trust=trust)
+        again_a = _run_again(a, b, telling_b, road, given, partial(on_motion, "B"), trust=trust)
+    runs_a, runs_b = (_repeated(run.outcomes) for run in (a, b))
     cases = [
-        *(ComparedCase("A", o.index, o, again_b.outcomes.get(o.index)) for o in telling_a),
-        *(ComparedCase("B", o.index, again_a.outcomes.get(o.index), o) for o in telling_b),
+        *(
+            ComparedCase("A", o.index, o, again_b.outcomes.get(o.index), *pair)
+            for o in telling_a
+            for pair in [(runs_a.get(o.case.start), again_b.runs.get(o.case.start))]
+        ),
+        *(
+            ComparedCase("B", o.index, again_a.outcomes.get(o.index), o, *pair)
+            for o in telling_b
+            for pair in [(again_a.runs.get(o.case.start), runs_b.get(o.case.start))]
+        ),
     ]
     evidence = (
         f"with {_in_words(own_a)} of A, B {again_b.how}; "
@@ -440,6 +500,11 @@ def check_comparable(a: Run, b: Run, levels: Iterable[int]) -> None:
             f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
             f"{b.criterion.text}: compare campaigns with the same --fail-when"
         )
+    if a.tolerated != b.tolerated:
+        raise UserError(
+            f"{a.folder} tolerates {a.tolerated:g} of the runs of a case and {b.folder} "
+            f"{b.tolerated:g}: compare campaigns with the same --tolerate"
+        )
     for level in levels:
         if not same_pov(a.settings, b.settings, level):
             raise UserError(
@@ -459,14 +524,24 @@ def _in_words(own: Iterable[Outcome]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _RunAgain:
-    """How a VUT was run in the other one's telling cases, and the outcomes by index."""
+    """How a VUT was run in the other one's telling cases, and the outcomes by index.
+
+    `runs` has the cases that ran several times, by their start.
+    """
 
     how: str
     outcomes: dict[int, Outcome] = field(default_factory=dict)
+    runs: dict[Case, RunsOfCase] = field(default_factory=dict)
+
+
+def _repeated(outcomes: Iterable[Outcome]) -> dict[Case, RunsOfCase]:
+    """Return the cases that ran several times by their start."""
+    return {one.case: one for one in by_case(outcomes) if one.runs > 1}
 
 
 def _run_again(
     run: Run,
+    other: Run,
     telling: Sequence[Outcome],
     net: Corridor,
     given: Mapping[str, object] | None,
@@ -474,27 +549,47 @@ def _run_again(
     *,
     trust: bool,
 ) -> _RunAgain:
-    """Run a campaign's VUT in the other's telling cases, if it is still the same VUT."""
+    """Run a campaign's VUT in the other's telling cases, if it is still the same VUT.
+
+    A case runs with as many draws as it has there. Where chance decides, the same files are the
+    same VUT, as the same score need not be.
+    """
     if not telling:
         return _RunAgain("had nothing to run")
     scored = [o for o in run.outcomes if o.score is not None]
     checked = sorted(scored, key=lambda o: (o.score, o.index))[:CHECKED]
-    cases = [o.case for o in (*checked, *telling)]
+    repeated = _repeated(other.outcomes)
+    draws = [[o.case for o in _runs_of(o, repeated)] for o in telling]
+    cases = [*(o.case for o in checked), *chain.from_iterable(draws)]
     settings = settings_of(run.folder, run.settings, given, trust=trust)
     plan = resolve(settings, net.path).for_cases(len(cases))
+    shows_chance = any(one.varies for one in _repeated(run.outcomes).values())
     results = [result for _, result in sorted(evaluate(plan, cases), key=itemgetter(0))]
     for before, result in zip(checked, results, strict=False):
         now = result.outcome(before.index)
+        if shows_chance and _same_vut(run, settings):
+            break
         if before.score is None or now.score is None or abs(before.score - now.score) > SAME_SCORE:
             return _RunAgain(
                 "could not be run: its VUT or its POV does not do again what case "
                 f"{before.index} records"
             )
-    again = _RunAgain("was run again")
-    for other, result in zip(telling, results[len(checked) :], strict=True):
-        on_motion(other.index, result.trajectory)
-        again.outcomes[other.index] = result.outcome(other.index)
+    again, ran = _RunAgain("was run again"), iter(results[len(checked) :])
+    for one, of_case in zip(telling, draws, strict=True):
+        of_runs = [next(ran) for _ in of_case]
+        outcomes = [result.outcome(one.index) for result in of_runs]
+        deciding = one_per_case(outcomes, run.tolerated)[0]
+        place = next(n for n, outcome in enumerate(outcomes) if outcome.case == deciding.case)
+        on_motion(one.index, of_runs[place].trajectory)
+        again.outcomes[one.index] = deciding
+        again.runs.update(_repeated(outcomes))
     return again
+
+
+def _runs_of(one: Outcome, repeated: Mapping[Case, RunsOfCase]) -> Sequence[Outcome]:
+    """Return the runs of the case of an outcome."""
+    known = repeated.get(one.case.start)
+    return (one,) if known is None else known.outcomes
 
 
 # One campaign of both versions, which ran the same cases.
@@ -514,13 +609,24 @@ def compare_against(run: Run) -> RunComparison | None:
     return _comparison(cases, before, run.outcomes, run.levels, evidence, same_cases=True)
 
 
-def _telling(before: Sequence[Outcome], after: Sequence[Outcome], run: str) -> list[ComparedCase]:
+def _telling(
+    before: Sequence[Outcome], after: Sequence[Outcome], run: str, tolerated: float = 0.0
+) -> list[ComparedCase]:
     """Return the same cases of A and B in which one failed or gave no verdict."""
-    return [
-        ComparedCase(run, a.index, a, b)
-        for a, b in zip(before, after, strict=True)
-        if any(o.failed or not o.is_tested for o in (a, b))
-    ]
+    runs: dict[tuple[Case, int], list[tuple[Outcome, Outcome]]] = {}
+    repeated = {outcome.case.start for outcome in before if outcome.case.draw}
+    for a, b in zip(before, after, strict=True):
+        # A case without repeats may be there twice.
+        number = 0 if a.case.start in repeated else a.index
+        runs.setdefault((a.case.start, number), []).append((a, b))
+    cases = []
+    for (start, _), pairs in runs.items():
+        both = [list(of) for of in zip(*pairs, strict=True)]
+        deciding = [one_per_case(of, tolerated)[0] for of in both]
+        known = [_repeated(of).get(start) for of in both]
+        if any(outcome.failed or not outcome.is_tested for outcome in deciding):
+            cases.append(ComparedCase(run, pairs[0][0].index, *deciding, *known))
+    return cases
 
 
 # One campaign: its recorded cases with a changed VUT.
@@ -548,6 +654,10 @@ class Rerun(Result):
     @property
     def changed(self) -> list[ComparedCase]:
         """The cases whose verdict changed, in the order of the campaign."""
+        if any(outcome.case.draw for outcome in self.before):
+            others = (Change.BOTH_FAIL, Change.WITHIN_CHANCE, Change.NO_VERDICT)
+            known = (case for case in self.compared.cases if case.change not in others)
+            return sorted(known, key=lambda case: case.index)
         return [
             ComparedCase("A", a.index, a, b)
             for a, b in zip(self.before, self.after, strict=True)
@@ -638,9 +748,10 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Rerun:
             study.on_cases(1)
     after = [by_index[outcome.index] for outcome in before]
     evidence = f"{counted(len(before), 'case')} ran again"
-    compared = _comparison(
-        _telling(before, after, "A"), before, after, levels, evidence, same_cases=True
-    )
+    share = run.tolerated
+    own = one_per_case(before, share), one_per_case(after, share)
+    telling = _telling(before, after, "A", share)
+    compared = _comparison(telling, *own, levels, evidence, same_cases=True)
     unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
     return Rerun(settings.vut, before, after, compared, unrepeated)
 

@@ -58,6 +58,11 @@ class RunsOfCase:
         return self.failures / self.runs
 
     @property
+    def varies(self) -> bool:
+        """Whether its runs differ in a measure: then chance is in them."""
+        return any(outcome.measures != self.outcomes[0].measures for outcome in self.outcomes)
+
+    @property
     def in_words(self) -> str:
         """How many of the runs fail."""
         return f"{self.failures} of {counted(self.runs, 'run')} fail{'s' * (self.failures == 1)}"
