@@ -460,7 +460,8 @@ def _recorded_case(
     settings = settings_today(run, {**fields, **ONE, "levels": (number,)}, trust=trust)
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(number)))
     kept = {name: getattr(before, name) for name in names}
-    return settings, case_of(settings.scenario, number, {**kept, **values})
+    case = case_of(settings.scenario, number, {**kept, **values})
+    return settings, replace(case, draw=before.draw)
 
 
 def _given_case(
@@ -479,7 +480,19 @@ def _given_case(
     policies = policies_folder(setup.get("policies"), scenario)
     number = one_level(name, policies, scenario.levels, own=own)
     settings = CampaignSettings(**fields, **ONE, levels=(number,))
-    return settings, case_of(settings.scenario, number, {**coordinates, **values})
+    case = case_of(settings.scenario, number, {**coordinates, **values})
+    return settings, replace(case, draw=_draw_of(row))
+
+
+def _draw_of(row: Mapping[str, Any]) -> int:
+    """Return the draw of a row of a table; an empty field of one with repeats is the first."""
+    draw = row.get("draw")
+    if draw is None or draw != draw:  # noqa: PLR0124 (NaN of a data frame)
+        return 0
+    try:
+        return int(draw)
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(f"draw is {draw!r:.60}: it must be a whole number") from None
 
 
 def rerun(

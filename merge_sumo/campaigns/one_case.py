@@ -25,6 +25,7 @@ ONE: Final[dict[str, Any]] = {
     "sampler": "uniform",
     "stop_after_converged": None,
     "audit": None,
+    "repeat": 1,
 }
 """Settings of a campaign that is one case."""
 DEBUG_DEADLINE_S: Final = 86_400.0

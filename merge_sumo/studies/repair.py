@@ -289,8 +289,10 @@ def fresh_settings(
         name: None if (known := getattr(today, name)) is None or known > cases else known
         for name in ("batch", "in_flight", "audit")
     }
+    repeat = today.repeat if isinstance(today.repeat, str) else min(today.repeat, cases)
     return replace(
         today,
+        repeat=repeat,
         vut=spec,
         seed=today.seed + asked.seed + number,
         cases=cases,

@@ -10,13 +10,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigning import resume_campaign, run_campaign
 
+from merge_sumo import api
+from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.testing.contracts import SamplerContract, play, play_case
 from merge_sumo.values.case import Case, Pool
 from merge_sumo.values.chance import by_case, failing_cases, is_decided
+from merge_sumo.values.imperfection import Sensing
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
@@ -172,3 +178,85 @@ def test_decisions_that_add_coverage_come_first():
     first, second, *_ = sampler.ask(4)
     # By Jeffreys' prior a second failure decides: P(share > .2) = .959 with Beta(1.5, .5).
     assert (first, second) == (replace(far, draw=1), replace(beside, draw=1))
+
+
+SEEDED = """
+import random
+class Vut:
+    def reset(self, seen, seed):
+        self.bold = random.Random(seed).random() < 0.5
+    def act(self, seen):
+        if self.bold:
+            return 0.5
+        return -1.5 if seen.x_pov_m < seen.x_vut_m + 40.0 and seen.x_vut_m > -120.0 else 0.3
+"""
+
+
+class TestACampaign:
+    """A controller that draws by the seed is repeatable: the same bytes, however it ran."""
+
+    def settings(self, tmp_path, **given) -> CampaignSettings:
+        vut = tmp_path / "seeded.py"
+        vut.write_text(SEEDED)
+        known = {"levels": (0,), "cases": 60, "sampler": "gpr", "batch": 10, "tolerated": 0.3}
+        known |= {"vut": f"{vut}:Vut", "repeat": "auto", "scenario": US23, "in_process": True}
+        return CampaignSettings(**{**known, **given})
+
+    @pytest.mark.parametrize(
+        "given", [{}, {"repeat": 3, "sampler": "uniform"}, {"batch": None, "in_flight": 6}], ids=str
+    )
+    def test_goes_on_to_the_byte(self, tmp_path, given):
+        settings, folder = self.settings(tmp_path, **given), tmp_path / "run"
+        run = run_campaign(settings, folder)
+        repeats = [outcome for outcome in run.outcomes if outcome.case.draw]
+        assert len(repeats) >= 2
+        path = folder / "outcomes.jsonl"
+        before = path.read_bytes()
+        path.write_bytes(b"".join(before.splitlines(keepends=True)[:35]))
+        resume_campaign(folder)
+        assert path.read_bytes() == before
+        assert [one for one in read_repeats(run) if not one.same] == []
+        again = api.run_case(settings.vut, recorded=(folder, repeats[0].index), in_process=True)
+        assert again.outcome.case == repeats[0].case
+        assert again.measures == repeats[0].measures
+        row = api.open_run(folder).cases[repeats[0].index]
+        as_row = api.run_case(settings.vut, case=row, in_process=True, fail_when=settings.fail_when)
+        assert as_row.outcome.case == repeats[0].case
+
+    def test_refuses_other_repeats_of_a_folder(self, tmp_path):
+        run_campaign(self.settings(tmp_path, cases=20), tmp_path / "run")
+        for name, value in (("repeat", 3), ("tolerated", 0.1)):
+            with pytest.raises(UserError, match=f"^{name} differs"):
+                resume_campaign(tmp_path / "run", {name: value, "cases": 40})
+
+    def test_has_its_audit_cases_in_their_places(self, tmp_path):
+        settings = self.settings(tmp_path, audit=12, batch=None)
+        run = run_campaign(settings, tmp_path / "run")
+        audit = settings.audit_plan
+        marked = [outcome for outcome in run.outcomes if outcome.audit is not None]
+        assert [outcome.case for outcome in marked] == [
+            audit.case(index) for index in range(60) if index in audit
+        ]
+        repeated = [outcome for outcome in run.outcomes if outcome.case.draw]
+        assert repeated
+        assert not [outcome for outcome in repeated if outcome.audit is not None]
+
+    def test_counts_cases_and_not_runs_in_what_it_says(self, tmp_path):
+        run_campaign(self.settings(tmp_path), tmp_path / "run")
+        opened = api.results.CampaignRun(tmp_path / "run", gates=["failures"])
+        failing = failing_cases(opened.run.outcomes, 0.3)
+        assert opened.summary.failures == opened.verdict.failures == len(failing)
+        assert opened.chance.cases == opened.verdict.cases == len(by_case(opened.run.outcomes))
+        assert opened.chance.runs == 60
+        assert len(opened.failures) == len(failing)
+        assert opened.gates[0].found.startswith(f"{len(failing)} failure")
+        assert opened.to_record()["chance"]["tolerated"] == 0.3
+
+
+def test_the_package_s_own_vuts_repeat_nothing_without_noise():
+    settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=US23)
+    sampler = settings.new_sampler()
+    assert settings.with_repeats(sampler) is sampler
+    noisy = replace(US23, sense=Sensing(noise_x_m=1.0))
+    settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=noisy)
+    assert isinstance(settings.with_repeats(sampler), RepeatedWhereItMatters)
