@@ -93,7 +93,8 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
     limit = float((FAILURE_SCORE - mean) / deviation)
     told = _fitted(history.points, (history.score - mean) / deviation)
 
-    class Straddle(AcquisitionFunction):
+    # Without botorch its classes have no types.
+    class Straddle(AcquisitionFunction):  # type: ignore[misc, unused-ignore]
         """kappa sigma - |mu - limit|, for one point at a time."""
 
         def __init__(self) -> None:
