@@ -178,7 +178,9 @@ class TestDifferences:
         out = tmp_path / "run"
         run = ms.campaign(Fickle, level=0, sampler="uniform", cases=5, seed=2, out=out)
         Fickle.stops = True
-        found = ms.crosscheck(run).found
+        with pytest.warns(UserWarning, match="known to this process alone") as warned:
+            found = ms.crosscheck(run).found
+        assert warned[0].filename == __file__, "the line of who calls the verb"
         assert found.verdicts is not None
         one = found.verdicts.differences[0]
         assert one.reason.startswith("the VUT answers otherwise")
