@@ -189,7 +189,6 @@ class DriverWrapper(Driver):
     """Drives by another driver, and passes on what it does not change."""
 
     def __init__(self, driver: Driver) -> None:
-        """Take the driver."""
         super().__init__(driver.corridors)
         self._driver = driver
 

@@ -60,7 +60,6 @@ class Following:
     """Keeps the cars of the mainline in K corridors from driving into each other."""
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for a number of corridors."""
         self._decel = np.ones(corridors)
         self._tau = np.ones(corridors)
         self._taken = np.zeros(corridors)

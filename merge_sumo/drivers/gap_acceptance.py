@@ -35,7 +35,6 @@ class GapDesign:
     brake_mps2: float
 
     def __post_init__(self) -> None:
-        """Check the signs."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0.0):

@@ -36,7 +36,6 @@ class GapChoice:
     brake_mps2: float = 3.0
 
     def __post_init__(self) -> None:
-        """Check the signs."""
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0.0):

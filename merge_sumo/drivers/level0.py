@@ -45,7 +45,6 @@ class Level0Pov(Driver):
     """Keeps the acceleration that its case gives it; at a merge that is 0."""
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for a number of corridors."""
         super().__init__(corridors)
         self._a_mps2 = np.zeros(corridors)
 
@@ -62,7 +61,6 @@ class Level0Vut(Driver):
     """Accelerates as the scenario's level-0 profile says and holds its speed: 1 m/s2 to 28 m/s."""
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for a number of corridors."""
         super().__init__(corridors)
         self.a_mps2 = np.full(corridors, US23.level0_a_mps2)
         self.v_cruise_mps = np.full(corridors, US23.level0_v_mps)

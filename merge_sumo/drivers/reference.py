@@ -82,7 +82,6 @@ class RampDriver(Level0Vut):
     model: SafetyModel
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for a number of corridors."""
         super().__init__(corridors)
         self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)
         self.accel_mps2 = np.full(corridors, US23.a_max_mps2)
@@ -270,7 +269,6 @@ class CarefulPov(Driver):
     """
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for a number of corridors."""
         super().__init__(corridors)
         self._reaction = Reaction(corridors, CarefulModel())
         self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)

@@ -246,7 +246,6 @@ class Reaction:
     """
 
     def __init__(self, corridors: int, model: SafetyModel) -> None:
-        """Prepare for a number of corridors."""
         self._model = model
         self._waited = np.zeros(corridors, dtype=np.int64)
         self._braking_mps2 = np.full(corridors, model.released_mps2)

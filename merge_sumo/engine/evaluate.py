@@ -108,7 +108,6 @@ class CaseResults(Sequence[CaseResult]):
         ]
 
     def __len__(self) -> int:
-        """Return the number of cases."""
         return len(self.trajectories)
 
     @overload
@@ -116,7 +115,6 @@ class CaseResults(Sequence[CaseResult]):
     @overload
     def __getitem__(self, place: slice) -> list[CaseResult]: ...
     def __getitem__(self, place: int | slice) -> CaseResult | list[CaseResult]:
-        """Return a result, or some of them."""
         return self._measured[place]
 
 
@@ -128,7 +126,6 @@ class CasesAt(Sequence[Case]):
         self.pool, self.level, self.points, self.draw = pool, level, points, draw
 
     def __len__(self) -> int:
-        """Return the number of cases."""
         return len(self.points)
 
     @overload
@@ -136,13 +133,11 @@ class CasesAt(Sequence[Case]):
     @overload
     def __getitem__(self, place: slice) -> CasesAt: ...
     def __getitem__(self, place: int | slice) -> Case | CasesAt:
-        """Return a case, or some of them."""
         if isinstance(place, slice):
             return CasesAt(self.pool, self.level, self.points[place], self.draw)
         return next(iter(CasesAt(self.pool, self.level, self.points[place][None], self.draw)))
 
     def __iter__(self) -> Iterator[Case]:
-        """Make the cases."""
         cases = self.pool.cases(self.points, self.level)
         return iter(cases if self.draw == 0 else [replace(case, draw=self.draw) for case in cases])
 

@@ -86,11 +86,9 @@ class Simulator:
         self._opened.close()
 
     def __enter__(self) -> Self:
-        """Return the simulator."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close it."""
         self.close()
 
 

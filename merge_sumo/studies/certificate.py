@@ -102,7 +102,6 @@ class CoveringLattice:
     steps: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         same = len(self.steps) == 2 or len(set(self.steps)) == 1
         if len(self.steps) not in (2, 3) or min(self.steps) < 1 or not same:
             raise UserError(f"there is no covering lattice with steps {self.steps}")
@@ -121,7 +120,6 @@ class CoveringLattice:
         return (p * p + h * h) / (2.0 * h) if len(self.steps) == 2 else math.sqrt(5.0) / 2.0 * p
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return sum(math.prod(self._shape(odd)) for odd in (0, 1))
 
     def points(self, first: int, end: int) -> FloatArray:

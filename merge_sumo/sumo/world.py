@@ -364,11 +364,9 @@ class World:
             self._libsumo.close()
 
     def __enter__(self) -> Self:
-        """Return the world."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the world."""
         self.close()
 
 
