@@ -305,8 +305,16 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     if kind is INSTALLED and spec.partition("?")[0] not in installed_vuts():
         raise UserError(_why_unknown(spec))
     if kind.hosted and not options.in_process and SUPPORTED:
-        return hosted_vut(FINDER, spec, options)
+        # Facts of a Python controller do not depend on the values of its parameters.
+        alike = _without_values(spec) if kind in (PYTHON, INSTALLED) else spec
+        return hosted_vut(FINDER, spec, options, alike)
     return kind.prepare(_argument(spec), options)
+
+
+def _without_values(spec: str) -> str:
+    """Return a spec without the values of its parameters; `UserError` where one is no number."""
+    named, given = split_options(spec, spec)
+    return f"{named}?{'&'.join(sorted(numbers_of(given, spec)))}"
 
 
 def _why_unknown(spec: str) -> str:

@@ -7,6 +7,7 @@ import pytest
 from merge_sumo.drivers.rule_based import DESIGNS
 from merge_sumo.errors import UserError
 from merge_sumo.vuts.base import VutOptions, with_options
+from merge_sumo.vuts.host import hosted
 from merge_sumo.vuts.in_memory import keep
 from merge_sumo.vuts.registry import VutFactory, parameters_of
 
@@ -120,3 +121,22 @@ def test_a_built_in_design_keeps_what_is_not_set():
 def test_an_option_is_set_in_the_place_of_an_older_one():
     assert with_options("a.py:V?x=1&y=2", {"y": "3", "z": "4"}) == "a.py:V?x=1&y=3&z=4"
     assert with_options("design2", {"gap_m": "20"}) == "design2?gap_m=20"
+
+
+def test_a_process_is_opened_for_the_first_of_the_values_alone(file, monkeypatch):
+    opened: list[str] = []
+    host = hosted.Host
+
+    def counted(finder, spec, options):
+        opened.append(spec)
+        return host(finder, spec, options)
+
+    monkeypatch.setattr(hosted, "Host", counted)
+    for value in (1, 2, 3):
+        assert VutFactory(f"{file}:Vut?gain={value}").files
+    assert opened == [f"{file}:Vut?gain=1"]
+    with pytest.raises(UserError, match="gain is 'high': give a number"):
+        VutFactory(f"{file}:Vut?gain=high")
+    # Another name is another question: whether the controller has it is for its process to say.
+    VutFactory(f"{file}:Vut?late_m=2")
+    assert len(opened) == 2

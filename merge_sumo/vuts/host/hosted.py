@@ -50,12 +50,14 @@ LOOK_S: Final = 0.25
 ENDING_S: Final = 2.0
 
 
-def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
+def hosted_vut(finder: str, spec: str, options: VutOptions, alike: str | None = None) -> Vut:
     """Return a VUT whose code runs in a process of its own; `UserError` where it cannot be opened.
 
-    `finder` is the "MODULE:FUNCTION" that prepares it there, from spec and options.
+    `finder` is the "MODULE:FUNCTION" that prepares it there, from spec and options. VUTs that are
+    `alike`, by default those of the same spec, share their facts: only the first is opened for
+    them.
     """
-    facts = _facts(finder, spec, options)
+    facts = _facts(finder, spec, options, alike or spec)
 
     def make(corridors: int, _world: World | None) -> Driver:
         return HostedVut(corridors, finder, spec, options)
@@ -69,12 +71,13 @@ def hosted_vut(finder: str, spec: str, options: VutOptions) -> Vut:
 
 
 _known: dict[tuple[str, str, float], tuple[Mapping[str, Any], Files]] = {}
-"""Facts by spec, working folder and memory: no process is started where no file has changed."""
+"""Facts by what is alike, working folder and memory: no process is started where no file has
+changed."""
 
 
-def _facts(finder: str, spec: str, options: VutOptions) -> Mapping[str, Any]:
+def _facts(finder: str, spec: str, options: VutOptions, alike: str) -> Mapping[str, Any]:
     """Return the facts of a VUT."""
-    key = spec, str(Path.cwd()), options.memory_gib
+    key = alike, str(Path.cwd()), options.memory_gib
     if key not in _known or changed(_known[key][1]):
         host = _first(lambda: Host(finder, spec, options))
         host.kill()
