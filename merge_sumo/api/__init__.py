@@ -76,7 +76,7 @@ from merge_sumo.campaigns.scenario_suggestion import (
     suggested_lane_m,
     unseen,
 )
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
@@ -129,7 +129,7 @@ from merge_sumo.studies.entrants import LIMIT_S, check_spec
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.parameter_ranges import Range, default_ranges
-from merge_sumo.studies.run_study import RunStudy, same_system
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
 from merge_sumo.studies.truth import Repeats, Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
@@ -1169,7 +1169,7 @@ def repair(
         check_new(folder)
     today, plan, runner = _today(before, given, vut, stacklevel=5)
     runner = replace(runner, check=check)
-    same_system(before, record_of(today, plan))
+    RunStudy(before, today, plan).check_same_system()
     motions: dict[Path, dict[tuple[str, int], Trajectory]] = {}
     bars: list[Bars] = []
 
@@ -1252,12 +1252,8 @@ def explain(
     chosen = explanation.listed_failures(before, _listed(indices))
     asked = tuple(map(Range.parsed, params))
     with _study_of(before, given, "explained", len(chosen), "failures", engine=None) as study:
-        found = explanation.explain(
-            *(before, study.settings, study.plan, chosen),
-            ranges=asked or default_ranges(study.plan.vut),
-            workers=study.workers,
-            on_failures=study.on_cases,
-        )
+        ranges = asked or default_ranges(study.plan.vut)
+        found = explanation.explain(study, chosen, ranges=ranges)
     return ExplanationResult(before, tuple(found), target)
 
 

@@ -35,7 +35,6 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.campaigns.store import Run, failures, spread_failures
 from merge_sumo.engine.evaluate import evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
@@ -48,7 +47,7 @@ from merge_sumo.studies.parameter_changes import (
     pass_of,
 )
 from merge_sumo.studies.parameter_ranges import Range, check_names, todays_values
-from merge_sumo.studies.run_study import same_system
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, to_plain
 from merge_sumo.system.suggestions import either
@@ -213,32 +212,23 @@ def note_explanations(
 
 
 def explain(
-    run: Run,
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    chosen: Sequence[Outcome],
-    *,
-    ranges: Sequence[Range] = (),
-    workers: Workers | None = None,
-    on_failures: Callable[[int], None] = lambda _: None,
+    study: RunStudy, chosen: Sequence[Outcome], *, ranges: Sequence[Range] = ()
 ) -> list[Explanation]:
     """Explain failures of a campaign, and write that into its folder.
 
     Args:
-        run: the campaign.
-        settings: those of the campaign, except for what may be elsewhere.
-        plan: that of the settings, with the engine on which the search runs.
+        study: the campaign, and how its cases run; it is told how many failures have just been
+            explained, which are in the folder by then.
         chosen: the failures.
         ranges: parameters of the controller that are searched, too, with their ranges.
-        workers: where cases run, by default in this process.
-        on_failures: told how many have just been explained; those are in the folder.
 
     Raises:
         UserError: for a campaign with a net or policies of another day, without a failure, for a
             parameter that the controller does not have, and where a case that is run a second time
             ends otherwise.
     """
-    same_system(run, record_of(settings, plan))
+    study.check_same_system()
+    run, plan = study.run, study.plan
     if not chosen:
         raise UserError(f"{run.folder} has no failure: nothing can be explained")
     check_names(ranges)
@@ -246,13 +236,13 @@ def explain(
     # Without SUMO many cases at a time cost little; with it, each failure is kept as it is done.
     size = len(chosen) if plan.engine is Engine.KINEMATIC else 1
     found: list[Explanation] = []
-    with workers_or_here(workers) as opened:
+    with workers_or_here(study.workers) as opened:
         for first in range(0, len(chosen), size):
             part = chosen[first : first + size]
             some = _with_parameters(plan, part, _found(plan, part, opened), ranges, opened)
             _write(run, some)
             found += some
-            on_failures(len(some))
+            study.on_cases(len(some))
     return found
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,14 +38,13 @@ class RunStudy:
 
     def check_same_system(self) -> None:
         """Raise `UserError` where the campaign had another net or other policies than this plan."""
-        same_system(self.run, self.record())
-
-
-def same_system(run: Run, today: Mapping[str, Any]) -> None:
-    """Raise `UserError` where a run had another net or other policies than today's settings."""
-    for name in ("net_sha256", "policies_sha256"):
-        if run.settings.get(name) != today[name]:
-            what, others = ("net", "another") if name == "net_sha256" else ("policies", "other")
-            raise UserError(
-                f"{run.folder} was run with {others} {what}: name what it was run with, --{what}"
-            )
+        today, run = self.record(), self.run
+        for name, what, others in (
+            ("net_sha256", "net", "another"),
+            ("policies_sha256", "policies", "other"),
+        ):
+            if run.settings.get(name) != today[name]:
+                raise UserError(
+                    f"{run.folder} was run with {others} {what}: name what it was run with, "
+                    f"--{what}"
+                )
