@@ -253,7 +253,7 @@ def fmc_of(failures: Sequence[Sequence[float]], n: int) -> float:
     for index, level, *point in failures:
         if index < n:
             by_level.setdefault(level, []).append(point)
-    return sum(fmc(points) for points in by_level.values())
+    return float(sum(fmc(points) for points in by_level.values()))
 
 
 def cases_to(target: float, failures: Sequence[Sequence[float]]) -> int | None:
@@ -290,6 +290,8 @@ def read_found(folder: Path, task: Task) -> Found | None:
 
 
 def _digest(found: Found) -> str:
+    """Return the hash of a search; 0 and 0.0 are the same number."""
+    found = decode(json.dumps(asdict(found)), Found)
     return hashlib.sha256(json.dumps(asdict(found), sort_keys=True).encode()).hexdigest()
 
 

@@ -34,6 +34,8 @@ from merge_sumo.studies.sampler_benchmark import (
     Task,
     cases_to,
     fmc_of,
+    read_found,
+    write_found,
 )
 from merge_sumo.values.fmc import RADIUS, fmc
 
@@ -335,6 +337,14 @@ def test_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
     assert '"ran": 10' in first.read_text(), "a damaged search runs again"
     with pytest.raises(UserError, match="exists"):
         run(3)
+
+
+def test_a_search_is_read_back_whatever_it_found(tmp_path):
+    nothing = found_at([], "stateful")
+    for found in (nothing, replace(nothing, failures=[[3, 0, 0.5, 1]], fmc=[(400, 0)])):
+        write_found(tmp_path, found)
+        assert read_found(tmp_path, found.task) == found
+        assert read_found(tmp_path, replace(found.task, sampler_sha256="other")) is None
 
 
 def test_refuses_numbers_and_names_that_are_none():
