@@ -147,8 +147,8 @@ class ComparedCase:
     def became(self) -> str:
         """What it was and is in words; where these are the same, which of them is a failure."""
         if self.chance is not None and self.runs_a is not None and self.runs_b is not None:
-            both = f"{self.runs_a.in_words} -> {self.runs_b.in_words}"
-            return f"{both}, by Fisher's exact test p = {self.chance:.2g}"
+            shares = f"{self.runs_a.in_words} -> {self.runs_b.in_words}"
+            return f"{shares}, by Fisher's exact test p = {self.chance:.2g}"
         both = [outcome for outcome in (self.a, self.b) if outcome is not None]
         words = [outcome.measures.became for outcome in both]
         if len(set(words)) == 1:
@@ -622,10 +622,10 @@ def _telling(
     cases = []
     for (start, _), pairs in runs.items():
         both = [list(of) for of in zip(*pairs, strict=True)]
-        deciding = [one_per_case(of, tolerated)[0] for of in both]
+        a, b = (one_per_case(of, tolerated)[0] for of in both)
         known = [_repeated(of).get(start) for of in both]
-        if any(outcome.failed or not outcome.is_tested for outcome in deciding):
-            cases.append(ComparedCase(run, pairs[0][0].index, *deciding, *known))
+        if any(outcome.failed or not outcome.is_tested for outcome in (a, b)):
+            cases.append(ComparedCase(run, pairs[0][0].index, a, b, *known))
     return cases
 
 

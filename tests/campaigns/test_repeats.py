@@ -197,7 +197,7 @@ def test_where_cases_repeat_chance_is_expected_and_memory_is_not(vut, tmp_path, 
     assert {one.drawn for one in differing} == {chance}
     said = unrepeatable(differing)
     assert (said is None) is chance
-    assert chance or "The VUT keeps something from earlier episodes: " in said
+    assert chance or "The VUT keeps something from earlier episodes: " in str(said)
 
 
 def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path):
