@@ -151,7 +151,7 @@ class Sampler(ABC):
         """Return the history of a level where cases ran with more than one draw."""
         cases = self.runs(level)
         decisive = [one.deciding(self.tolerated) for one in cases]
-        scores = [[run.score for run in one.outcomes] for one in cases]
+        scores = [np.array([run.score for run in one.outcomes], dtype=float) for one in cases]
         return replace(
             self._rows_of(decisive, level),
             batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),

@@ -154,7 +154,9 @@ class Belief:
         self._latent = None
         if learned.varies:
             odds = _log_odds(np.average(left_out, axis=0, weights=self._weights))
-            self._latent = LatentOdds(learned.points, learned.runs, learned.failures, odds)
+            self._latent = LatentOdds(
+                learned.points, 1.0 * learned.runs, 1.0 * learned.failures, odds
+            )
 
 
 class Calibration:
@@ -293,7 +295,7 @@ def _log_odds(chance: FloatArray) -> FloatArray:
 
 
 def _calibrated(
-    evidence: FloatArray, failures: NDArray[np.int64], runs: NDArray[np.int64]
+    evidence: FloatArray, failures: NDArray[np.integer | np.bool_], runs: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the weights of the evidence, (W, 4), that predict best, and log posteriors, (W,).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,17 +75,18 @@ class LevelHistory:
         """Return the outcomes with later ones after them."""
         if not len(later.points):
             return self
-        rows = {
+        rows: dict[str, Any] = {
             name: np.concatenate([values, getattr(later, name)])
             for name, values in self._rows().items()
         }
-        return replace(self, **rows, varies=self.varies or later.varies)
+        rows["varies"] = self.varies or later.varies
+        return replace(self, **rows)
 
     def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
         """Return some of the outcomes."""
         return replace(self, **{name: values[places] for name, values in self._rows().items()})
 
-    def _rows(self) -> dict[str, NDArray[np.float64]]:
+    def _rows(self) -> dict[str, Any]:
         """Return the fields with a row for each case, by name."""
         values = {one.name: getattr(self, one.name) for one in fields(self)}
         return {name: rows for name, rows in values.items() if isinstance(rows, np.ndarray)}

@@ -16,11 +16,14 @@ from itertools import product
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import expit, log_expit, logit, ndtr
 
 from merge_sumo.values.case import FloatArray
+
+IntArray = NDArray[np.int64]
 
 VARIANCES: Final = (0.1, 0.5, 2.0, 8.0)
 LENGTHS: Final = (0.05, 0.15, 0.45)
@@ -53,7 +56,7 @@ class LatentOdds:
     """The log odds of failing of a run, learned from k of n."""
 
     def __init__(
-        self, points: FloatArray, runs: FloatArray, failures: FloatArray, mean: FloatArray
+        self, points: FloatArray, runs: IntArray, failures: IntArray, mean: FloatArray
     ) -> None:
         """Learn from cases, (N, d), with their runs and failures, (N,), around log odds, (N,)."""
         self._points = points
@@ -94,9 +97,7 @@ def _covariance(apart: FloatArray, variance: float, length: float) -> FloatArray
     return np.asarray(variance * (1.0 + scaled) * np.exp(-scaled), dtype=np.float64)
 
 
-def _mode(
-    covariance: FloatArray, runs: FloatArray, failures: FloatArray, mean: FloatArray
-) -> _Mode:
+def _mode(covariance: FloatArray, runs: IntArray, failures: IntArray, mean: FloatArray) -> _Mode:
     """Return the mode of h, by Newton's method: Rasmussen and Williams (2006), algorithm 3.1."""
     h = np.zeros(len(mean))
     identity = np.eye(len(mean))

@@ -1,0 +1,144 @@
+"""P(fail) from k failures of n runs: what a case that ran several times says."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import expit, logit
+
+from merge_sumo.samplers.belief import Belief
+from merge_sumo.samplers.gpr import NOISE, _noise
+from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.values.case import MergeCase, Pool
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Measures, Outcome
+from merge_sumo.values.trajectory import End
+
+CASE = MergeCase(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
+OTHER = replace(CASE, v_pov0_mps=31.0)
+
+
+def told(*runs: tuple[MergeCase, int, float, float], tolerated: float = 0.0) -> LevelHistory:
+    """Return the history of runs (case, draw, score, dx)."""
+    sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
+    sampler.tolerated = tolerated
+    sampler.tell(
+        [
+            Outcome(
+                index,
+                index,
+                replace(case, draw=draw),
+                Measures(end=End.MERGED, score=score, t_end_s=9.0, dx_m=dx_m),
+            )
+            for index, (case, draw, score, dx_m) in enumerate(runs)
+        ]
+    )
+    return sampler.history(0)
+
+
+RUNS = (
+    (CASE, 0, -20.0, 40.0),
+    (OTHER, 0, -30.0, -50.0),
+    (CASE, 1, -700.0, 2.0),
+    (CASE, 2, -25.0, 35.0),
+    (CASE, 3, -600.0, -3.0),
+)
+
+
+@pytest.mark.parametrize(
+    ("tolerated", "score", "dx_m", "failed"),
+    [(0.0, -700.0, 2.0, True), (0.49, -600.0, -3.0, True), (0.5, -25.0, 35.0, False)],
+)
+def test_a_case_has_one_row_with_the_run_that_decides(tolerated, score, dx_m, failed):
+    history = told(*RUNS, tolerated=tolerated)
+    assert len(history.points) == 2
+    assert history.runs.tolist() == [4, 1]
+    assert history.failures.tolist() == [2, 0]
+    assert history.share.tolist() == [0.5, 0.0]
+    assert history.batch.tolist() == [0, 1]
+    assert (history.score[0], history.dx_m[0], history.failed[0]) == (score, dx_m, failed)
+    assert history.variance[0] == pytest.approx(np.var([-20.0, -700.0, -25.0, -600.0], ddof=1))
+    assert np.isnan(history.variance[1])
+    assert history.varies
+
+
+def test_runs_that_are_alike_show_no_chance():
+    history = told((CASE, 0, -20.0, 40.0), (CASE, 1, -20.0, 40.0))
+    assert not history.varies
+    assert history.runs.tolist() == [2]
+    assert _noise(history) == NOISE
+
+
+def test_more_runs_leave_less_noise():
+    history = told(*RUNS)
+    single, four = (float(value) for value in np.asarray(_noise(history))[[1, 0]])
+    assert single - NOISE == pytest.approx(4.0 * (four - NOISE))
+
+
+class TestTheLogOdds:
+    POINTS = np.array([[0.2, 0.2], [0.8, 0.8]])
+
+    def at(self, runs: int, failures: int, mean: float = -2.0) -> tuple[float, float]:
+        """Return mean and variance at a case with so many runs, far from one that never fails."""
+        latent = LatentOdds(
+            self.POINTS, np.array([runs, 1]), np.array([failures, 0]), np.full(2, mean)
+        )
+        odds, variance = latent.at(self.POINTS[:1], np.array([mean]))
+        return float(odds[0]), float(variance[0])
+
+    def test_follow_the_share_of_many_runs(self):
+        odds, variance = self.at(1000, 300)
+        assert expit(odds) == pytest.approx(0.3, abs=0.005)
+        # The curvature of a binomial of 1,000 runs at .3, and hardly any prior.
+        assert variance == pytest.approx(1.0 / 210.0, rel=0.05)
+
+    def test_of_one_failure_in_one_run_stay_in_doubt(self):
+        one, ten = self.at(1, 1), self.at(10, 10)
+        assert logit(0.12) < one[0] < logit(0.8) < logit(0.9) < ten[0]
+        assert 1.0 < one[1] < 8.0
+
+
+def test_the_mean_chance_is_that_of_normal_log_odds():
+    rng = np.random.default_rng(0)
+    drawn = expit(-1.0 + 1.5 * rng.standard_normal(200_000)).mean()
+    assert mean_chance(np.array([-1.0]), np.array([2.25]))[0] == pytest.approx(drawn, abs=0.005)
+    above = chance_above(np.array([logit(0.3)] * 2), np.array([1.0, 4.0]), 0.3)
+    assert above.tolist() == [0.5, 0.5]
+
+
+class TestTheBelief:
+    """A strip that fails in three runs of ten, of which each case ran four times."""
+
+    RUNS = 4
+
+    def history(self, tolerated: float) -> tuple[LevelHistory, np.ndarray]:
+        rng = np.random.default_rng(4)
+        points = rng.random((150, 2))
+        inside = np.abs(points[:, 0] - 0.5) < 0.15
+        failures = np.where(inside, rng.binomial(self.RUNS, 0.3, 150), 0)
+        decides = failures > tolerated * self.RUNS
+        score = np.where(decides, -600.0, -20.0)
+        gap_m = np.where(decides, 0.0, np.where(inside, 30.0, 200.0 * (points[:, 0] - 0.5)))
+        runs = np.full(150, self.RUNS)
+        variance = np.where((failures > 0) & (failures < self.RUNS), 1e5, 0.0)
+        rows = points, score, decides, gap_m, np.arange(150) // 10, runs, failures, variance
+        return LevelHistory(*rows, varies=True, tolerated=tolerated), inside
+
+    def test_is_the_share_of_runs_that_fail(self):
+        history, _ = self.history(0.1)
+        belief = Belief(history)
+        strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
+        assert belief.of(strip).mean() == pytest.approx(0.3, abs=0.08)
+        assert belief.of(np.array([[0.1, 0.5], [0.9, 0.5]])).max() < 0.05
+
+    def test_tells_what_is_tolerated_from_what_is_not(self):
+        strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
+        low, high = (Belief(self.history(share)[0]).above(strip).mean() for share in (0.1, 0.6))
+        assert low > 0.8
+        assert high < 0.4
