@@ -43,8 +43,12 @@ class Chance(ABC):
 
     def __init__(self, corridors: int) -> None:
         """Prepare for K corridors."""
-        self._rng = np.random.default_rng(0)
+        self._luck = np.zeros(corridors)
         self._answer = np.zeros(corridors)
+
+    def reset(self, corridor: int, seen: Any, seed: int) -> None:
+        """Draw the number that decides in the episode that begins in a corridor."""
+        self._luck[corridor] = np.random.default_rng(seed).random()
 
     @staticmethod
     @abstractmethod
@@ -70,7 +74,7 @@ class Chance(ABC):
         x, v = seen.x_pov_m, np.maximum(seen.v_pov_mps, 1.0)
         usual = usual_gap_m(x, v, seen.x_vut_m, seen.v_vut_mps)
         u = (v - V_POV0_MPS[0]) / (V_POV0_MPS[1] - V_POV0_MPS[0])
-        errs = self._rng.random(len(x)) < self.erring(u)
+        errs = self._luck < self.erring(u)
         clear = np.where(usual >= 0.0, CLEAR_M, -CLEAR_M)
         gap = np.where(np.abs(usual) < CONTESTED_M, np.where(errs, 0.0, clear), usual)
         time_s = (gap - x) / v

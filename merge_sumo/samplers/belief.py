@@ -154,9 +154,7 @@ class Belief:
         self._latent = None
         if learned.varies:
             odds = _log_odds(np.average(left_out, axis=0, weights=self._weights))
-            self._latent = LatentOdds(
-                learned.points, 1.0 * learned.runs, 1.0 * learned.failures, odds
-            )
+            self._latent = LatentOdds(learned.points, learned.runs, learned.failures, odds)
 
 
 class Calibration:

@@ -39,9 +39,9 @@ class LevelHistory:
     failed: NDArray[np.bool_]
     dx_m: FloatArray
     batch: NDArray[np.int64]
-    runs: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
-    failures: NDArray[np.int64] = field(default=None)  # type: ignore[assignment]
-    variance: FloatArray = field(default=None)  # type: ignore[assignment]
+    runs: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    failures: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    variance: FloatArray = field(default_factory=lambda: np.empty(0, dtype=np.float64))
     varies: bool = False
     tolerated: float = 0.0
 
@@ -53,7 +53,7 @@ class LevelHistory:
             "variance": np.full(len(self.points), np.nan),
         }
         for name, values in single.items():
-            if getattr(self, name) is None:
+            if len(getattr(self, name)) != len(self.points):
                 object.__setattr__(self, name, values)
 
     @property
