@@ -73,7 +73,7 @@ def searched(vut: str, sampler: str, seed: int, repeat: Any, tolerated: float) -
             out=Path(folder) / "run",
             progress=False,
         )
-        return run.outcomes
+        return list(run.run.outcomes)
 
 
 def found(vut: str, outcomes: Sequence[Outcome], tolerated: float) -> tuple[float, float]:

@@ -42,8 +42,12 @@ Ask = Callable[[Sequence[FloatArray]], Sequence[FloatArray]]
 class Surface:
     """The surrogate of one level of a run."""
 
-    def __init__(self, failing: FloatArray, ask: Ask) -> None:
-        """Use a learned chance to fail and the points, (n, d), of the failures found."""
+    def __init__(self, failing: FloatArray, ask: Ask, tolerated: float = 0.0) -> None:
+        """Use a learned chance to fail and the points, (n, d), of the failures found.
+
+        A place that fails in no more than a `tolerated` share of its runs is no failure.
+        """
+        self.plausible = max(PLAUSIBLE, tolerated)
         self._dims = failing.shape[1]
         self._failing = failing
         self._ask = ask
@@ -72,12 +76,12 @@ class Surface:
         """Return the coverage if all places failed that the surrogate does not exclude.
 
         As many uniform points as a ground truth has cases, those with a chance of at least
-        `PLAUSIBLE`, together with the failures found. No more than the pool, though balls at its
+        `plausible`, together with the failures found. No more than the pool, though balls at its
         faces reach out of it, unless the failures found alone cover more. No confidence bound: a
         region of which the surrogate knows nothing is not in it.
         """
         points, chance = self.pool()
-        whole = fmc(np.concatenate([self._failing, points[chance >= PLAUSIBLE]]))
+        whole = fmc(np.concatenate([self._failing, points[chance >= self.plausible]]))
         return whole if whole <= 1.0 else max(1.0, fmc(self._failing))
 
     def pool(self) -> tuple[FloatArray, FloatArray]:
@@ -102,7 +106,10 @@ def nodes(grid: Grid) -> FloatArray:
 
 
 def learn_surface(
-    outcomes: Sequence[Outcome], level: int, workers: Workers | None = None
+    outcomes: Sequence[Outcome],
+    level: int,
+    workers: Workers | None = None,
+    tolerated: float = 0.0,
 ) -> Surface | None:
     """Return the surrogate of a level, or None where too few cases failed to learn from.
 
@@ -112,15 +119,16 @@ def learn_surface(
     if not at_level:
         return None
     sampler = UniformSampler(Pool(levels=(level,), scenario=at_level[0].case.scenario), seed=0)
+    sampler.tolerated = tolerated
     sampler.tell(at_level)
     history = sampler.history(level)
     failing = history.points[history.failed]
     if len(failing) < FEWEST_FAILURES or len(history.failed) - len(failing) < JUDGED_FROM:
         return None
     if workers is not None and workers.count > 1 and not workers.here:
-        return Surface(failing, partial(_on_workers, workers, history))
+        return Surface(failing, partial(_on_workers, workers, history), tolerated)
     with threadpool_limits(1):
-        return Surface(failing, partial(_on_cores, _learned(history)))
+        return Surface(failing, partial(_on_cores, _learned(history)), tolerated)
 
 
 def _learned(history: LevelHistory) -> Callable[[FloatArray], FloatArray]:

@@ -23,6 +23,7 @@ from merge_sumo.studies.explanation import in_sentences
 from merge_sumo.studies.parameter_ranges import Range
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.case import FloatArray, to_unit
+from merge_sumo.values.chance import RunsOfCase
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import Measure
 from merge_sumo.values.scenario import (
@@ -145,11 +146,27 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "offset": offsets.get(o.index, 0),
             "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
         }
+        if facts.repeated:
+            row["runs"] = _runs(facts.repeated.get(o.index))
         if not facts.run.criterion.is_papers:
             row["margin"] = _rounded(o.margin, 3)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     return columns or {"index": []}
+
+
+def _runs(of: RunsOfCase | None) -> dict[str, Any] | None:
+    """Return how many runs of a case failed, with the interval; None where it ran once."""
+    if of is None:
+        return None
+    low, high = of.interval()
+    return {
+        "failed": of.failures,
+        "number": of.runs,
+        "low": round(low, 3),
+        "high": round(high, 3),
+        "each": [[run.index, int(run.failed)] for run in of.outcomes],
+    }
 
 
 def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
@@ -218,7 +235,7 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
 
 def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
     shown = {o.index for o in facts.shown}
-    others = [o for o in facts.run.outcomes if o.index not in shown]
+    others = [o for o in facts.cases if o.index not in shown]
     return {
         level: maps_of(
             facts.run.scenario,
@@ -234,12 +251,12 @@ def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
 
 def _search(facts: ReportModel) -> dict[str, Any]:
     """Return cases, mean score and coverage of each level after groups of batches."""
-    batches = sorted({o.batch for o in facts.run.outcomes})
+    batches = sorted({o.batch for o in facts.cases})
     width = -(-len(batches) // MOST_STEPS) or 1
     groups = batches[::width]
     levels = []
     for level in facts.levels:
-        at = [o for o in facts.run.outcomes if o.case.level == level]
+        at = [o for o in facts.cases if o.case.level == level]
         group = np.array([o.batch // width for o in at], dtype=np.int64)
         score = np.array([o.score for o in at], dtype=np.float64)
         failed = np.array([o.failed for o in at], dtype=bool)

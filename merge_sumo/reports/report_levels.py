@@ -105,7 +105,7 @@ def _note(found: LevelSummary, axes: tuple[Coordinate, ...], *, learned: bool) -
 
 def _of_truth(model: ReportModel, level: int, truth: Truth) -> str:
     """Return the covered share of a truth with failures, and for what it is too small."""
-    cases = (o.case for o in model.run.outcomes if o.failed and o.case.level == level)
+    cases = (o.case for o in model.cases if o.failed and o.case.level == level)
     found, failing = to_unit(cases, level), truth.failures
     near = int(covered(failing, found).sum())
     text = (

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final, TypeVar
 
+from merge_sumo.analysis.chance import chance_in
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.analysis.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.analysis.people import beside_people
@@ -30,6 +31,7 @@ from merge_sumo.studies.explanation import read_explanations
 from merge_sumo.studies.stress import stress_of
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
 from merge_sumo.system.workers import Workers
+from merge_sumo.values.chance import by_case
 from merge_sumo.values.scenario import DEADLINE_S, LEVELS, OWN
 from merge_sumo.values.score import Outcome
 
@@ -46,7 +48,13 @@ T = TypeVar("T")
 
 
 class ReportModel:
-    """Everything that the page shows of a run."""
+    """Everything that the page shows of a run.
+
+    Attributes:
+        cases: the run that stands for each case.
+        repeated: by its index, all runs of a case that ran more than once.
+        chance: what repeats show of chance; None without any.
+    """
 
     def __init__(
         self,
@@ -65,18 +73,22 @@ class ReportModel:
         """
         self.run = run
         self.road = road_of_run(run)
+        self.cases = run.cases
+        runs = [one for one in by_case(run.outcomes) if one.runs > 1]
+        self.repeated = {one.shown(run.tolerated).index: one for one in runs}
+        self.chance = chance_in(run.outcomes, run.tolerated)
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
-        self.verdict = judge(run.cases)
+        self.verdict = judge(self.cases)
         self.levels = list(self.summary.levels)
         share = run.people if people is None else people
-        self.people = beside_people(run.cases, share, self.levels)
+        self.people = beside_people(self.cases, share, self.levels)
         # The surrogate of each level; the cases; the text; the data.
         self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
         self._counting = threading.Lock()
         on_part(0, self._parts)
         self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers, self.part_ended))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
-        self.worst = failures(run.cases)
+        self.worst = failures(self.cases)
         self.regions = regions_of(self.worst)
         self.stress = stress_of(run.folder)
         robust = set() if self.stress is None else set(self.stress.robust)
@@ -87,12 +99,12 @@ class ReportModel:
         self.explanations = read_explanations(run)
         self.repeats = read_repeats(run)
         self.near = sorted(
-            (o for o in run.outcomes if _is_told(o) and not o.failed),
+            (o for o in self.cases if _is_told(o) and not o.failed),
             key=lambda o: (o.score, o.index),
         )
-        self.surprises = surprises(run.outcomes, run.scenario.dx_crash_m)[:LISTED]
+        self.surprises = surprises(self.cases, run.scenario.dx_crash_m)[:LISTED]
         self.expected = read_expectation(run)
-        self.untested = [o for o in run.outcomes if not _is_told(o)]
+        self.untested = [o for o in self.cases if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
         telling = {o.index: o for o in (*listed, *self.worst, *self.untested, *self.near)}
@@ -156,7 +168,7 @@ def _surfaces(
     """Return the surrogate of each level; what its map shows is worked out."""
     surfaces = {}
     for level in levels:
-        surface = surfaces[level] = learn_surface(run.outcomes, level, workers)
+        surface = surfaces[level] = learn_surface(run.outcomes, level, workers, run.tolerated)
         if surface is not None:
             surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
         on_level()

@@ -101,6 +101,8 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": _avoidance(model),
         "people": model.people,
+        "chance": model.chance,
+        "repeated": model.repeated,
     }
 
 
@@ -117,8 +119,8 @@ def head_words(model: ReportModel) -> dict[str, Any]:
         "unrepeatable": repeats.unrepeatable(model.repeats),
         "careful": in_a_sentence(model.avoidance.values()),
         "lost": in_words(lost) if lost else "",
-        "notes": notes_on(run.outcomes, run.criterion),
-        "torn": run.torn or (isinstance(wanted, int) and model.summary.cases < wanted),
+        "notes": notes_on(model.cases, run.criterion),
+        "torn": run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted),
     }
 
 
@@ -127,21 +129,21 @@ def _untested(model: ReportModel) -> dict[str, Any] | None:
 
 
 def _numbers(model: ReportModel) -> dict[str, Any]:
-    outcomes, scenario = model.run.outcomes, model.run.scenario
+    outcomes, scenario = model.cases, model.run.scenario
     return {
         "found": model.verdict,
         "truth_cases": " or ".join(
             f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in model.levels})
         ),
-        "plausible_chance": f"{PLAUSIBLE:.0%}",
+        "plausible_chance": f"{max(PLAUSIBLE, model.run.tolerated):.0%}",
         "fewest_failures": FEWEST_FAILURES,
         "radii": _radii({len(model.run.scenario.dimensions(level)) for level in model.levels}),
         "avoidable": avoidable_text(model.worst, scenario),
         "after": harmful_merges_text(outcomes, scenario),
         "before": overlaps_before_m_text(outcomes, scenario),
-        "batches": len({o.batch for o in outcomes}),
+        "batches": len({o.batch for o in model.run.outcomes}),
         "recorded": _recorded(model.run),
-        "driven": _duration(sum(o.measures.t_end_s for o in outcomes)),
+        "driven": _duration(sum(o.measures.t_end_s for o in model.run.outcomes)),
     }
 
 
@@ -159,7 +161,7 @@ def _board(model: ReportModel) -> dict[str, Any]:
 
 
 def _merging(model: ReportModel) -> dict[str, Any] | None:
-    outcomes, lane_m = model.run.outcomes, lane_of(model.run.scenario)
+    outcomes, lane_m = model.cases, lane_of(model.run.scenario)
     found = merging_of(outcomes)
     if found is None or lane_m is None:
         return None

@@ -60,6 +60,18 @@ function drawMark(parent, i, x, y, faint) { // shape and colour by severity; wha
   if (found === null) return draw(parent, "rect", { ...look, x: x - 3, y: y - 3, width: 6, height: 6 });
   return draw(parent, "circle", { ...look, cx: x, cy: y, r: large ? 4.2 : found === "safe" ? 2.4 : 3.2 });
 }
+const runsOf = (i) => (cases.runs ? cases.runs[i] : null); // of a case that ran more than once
+function drawShare(parent, i, x, y, faint) { // an arc from the top, clockwise: the share of its runs that fail
+  const runs = runsOf(i), share = runs && 100 * runs.failed / runs.number;
+  if (!share || share === 100) return;
+  draw(parent, "circle", { class: `of-runs${faint}`, cx: x, cy: y, r: 8, pathLength: 100, "stroke-dasharray": `${share} ${100 - share}`, transform: `rotate(-90 ${x} ${y})` });
+}
+function runsInWords(i) {
+  const runs = runsOf(i), percent = (share) => fixed(100 * share, 0);
+  if (!runs) return cases.runs && tested(i) ? "This case ran once." : "";
+  const each = runs.each.map(([index, fails]) => `${index} ${fails ? "fails" : "passes"}`).join(", ");
+  return `Fails in ${runs.failed} of ${runs.number} runs (95 % interval ${percent(runs.low)} to ${percent(runs.high)} %): ${each}. Shown is run ${cases.index[i]}, which decides.`;
+}
 const rank = (i) => cases.severity[i] ?? data.severities.length; // the most severe lie on top
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
@@ -123,6 +135,7 @@ function words(i) {
     if (until !== null) parts.push(`The last time at which the fuzzy safety model (fsm) can take over and avoid it is ${fixed(until, 1)} s.`);
     if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
   }
+  parts.push(runsInWords(i));
   return parts.filter(Boolean).join(" ");
 }
 
@@ -232,6 +245,7 @@ function FailureMap(figure) {
       if (!framed(x, y)) continue;
       const faint = near(i) && wanted(i) ? "" : " faint";
       drawMark(svg, i, x, y, faint);
+      drawShare(svg, i, x, y, faint);
       if (cases.inside && cases.inside[i] === 0) draw(svg, "circle", { class: `beyond${faint}`, cx: x, cy: y, r: 7 });
     }
     const most = figure.querySelector(".most");
@@ -774,6 +788,10 @@ function allCases() { // gives what shows the cases that the filters let through
     ...(people ? [{ name: "people", words: true, value: besides }] : []),
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
     ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
+    ...(cases.runs ? [
+      { name: "runs", exact: true, value: (i) => runsOf(i)?.number ?? 1, text: String },
+      { name: "share of runs that fail", exact: true, value: (i) => { const runs = runsOf(i); return runs ? runs.failed / runs.number : tested(i) ? Number(failed(i)) : null; }, text: (value) => fixed(value, 2) },
+    ] : []),
     ...(cases.margin ? [number("margin", "margin", 2)] : []),
     ...data.measures.map((measure) => number(measure.name, measure.title, measure.digits)),
   ];
