@@ -75,7 +75,7 @@ class ReportModel:
         self.road = road_of_run(run)
         self.cases = run.cases
         runs = [one for one in by_case(run.outcomes) if one.runs > 1]
-        self.repeated = {one.shown(run.tolerated).index: one for one in runs}
+        self.repeated = {one.deciding(run.tolerated).index: one for one in runs}
         self.chance = chance_in(run.outcomes, run.tolerated)
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
         self.verdict = judge(self.cases)
