@@ -1,0 +1,138 @@
+"""The page of a campaign whose cases ran several times, for a VUT that fails by chance."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaigning import run_campaign
+from lxml import html
+from test_browser import browser, shown  # noqa: F401 (a fixture)
+
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.store import Run
+from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.reports.report import REPORT, write_report
+from merge_sumo.values.case import from_unit
+from merge_sumo.values.scenario import US23
+
+CONTROLLERS = Path(__file__).parents[2] / "tools" / "chance_vuts.py"
+TOLERATED, RUNS = 0.5, 4
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Run:
+    settings = CampaignSettings(
+        vut=f"{CONTROLLERS}:Even",
+        levels=(0,),
+        cases=30 * RUNS,
+        seed=5,
+        repeat=RUNS,
+        tolerated=TOLERATED,
+        scenario=US23,
+    )
+    run = run_campaign(settings, tmp_path_factory.mktemp("chance") / "run")
+    write_report(run)
+    return run
+
+
+def recorded(run: Run) -> dict[tuple, list[tuple[int, bool]]]:
+    """Return index and verdict of each run, by the start of its case, from the file alone."""
+    cases: dict[tuple, list[tuple[int, bool]]] = {}
+    for line in (run.folder / "outcomes.jsonl").read_text().splitlines():
+        record = json.loads(line)
+        start = record["x_pov0_m"], record["v_pov0_mps"]
+        cases.setdefault(start, []).append((record["index"], record["score"] < -500.0))
+    return cases
+
+
+def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser):  # noqa: F811
+    cases = recorded(made)
+    failures = {start: sum(fails for _, fails in runs) for start, runs in cases.items()}
+    assert {len(runs) for runs in cases.values()} == {RUNS}
+    both_ways = [start for start, failed in failures.items() if 0 < failed < RUNS]
+    failing = [start for start, failed in failures.items() if failed > TOLERATED * RUNS]
+    assert len(both_ways) > 2, "chance decides"
+    page = html.fromstring((made.folder / REPORT).read_text())
+    text = " ".join(page.text_content().split())
+    assert f"{len(failing)} failures in {len(cases)} cases" in text
+    assert f"{30 * RUNS} runs of {len(cases)} cases" in text
+    assert "arc: the share of its runs that fail" in text
+    assert "chance of a run to fail, by the surrogate" in text or len(failing) < 5
+    with shown(browser, made.folder / REPORT) as opened:
+        arcs = opened.locator(".map .of-runs")
+        assert arcs.count() == len(both_ways)
+        drawn = sorted(
+            float(arcs.nth(place).get_attribute("stroke-dasharray").split()[0])
+            for place in range(arcs.count())
+        )
+        assert drawn == sorted(100.0 * failures[start] / RUNS for start in both_ways)
+        for start in both_ways[:3]:
+            index = opened.evaluate(
+                "([x, v]) => cases.index.find((_, i) => Math.abs(cases.x_pov0_m[i] - x) < 0.01"
+                " && Math.abs(cases.v_pov0_mps[i] - v) < 0.01)",
+                list(start),
+            )
+            opened.evaluate("(index) => openCase(place.get(index))", index)
+            said = opened.locator("#case-words").inner_text()
+            sentence = re.search(
+                r"Fails in (\d+) of (\d+) runs \(95 % interval (\d+) to (\d+) %\): (.*?)\. "
+                r"Shown is run (\d+), which decides\.",
+                said,
+            )
+            failed, number, low, high, each, decides = sentence.groups()
+            assert (int(failed), int(number)) == (failures[start], RUNS)
+            assert each == ", ".join(
+                f"{one} {'fails' if fails else 'passes'}" for one, fails in cases[start]
+            )
+            assert int(decides) == index
+            verdict = dict(cases[start])[index]
+            assert verdict == (failures[start] > TOLERATED * RUNS)
+            # Clopper and Pearson: at the ends, so many failures or more, or fewer, have 2.5 %.
+            ends = (int(low) / 100.0, True), (int(high) / 100.0, False)
+            tails = [tail(end, failures[start], upper=upper) for end, upper in ends]
+            assert tails == pytest.approx([0.025, 0.025], abs=0.02)
+
+
+def tail(chance: float, failures: int, *, upper: bool) -> float:
+    """Return the probability of so many failures of 4 runs, or more; or of so many, or fewer."""
+    numbers = range(failures, RUNS + 1) if upper else range(failures + 1)
+    return sum(
+        math.comb(RUNS, number) * chance**number * (1.0 - chance) ** (RUNS - number)
+        for number in numbers
+    )
+
+
+def test_controllers_of_the_comparison_fail_as_their_closed_form_says():
+    spec = importlib.util.spec_from_file_location("chance_vuts", CONTROLLERS)
+    known = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(known)
+    plan = resolve(CampaignSettings(vut=f"{CONTROLLERS}:Slope", levels=(0,), scenario=US23))
+    # Along the line on which both arrive together, at nine speeds of the POV, and beside it.
+    v_mps = np.repeat(np.linspace(26.0, 34.0, 9), 3)
+    x_m = -known.usual_gap_m(0.0, v_mps, np.array(-182.0), np.array(18.0))
+    x_m = x_m + np.tile([0.0, 7.5, -8.5], 9)
+    points = np.column_stack([(x_m + 340.0) / 160.0, (v_mps - 25.0) / 10.0])
+    chance = known.Slope.chance(x_m, v_mps)
+    expected = np.outer(np.linspace(0.1, 0.9, 9), [1.0, 1.0, 0.0])
+    assert chance.reshape(9, 3) == pytest.approx(expected)
+    cases = from_unit(points, 0, scenario=US23)
+    draws = [replace(case, draw=draw) for case in cases for draw in range(20)]
+    ran = list(run_cases(plan.for_cases(len(draws)), draws))
+    share = np.array([one.measures.is_close for one in ran]).reshape(-1, 20).mean(axis=1)
+    assert share[chance == 0.0].max() == 0.0
+    inside = chance > 0.0
+    # 18 cases with 20 runs each: the mean lies within three standard deviations.
+    off = share[inside].mean() - chance[inside].mean()
+    assert abs(off) < 3.0 * math.sqrt((chance * (1 - chance))[inside].mean() / (20 * inside.sum()))
+    by_speed = share[inside].reshape(9, 2).mean(axis=1)
+    assert by_speed[-2:].mean() > by_speed[:2].mean() + 0.4
