@@ -274,7 +274,9 @@ def _concluded(
     if junit is not None:
         check_junit(junit, folder)
     quiet = not (is_watched() if runner.progress is None else runner.progress)
-    progress = CampaignProgress(_title(settings), settings.cases, settings.levels)
+    progress = CampaignProgress(
+        _title(settings), settings.cases, settings.levels, tolerated=settings.tolerated
+    )
     try:
         with (
             runner.open(plan) as opened,

@@ -14,6 +14,7 @@ from merge_sumo.reports.progress import Work, clock_text, rate_text
 from merge_sumo.studies.counterfactuals import MOST
 from merge_sumo.system.printable import printable
 from merge_sumo.values.case import Case, to_unit
+from merge_sumo.values.chance import RunsOfCase, fails_above
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End
@@ -45,12 +46,24 @@ WORST: Final = 10
 class CampaignProgress:
     """Counts the cases of a campaign and the parts of what follows them."""
 
-    def __init__(self, title: str, cases: int, levels: Sequence[int], workers: int = 1) -> None:
+    def __init__(
+        self,
+        title: str,
+        cases: int,
+        levels: Sequence[int],
+        workers: int = 1,
+        *,
+        tolerated: float = 0.0,
+    ) -> None:
         self.title = printable(title)
         self.phase = Phase.CASES
         self.work = {Phase.CASES: Work(cases, time.monotonic())}
         self.cases = dict.fromkeys(levels, 0)
-        self.failing: dict[int, list[Case]] = {level: [] for level in levels}
+        self.failing: dict[int, dict[int, Case]] = {level: {} for level in levels}
+        """Cases that fail in more than a tolerated share of their runs, by their first run."""
+        self._tolerated = tolerated
+        self._runs: dict[Case, list[Outcome]] = {}
+        """Runs with a verdict of the last case with a start."""
         self.fmc = dict.fromkeys(levels, 0.0)
         """Coverage of the failures of a level when `refresh` was last called."""
         self.errors = self.timeouts = 0
@@ -69,11 +82,27 @@ class CampaignProgress:
         self.errors += outcome.measures.end.is_error
         self.timeouts += outcome.measures.end is End.TIMEOUT
         self.newest.append(outcome)
+        if outcome.score is not None:
+            self._count_run(outcome)
         if outcome.failed:
-            self.failing.setdefault(level, []).append(outcome.case)
             self.failures.append(outcome)
             self.worst = failures([*self.worst, outcome])[:WORST]
-            self._stale.add(level)
+
+    def _count_run(self, outcome: Outcome) -> None:
+        """Count a run of a case: it may make the case a failing one, or none any more."""
+        start, level = outcome.case.start, outcome.case.level
+        if outcome.case.draw == 0 or start not in self._runs:
+            self._runs[start] = []
+        runs = self._runs[start]
+        runs.append(outcome)
+        failing, first = self.failing.setdefault(level, {}), runs[0].index
+        if fails_above(RunsOfCase(start, tuple(runs)), self._tolerated):
+            failing[first] = start
+        elif first in failing:
+            del failing[first]
+        else:
+            return
+        self._stale.add(level)
 
     def ran_before(self, outcome: Outcome) -> None:
         """Count a case that ran before a resume; it does not count for the rate."""
@@ -93,7 +122,7 @@ class CampaignProgress:
     def refresh(self) -> None:
         """Bring the coverages up to date."""
         for level in self._stale:
-            self.fmc[level] = fmc(to_unit(self.failing[level], level))
+            self.fmc[level] = fmc(to_unit(self.failing[level].values(), level))
         self._stale.clear()
 
     @property

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 import types
+from dataclasses import replace
 
 import pytest
 from handmade import write_run
@@ -19,6 +20,8 @@ from merge_sumo.reports.campaign_progress import FAILURE_S, LEVEL_S, CampaignPro
 from merge_sumo.reports.progress import Bars, Counter, Work, clock_text, is_watched, rate_text
 from merge_sumo.reports.report import GENERATOR, REPORT, report_page, write_report
 from merge_sumo.reports.running_page import EVERY_S, FIRST_S, MOST_SHARE, RunningPage
+from merge_sumo.values.case import to_unit
+from merge_sumo.values.fmc import fmc
 
 
 @pytest.fixture(scope="module")
@@ -320,3 +323,18 @@ class TestThePageOfACampaignThatRuns:
             page.show(now)
         assert 2.0 * len(written) <= MOST_SHARE * clock[0]
         assert len(written) > 10
+
+
+def test_counts_a_case_once_and_as_failing_while_more_of_its_runs_fail_than_are_tolerated(outcomes):
+    fails = next(outcome for outcome in outcomes if outcome.failed)
+    passes = next(outcome for outcome in outcomes if not outcome.failed).measures
+    progress = CampaignProgress("a", 4, (0, 1, 2), tolerated=0.5)
+    found = []
+    for draw, measures in enumerate((fails.measures, passes, fails.measures, fails.measures)):
+        case = replace(fails.case, draw=draw)
+        progress.case_ended(replace(fails, index=draw, case=case, measures=measures))
+        progress.refresh()
+        found.append((progress.found, round(progress.fmc[fails.case.level], 4)))
+    ball = round(fmc(to_unit([fails.case], fails.case.level)), 4)
+    one, none = ("1 failure", ball), ("0 failures", 0.0)
+    assert found == [one, none, one, one]
