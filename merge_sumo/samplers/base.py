@@ -13,7 +13,7 @@ import numpy as np
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
-from merge_sumo.values.chance import RunsOfCase, by_case
+from merge_sumo.values.chance import RunsOfCase, by_case, fails_above
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome
 
@@ -150,10 +150,11 @@ class Sampler(ABC):
     def _repeated_history(self, level: int) -> LevelHistory:
         """Return the history of a level where cases ran with more than one draw."""
         cases = self.runs(level)
-        decisive = [one.deciding(self.tolerated) for one in cases]
+        worst = [one.deciding() for one in cases]
         scores = [np.array([run.score for run in one.outcomes], dtype=float) for one in cases]
         return replace(
-            self._rows_of(decisive, level),
+            self._rows_of(worst, level),
+            failed=np.array([fails_above(one, self.tolerated) for one in cases], dtype=bool),
             batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),
             runs=np.array([one.runs for one in cases], dtype=np.int64),
             failures=np.array([one.failures for one in cases], dtype=np.int64),

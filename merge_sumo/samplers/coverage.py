@@ -304,7 +304,7 @@ def _limit(history: LevelHistory) -> float | None:
 
     With few failures, the nearest misses guide the search, as in subset simulation.
     """
-    if history.failed.sum() >= NEAREST or len(history.score) < PATIENCE:
+    if history.ever_failed.sum() >= NEAREST or len(history.score) < PATIENCE:
         return None
     nearness = gap_m(history) if has_gaps(history) else history.score
     return float(np.partition(nearness, NEAREST - 1)[NEAREST - 1])

@@ -15,17 +15,16 @@ from merge_sumo.values.case import FloatArray
 class LevelHistory:
     """The outcomes of one POV level: N cases with a verdict, in the order of their first run.
 
-    A case that ran several times has one row: the *deciding run* gives its score and its gap. Of
-    the runs from the worst to the best it is the first one behind those that are tolerated, so
-    that its score is below lambda exactly where more than the tolerated share of the runs failed.
+    A case that ran several times has one row. Its worst run gives its score and its gap, whatever
+    is tolerated: so a surrogate learns where a case can fail, and from k of n how often it does.
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        score: P of the deciding run, or its stand-in under another criterion than the paper's,
-            (N,).
-        failed: score < lambda, (N,).
-        dx_m: signed gap at M in the deciding run, (N,), or its stand-in under another criterion: a
-            case fails within 6 m; NaN where the VUT never arrived or there is no trajectory.
+        score: P of the worst run, or its stand-in under another criterion than the paper's, (N,).
+        failed: whether more than the tolerated share of the runs failed, (N,); for a single run,
+            score < lambda.
+        dx_m: signed gap at M in the worst run, (N,), or its stand-in under another criterion: a run
+            fails within 6 m; NaN where the VUT never arrived or there is no trajectory.
         batch: batch of the campaign in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
         failures: number of those that failed, (N,).

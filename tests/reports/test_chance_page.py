@@ -10,6 +10,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
     both_ways = [start for start, failed in failures.items() if 0 < failed < RUNS]
     failing = [start for start, failed in failures.items() if failed > TOLERATED * RUNS]
     assert len(both_ways) > 2, "chance decides"
-    page = html.fromstring((made.folder / REPORT).read_text())
+    page: Any = html.fromstring((made.folder / REPORT).read_text())
     text = " ".join(page.text_content().split())
     assert f"{len(failing)} failures in {len(cases)} cases" in text
     assert f"{30 * RUNS} runs of {len(cases)} cases" in text
