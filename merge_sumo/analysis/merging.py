@@ -65,7 +65,7 @@ class MergeStatistics:
     def sentence(self) -> str:
         """Return it as a line, with the published figures."""
         if self.lane_share is None:
-            return f"no merge in {counted(self.cases, 'case')}{self._stops}"
+            return f"no merge without an error in {counted(self.cases, 'case')}{self._stops}"
         shares = [site.lane_share for site in SITES]
         text = (
             f"merges {place_in_words(self.lane_share)} in the median (people in the mean: "

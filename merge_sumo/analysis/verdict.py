@@ -93,7 +93,8 @@ class Verdict:
     @property
     def nothing_tested(self) -> str:
         """Return that no case was tested, as a sentence without its full stop."""
-        return f"nothing was tested: the VUT reached {self.goal} in no case"
+        safely = " without an error" if self.errors else ""
+        return f"nothing was tested: the VUT reached {self.goal}{safely} in no case"
 
     @property
     def counts(self) -> str:

@@ -284,8 +284,15 @@ class CampaignRun(Result):
             f"{changes[Change.BOTH_FAIL]} fail with both",
         )
         earlier = printable(str(self.settings[AGAINST])[:NAME_CHARACTERS])
+        silent = {
+            f"with {printable(self._run.vut)} alone": changes[Change.NO_VERDICT_OF_B],
+            f"with {earlier} alone": changes[Change.NO_VERDICT_OF_A],
+            "with both": changes[Change.NO_VERDICT],
+        }
+        parts = [f"{counted(number, 'case')} {which}" for which, number in silent.items() if number]
         return [
             f"against {earlier}: {', '.join(counts)}",
+            *([f"  error or timeout, so no verdict: {', '.join(parts)}"] if parts else []),
             f"what broke: {self.folder / AGAINST_PAGE}",
         ]
 

@@ -9,6 +9,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import Povs, own_pov, policies_folder
 from merge_sumo.engine.simulator import road_for
+from merge_sumo.errors import UserError
 from merge_sumo.vuts.registry import VutFactory
 
 
@@ -42,4 +43,7 @@ def resolve_earlier(settings: CampaignSettings, plan: SimulationPlan) -> Simulat
     if settings.against is None:
         return None
     options = settings.earlier.vut_options(plan.povs.policies)
-    return replace(plan, vut=VutFactory(settings.against, options))
+    try:
+        return replace(plan, vut=VutFactory(settings.against, options))
+    except UserError as error:
+        raise UserError(str(error).replace("--vut ", "--against ", 1)) from error

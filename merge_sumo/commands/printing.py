@@ -60,7 +60,7 @@ def folder_of(out: Path | None, resume: Path | None, what: str) -> Path:
 
 def same_command(folder: Path) -> str | None:
     """Return how to go on with what was stopped in a folder; None where nothing was written."""
-    same = f"stopped; go on with the same command and --resume {quoted(folder)}"
+    same = f"stopped; go on with the same command and --resume {quoted(folder)}, without --out"
     return same if folder.exists() else None
 
 

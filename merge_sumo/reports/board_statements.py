@@ -46,6 +46,8 @@ from merge_sumo.values.scenario import OWN, US23, MergeScenario, lane_of, level_
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.severity import Severity, meanings
 
+SLOWEST_TRAFFIC_MPS: Final = 17.0
+"""Less than one car in a hundred of the traffic that a command names drives slower."""
 OF_A_CAMPAIGN: Final = (
     *("vut", "levels", "scenario", "fail_when", "require", "v_vut0_mps"),
     *("policies_sha256", "net_sha256"),
@@ -118,7 +120,13 @@ def figure(value: Value, file: str, key: str, digits: str = "") -> Figure:
 
 def share(value: float, file: str, key: str) -> Figure:
     """Return a share as a figure in percent."""
-    return Figure(value, f"{two_digits(100.0 * value)} %", file, key)
+    return Figure(value, _percent(value), file, key)
+
+
+def _percent(value: float) -> str:
+    """Return a share in percent: with a decimal as the terminal has it, or two digits if small."""
+    percent = 100.0 * value
+    return f"{round(percent, 1):g} %" if percent >= 10.0 else f"{two_digits(percent)} %"
 
 
 def _in_1000(per_merge: float, key: str) -> Figure:
@@ -375,7 +383,7 @@ class BoardModel:
             yield Statement(
                 "Not known: how much of the pool fails far from every failure that was found. A "
                 "campaign with audit cases bounds it.",
-                command=self._again("--audit 100"),
+                command=self._again_with_audit(100),
             )
         else:
             yield say(
@@ -391,9 +399,11 @@ class BoardModel:
         yield from self._chance()
         yield self._certified()
 
-    def _again(self, option: str) -> str:
-        cases = self.summary.cases
-        return f"merge-sumo campaign {self._setup} --cases {cases} --seed {self._seed} {option}"
+    def _again_with_audit(self, audit: int) -> str:
+        """Return the command of the campaign with audit cases beside those that it has."""
+        cases = self.summary.cases + audit
+        seed = f"--seed {self._seed}"
+        return f"merge-sumo campaign {self._setup} --cases {cases} {seed} --audit {audit}"
 
     @property
     def _setup(self) -> str:
@@ -481,16 +491,23 @@ class BoardModel:
         if not isinstance(self.run.scenario, MergeScenario):
             yield Statement("Not known: no traffic is published for this kind of scenario.")
             return
+        if self.run.scenario.vehicles > 2:
+            yield Statement(
+                "Not known: a traffic has its own headways, and so has a scenario with a queue."
+            )
+            return
         if known is None:
+            slow = self.run.scenario.bounds("v_pov0_mps")[1] < SLOWEST_TRAFFIC_MPS
+            traffic = "FILE" if slow else "exid-5"
             yield Statement(
                 "Not run: with how many mainline cars a merge fails in traffic of published "
                 "density and speeds.",
-                command=self._command("failures-per-merge", " --traffic exid-5"),
+                command=self._command("failures-per-merge", f" --traffic {traffic}"),
             )
             return
         density = known.traffic.density_veh_per_km or 0.0
         least, most = known.outside
-        not_counted = f"{two_digits(100.0 * least)} to {two_digits(100.0 * most)} %"
+        ends = dict.fromkeys((_percent(least), _percent(most)))
         yield say(
             "In 1,000 merges in the traffic {} ({} cars/km), failures with {} to {} cars of the "
             "mainline are expected, whatever the mixture of levels is ({} confidence); so at most "
@@ -502,7 +519,7 @@ class BoardModel:
             _in_1000(known.high, "high"),
             share(known.confidence, PER_MERGE, "confidence"),
             _in_1000(known.high, "high"),
-            Figure(most, not_counted, PER_MERGE, "outside"),
+            Figure(most, " to ".join(ends), PER_MERGE, "outside"),
         )
         parts, figures = [], []
         for level, one in known.levels.items():
@@ -510,10 +527,11 @@ class BoardModel:
             figures.append(_in_1000(one.low, f"levels.{level}.low"))
             figures.append(_in_1000(one.high, f"levels.{level}.high"))
         yield say(f"If all drivers were of one level: {'; '.join(parts)}.", *figures)
+        counted = printable(known.counted)
         yield say(
             "Source of the traffic: {}. {}.",
             figure(known.traffic.source, PER_MERGE, "traffic.source"),
-            Figure(known.counted, printable(known.counted).capitalize(), PER_MERGE, "counted"),
+            Figure(known.counted, f"{counted[:1].upper()}{counted[1:]}", PER_MERGE, "counted"),
         )
 
     def _people(self) -> Iterator[Statement]:

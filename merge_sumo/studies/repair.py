@@ -308,6 +308,15 @@ def require_optuna() -> None:
         raise UserError("repair needs optuna: run `pip install 'merge-sumo[repair]'`")
 
 
+ASKED: Final = {
+    "cases_sha256": "the record of the campaign",
+    "vut_files": "a file of the controller",
+    "parameters": "--param",
+    "versions": "the version of a package",
+}
+"""What a setting of a repair is called where it differs; others are options of that name."""
+
+
 class RepairJournal:
     """The folder of a repair: what was asked, and its trials in their order.
 
@@ -326,8 +335,9 @@ class RepairJournal:
         asked = json.loads(json.dumps(settings))
         for name in asked:
             if known.get(name) != asked[name]:
+                what = ASKED.get(name, f"--{name}")
                 raise UserError(
-                    f"{folder} was begun with another {name}: go on with the same command, or "
+                    f"{what} is not what {folder} was begun with: go on with the same command, or "
                     "begin a new folder"
                 )
         if (folder / TRIALS).exists():

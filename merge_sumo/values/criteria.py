@@ -29,8 +29,8 @@ CRITERIA: Final[Registry[NamedCriterion]] = Registry(
         "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
         "unsafe": NamedCriterion(
             "clearance_m <= 0 or brake_after_mps2 > 3",
-            "a contact, or the rear vehicle must brake harder than UN Regulation No. 79 lets a "
-            "lane change demand of others (`after_drac_mps2` is a separate measure)",
+            "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "
+            "No. 79 lets a lane change demand of others",
         ),
     },
     accepts=lambda item: isinstance(item, NamedCriterion),

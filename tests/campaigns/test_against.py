@@ -218,3 +218,22 @@ class TestCommand:
         said = call("campaign", "--vut", "new.py:f", "--gate", "regressions", "--out", "run")
         assert_refused(said, "--gate regressions needs an earlier version")
         assert not Path("run").exists()
+
+
+def test_the_result_counts_cases_without_a_verdict(command_line):
+    """A new version that raises for fast POVs breaks nothing, and that is not all that is said."""
+    text = "def f(seen):\n    if seen.v_pov_mps > 30.0:\n        raise ValueError\n    return 0.0\n"
+    Path("new.py").write_text(text)
+    asked = ("--vut", "new.py:f", "--against", "old.py:f", "--level", 0, "--cases", 10, "--quiet")
+    code, out, err = command_line("campaign", *asked, "--in-process", "--out", "run")
+    assert code == 0, err
+    errors = sum(o.measures.end.is_error for o in Run(Path("run")).outcomes)
+    assert 0 < errors < 10
+    assert "against old.py:f: 0 cases broke, 0 fixed" in out
+    assert f"  error or timeout, so no verdict: {errors} cases with new.py:f alone\n" in out
+    assert f">No verdict of B: {errors}</h2>" in Path("run/against.html").read_text()
+
+
+def test_a_parameter_that_the_old_version_lacks_is_said_of_it(command_line):
+    asked = ("--vut", "design1", "--against", "design1?gap=2", "--cases", 5, "--out", "run")
+    assert_refused(command_line("campaign", *asked), "--against design1?gap=2: design1 has no")

@@ -129,7 +129,7 @@ class TestNumbers:
         known = [len(inside), len(failing), 23, 2.06, *([len(beyond), 2.0, 1] if beyond else [])]
         assert [f.value for f in first.figures] == known
         assert caveat.figures[1].value == pytest.approx(1 - 0.05 ** (1 / 23), abs=1e-12)
-        assert "up to 12 % of drivers" in caveat.text
+        assert "up to 12.2 % of drivers" in caveat.text
 
     def test_of_files_are_what_the_file_has_at_the_key(self, made):
         assert checked_figures(made, [STRESS, CROSSCHECK]) >= 5
@@ -334,6 +334,6 @@ def test_commands_set_up_what_was_tested(tmp_path):
         statement = sentences(write_run(folder, 20, levels=(1,), **changed), "remains")[0]
         return statement.command
 
-    assert command().endswith(" --vut handmade --level 1 --cases 20 --seed 1 --audit 100")
+    assert command().endswith(" --vut handmade --level 1 --cases 120 --seed 1 --audit 100")
     on_lane = command(scenario=named_scenario("us23-lane"))
     assert " --scenario us23-lane --fail-when paper --level 1 " in on_lane

@@ -171,7 +171,7 @@ def test_it_goes_on_where_it_was_stopped_and_workers_change_nothing(campaigns, t
     lines = (part / "trials.jsonl").read_bytes()
     assert lines.count(b"\n") == 4
     (part / "trials.jsonl").write_bytes(lines + b'{"round": 1, "val')
-    with pytest.raises(UserError, match="begun with another trials"):
+    with pytest.raises(UserError, match=r"--trials is not what .* was begun with"):
         api.repair(run, ["edge_m=-345..-200"], out=part, resume=True, **{**few, "trials": 7})
     api.repair(run, ["edge_m=-345..-200"], out=part, resume=True, **few)
     assert (part / "trials.jsonl").read_bytes() == (whole / "trials.jsonl").read_bytes()
