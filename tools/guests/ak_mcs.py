@@ -34,7 +34,8 @@ class AkMcsSampler(LevelwiseSampler):
     Kriging and Monte Carlo Simulation" (2011), with a Matern kernel, as for a rough limit state.
     A batch is chosen one point at a time: the process then believes its own mean there (kriging
     believer). Where no point of the population is uncertain any more, the method would stop; the
-    sampler then draws from those that are to fail.
+    sampler then goes on where the deviation is largest, in half of the batches among the points
+    that are to fail, in the others anywhere.
 
     The limit state is sqrt|dx| - sqrt(6 m), with the gap dx at M, negative where a case fails: the
     score jumps there, and the signed gap jumps where the order of the cars changes.
@@ -59,19 +60,27 @@ class AkMcsSampler(LevelwiseSampler):
         population = rng.random((POPULATION, history.dims))
         process = _fitted(history.points, _limit_state(history))
         mean, deviation = process.predict(population)
-        uncertainty = np.abs(mean) / deviation
-        failing = np.flatnonzero(mean < 0.0)
-        if uncertainty.min() >= CERTAIN and len(failing) >= n:
-            return population[rng.choice(failing, n, replace=False)]
-        nearest = population[np.argsort(uncertainty, kind="stable")[:NEAREST]]
+        certain = bool((np.abs(mean) >= CERTAIN * deviation).all())
+        failing = population[mean < 0.0]
+        if certain and len(failing) >= n and rng.random() < 0.5:
+            population = failing
+        else:
+            order = np.argsort(_rank(mean, deviation, certain=certain), kind="stable")
+            population = population[order]
+        near = population[: max(NEAREST, n)]
         picks: list[int] = []
         for _ in range(n):
-            mean, deviation = process.predict(nearest)
-            uncertainty = np.abs(mean) / deviation
-            uncertainty[picks] = np.inf
-            picks.append(int(np.argmin(uncertainty)))
-            process = process.believing(nearest[picks[-1:]], mean[picks[-1:]])
-        return nearest[picks]
+            mean, deviation = process.predict(near)
+            rank = _rank(mean, deviation, certain=certain)
+            rank[picks] = np.inf
+            picks.append(int(np.argmin(rank)))
+            process = process.believing(near[picks[-1:]], mean[picks[-1:]])
+        return near[picks]
+
+
+def _rank(mean: FloatArray, deviation: FloatArray, *, certain: bool) -> FloatArray:
+    """Return a number that is least at the most useful point: U, or less deviation, (m,)."""
+    return -deviation if certain else np.abs(mean) / deviation
 
 
 def _limit_state(history: LevelHistory) -> FloatArray:
