@@ -61,13 +61,13 @@ class AkMcsSampler(LevelwiseSampler):
         process = _fitted(history.points, _limit_state(history))
         mean, deviation = process.predict(population)
         certain = bool((np.abs(mean) >= CERTAIN * deviation).all())
-        failing = population[mean < 0.0]
+        failing: FloatArray = population[mean < 0.0]
         if certain and len(failing) >= n and rng.random() < 0.5:
             population = failing
         else:
             order = np.argsort(_rank(mean, deviation, certain=certain), kind="stable")
             population = population[order]
-        near = population[: max(NEAREST, n)]
+        near: FloatArray = population[: max(NEAREST, n)]
         picks: list[int] = []
         for _ in range(n):
             mean, deviation = process.predict(near)

@@ -93,8 +93,8 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
     limit = float((FAILURE_SCORE - mean) / deviation)
     told = _fitted(history.points, (history.score - mean) / deviation)
 
-    # Without botorch its classes have no types.
-    class Straddle(AcquisitionFunction):  # type: ignore[misc, unused-ignore]
+    # The classes of botorch have no types for the checker.
+    class Straddle(AcquisitionFunction):  # type: ignore[misc]
         """kappa sigma - |mu - limit|, for one point at a time."""
 
         def __init__(self) -> None:
@@ -112,7 +112,7 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
         def forward(self, X: Tensor) -> Tensor:  # noqa: N803
             """Return the straddle at points, (m, 1, d), as (m,)."""
             posterior = self.model.posterior(X)
-            straddle = KAPPA * posterior.variance.sqrt() - (posterior.mean - limit).abs()
+            straddle: Tensor = KAPPA * posterior.variance.sqrt() - (posterior.mean - limit).abs()
             return straddle[:, 0, 0]
 
     return Straddle()
