@@ -99,7 +99,7 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
 
         def __init__(self) -> None:
             super().__init__(told)
-            self.X_pending = None
+            self.X_pending: Tensor | None = None
 
         def set_X_pending(self, X_pending: Tensor | None = None) -> None:  # noqa: N802, N803
             """Let the process believe its mean at points, (m, d)."""
