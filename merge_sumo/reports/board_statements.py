@@ -243,6 +243,7 @@ class BoardModel:
             figure(str(known.get("libsumo")), SETTINGS, "versions.libsumo"),
         )
         yield from self._starts()
+        yield from self._imperfect()
         yield say(
             "The sampler {} (seed {}) chose the cases in search of failures, so the share of "
             "failures among them is no frequency.",
@@ -278,6 +279,18 @@ class BoardModel:
         else:
             ends += [figure(v, SETTINGS, "scenario.v_vut0_mps") for v in slow_mps]
             yield say(f"{text} at {{}} to {{}} m/s. All such starts are the pool.", *ends)
+
+    def _imperfect(self) -> Iterator[Statement]:
+        """What sensors and actuator of the VUT were given; a range is a coordinate of the pool."""
+        scenario = self.run.scenario
+        for known, what, key in (
+            (scenario.sense, "The VUT senses other cars imperfectly", "scenario.sense"),
+            (scenario.act, "The VUT obeys its controller imperfectly", "scenario.act"),
+        ):
+            if not known.is_perfect:
+                wide = "; a range is part of the pool" if known.ranged else ""
+                shown = known.text.replace(",", ", ").replace("..", " to ").replace("=", " ")
+                yield say(f"{what}: {{}}{wide}.", Figure(known.text, shown, SETTINGS, key))
 
     def _against(self) -> Iterator[Statement]:
         for level, found in self.summary.levels.items():
@@ -413,6 +426,9 @@ class BoardModel:
         given: dict[str, Any] = {option: run.settings.get(option) for option in ("vut", "pov")}
         if name != US23.name:
             given["scenario"] = name if name in shipped_scenarios() else f"{name}{SUFFIX}"
+        if name in shipped_scenarios():
+            for option in ("sense", "act"):
+                given[option] = getattr(run.scenario, option).text or None
         given["policies"] = run.settings.get("policies")
         if criterion.require is not None:
             given["require"] = criterion.require
@@ -719,7 +735,7 @@ UNSAID: Final = (
     "road.",
     "No proof of safety: a search shows failures and cannot show that there are none.",
     "Nothing of tyres, steering, sensors or software timing beyond the equations of motion, except "
-    "where a stress test above says so.",
+    "where this page says so.",
     "Nothing of other roads, weather, or more cars than the scenario has.",
     "Nothing of how many people drive like a level: the shares of levels are unknown.",
 )

@@ -54,6 +54,11 @@ class Imperfection:
         return not self.to_record()
 
     @property
+    def text(self) -> str:
+        """What is imperfect, as it is written after an option; empty where nothing is."""
+        return ",".join(f"{name}={_in_words(value)}" for name, value in self.to_record().items())
+
+    @property
     def ranged(self) -> tuple[str, ...]:
         """Fields that are coordinates of the pool."""
         return tuple(name for name, value in self._given() if isinstance(value, tuple))

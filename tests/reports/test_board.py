@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.crosscheck import CROSSCHECK, Crosscheck, Motion, Verdicts
 from merge_sumo.studies.stress import STRESS, Flips, Rung, Stress
 from merge_sumo.system.records import to_plain
+from merge_sumo.values.imperfection import Sensing
+from merge_sumo.values.scenario import US23
 
 
 def stressed(run: Run) -> Stress:
@@ -335,5 +338,16 @@ def test_commands_set_up_what_was_tested(tmp_path):
         return statement.command
 
     assert command().endswith(" --vut handmade --level 1 --cases 120 --seed 1 --audit 100")
+    late = replace(US23, sense=Sensing.parsed("delay_s=0..1,dropout=0.05", "--sense"))
+    assert " --sense delay_s=0..1,dropout=0.05 --level 1 --cases 120 " in command(scenario=late)
+    (said,) = [
+        one.text
+        for one in sentences(write_run(tmp_path / "late", 2, levels=(1,), scenario=late), "tested")
+        if "imperfectly" in one.text
+    ]
+    assert said == (
+        "The VUT senses other cars imperfectly: delay_s 0 to 1, dropout 0.05; a range is part of "
+        "the pool."
+    )
     on_lane = command(scenario=named_scenario("us23-lane"))
     assert " --scenario us23-lane --fail-when paper --level 1 " in on_lane
