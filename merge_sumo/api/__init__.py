@@ -1183,7 +1183,11 @@ def repair(
 
     def on_trial(trial: mending.Trial) -> None:
         done = sum(one.round == trial.round for one in search.trials)
-        bars[0].counted(f"round {trial.round}", done, max(trials, done), "trials")
+        if done <= trials:
+            bars[0].counted(f"round {trial.round}", done, trials, "trials")
+        else:  # how many the search for the smallest change takes is not known before
+            done -= trials
+            bars[0].counted(f"round {trial.round}, smallest change", done, done, "trials")
 
     def fresh(spec: str, number: int) -> tuple[Run, RunComparison]:
         campaign = folder / mending.CAMPAIGN.format(number)
