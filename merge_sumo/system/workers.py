@@ -23,10 +23,11 @@ from concurrent.futures import (
     CancelledError,
     Executor,
     Future,
+    InvalidStateError,
     wait,
 )
 from concurrent.futures.process import ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -397,7 +398,10 @@ class LocalProcesses(ProcessPoolExecutor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submit; workers that are started here, now or later, never see SIGINT."""
         with _sigint_blocked(), without_main(), without_cwd():
-            return super().submit(fn, *args, **kwargs)
+            future = super().submit(fn, *args, **kwargs)
+        # The thread that ends a broken pool would die of a future that was cancelled.
+        future.set_exception = partial(_fail, future)  # type: ignore[method-assign]
+        return future
 
     def __exit__(self, *exception: Any) -> bool | None:
         """Wait for the workers; when the program is to end at once, end them too."""
@@ -418,6 +422,12 @@ class LocalProcesses(ProcessPoolExecutor):
         queue: Any = getattr(self, "_call_queue", None)
         if queue is not None:
             queue._reader.close()
+
+
+def _fail(future: Future[Any], error: BaseException | None) -> None:
+    """Have a future fail, unless it is cancelled."""
+    with suppress(InvalidStateError):
+        Future.set_exception(future, error)
 
 
 _endings: list[Callable[[], None]] = []

@@ -166,6 +166,22 @@ def asleep(_):
 
 
 class TestLocalProcesses:
+    def test_end_although_work_was_cancelled(self, monkeypatch):
+        died: list[threading.ExceptHookArgs] = []
+        monkeypatch.setattr(threading, "excepthook", died.append)
+
+        def stopped() -> None:
+            with LocalProcesses(1) as workers:
+                begun, *waiting = [workers.submit(time.sleep, 60) for _ in range(6)]
+                while not begun.running():
+                    time.sleep(0.01)
+                assert waiting[-1].cancel()
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            stopped()
+        assert died == []
+
     def test_end_at_once_while_they_are_given_more_than_a_pipe_holds(self):
         workers = LocalProcesses(1)
         for _ in range(3):
