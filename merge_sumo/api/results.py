@@ -168,7 +168,7 @@ class CampaignRun(Result):
     @cached_property
     def merging(self) -> MergeStatistics | None:
         """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
-        return merging_of(self._run.outcomes)
+        return merging_of(self._run.cases)
 
     @cached_property
     def careful(self) -> str | None:
@@ -226,7 +226,7 @@ class CampaignRun(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo campaign --json` prints."""
-        outcomes, criterion = self._run.outcomes, self._run.criterion
+        outcomes, criterion = self._run.cases, self._run.criterion
         return {
             **asdict(self.summary),
             **self.verdict.to_record(),
@@ -261,7 +261,7 @@ class CampaignRun(Result):
         optional += [] if self.merging is None else [f"  {self.merging.sentence}"]
         optional += self.verdict.trouble_lines()
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
-        optional += [f"  note: {note}" for note in doubts(run.outcomes, run.criterion)]
+        optional += [f"  note: {note}" for note in doubts(run.cases, run.criterion)]
         optional += [_level_line(level, summary) for level, summary in levels.items()]
         optional += (
             [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]

@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from merge_sumo.analysis.audit import AuditCase, MissedShare, audit_cases, missed_share
 from merge_sumo.campaigns.store import Batch
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.wrapper import SamplerWrapper
 from merge_sumo.values.audit_mark import AuditMark
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
-from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome
 
 STREAM: Final = 0x61756469
@@ -97,17 +97,13 @@ class Audit:
         return missed_share(cases, self.pool.levels)
 
 
-class AuditedSampler(Sampler):
+class AuditedSampler(SamplerWrapper):
     """A sampler among whose picks audit cases are."""
 
     def __init__(self, sampler: Sampler, audit: Audit) -> None:
         """Take a sampler that was told nothing."""
-        super().__init__(sampler.pool, sampler.seed)
-        self._sampler, self._audit = sampler, audit
-        self.learns, self.overlaps = sampler.learns, sampler.overlaps  # type: ignore[misc]
-        self.uses_predictions = sampler.uses_predictions  # type: ignore[misc]
-        self._places: list[int | None] = []
-        """By the place in the last batch, the place among the sampler's own picks."""
+        super().__init__(sampler)
+        self._audit = audit
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, audit cases in their places."""
@@ -121,30 +117,8 @@ class AuditedSampler(Sampler):
             for place, number in enumerate(self._places)
         ]
 
-    def prediction(self, place: int) -> Prediction | None:
-        """Return the prediction of a case of the last batch; None for an audit case."""
-        number = self._places[place]
-        return None if number is None else self._sampler.prediction(number)
-
-    def batch_size(self) -> int:
-        """Return the preferred number of cases of the next batch."""
-        return self._sampler.batch_size()
-
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
     ) -> None:
         """Take outcomes, of whole batches; those of audit cases are marked from here on."""
-        super().tell(self._audit.mark(outcomes, self._outcomes.values()))
-        self._sampler.tell(outcomes, motions)
-
-    def pend(self, cases: Iterable[Case]) -> None:
-        """Take the cases that run at present; later picks may keep away from audit cases."""
-        pending = list(cases)
-        super().pend(pending)
-        self._sampler.pend(pending)
-
-    def skip(self, cases: Iterable[Case]) -> None:
-        """Count cases as proposed whose outcomes will not be told."""
-        skipped = list(cases)
-        super().skip(skipped)
-        self._sampler.skip(skipped)
+        super().tell(self._audit.mark(outcomes, self._outcomes.values()), motions)

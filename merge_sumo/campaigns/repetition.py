@@ -17,10 +17,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.wrapper import SamplerWrapper
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, fails_above, runs_needed
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 ONE_IN: Final = 8
@@ -35,7 +35,7 @@ LEAST_GAIN: Final = 0.05
 """Of a decision on a case in the midst of decided failing cases, as a share of one far from all."""
 
 
-class RepeatingSampler(Sampler):
+class RepeatingSampler(SamplerWrapper):
     """A sampler among whose picks repeats are."""
 
     draws: int = 1
@@ -43,14 +43,9 @@ class RepeatingSampler(Sampler):
 
     def __init__(self, sampler: Sampler) -> None:
         """Take a sampler that was told nothing."""
-        super().__init__(sampler.pool, sampler.seed)
-        self._sampler = sampler
-        self.learns, self.overlaps = sampler.learns, sampler.overlaps  # type: ignore[misc]
-        self.uses_predictions = sampler.uses_predictions  # type: ignore[misc]
+        super().__init__(sampler)
         self._drawn: dict[Case, int] = {}
         """Draws proposed of each case by its start, but for those that are pending."""
-        self._places: list[int | None] = []
-        """By the place in the last batch, the place among the sampler's own picks."""
 
     @abstractmethod
     def repeats(self, n: int) -> list[Case]:
@@ -65,11 +60,6 @@ class RepeatingSampler(Sampler):
         self._places = [*(None for _ in repeats), *(n if draw == 0 else None for n, draw in pairs)]
         return [*repeats, *(replace(own[number], draw=draw) for number, draw in pairs)]
 
-    def prediction(self, place: int) -> Prediction | None:
-        """Return the prediction of a case of the last batch; None for a repeat."""
-        number = self._places[place]
-        return None if number is None else self._sampler.prediction(number)
-
     def batch_size(self) -> int:
         """Return the preferred number of cases of the next batch."""
         return self.draws * ceil(self._sampler.batch_size() / self.draws)
@@ -80,20 +70,12 @@ class RepeatingSampler(Sampler):
         """Take outcomes, also those of repeats."""
         super().tell(outcomes, motions)
         _count(self._drawn, (outcome.case for outcome in outcomes))
-        self._sampler.tell(outcomes, motions)
-
-    def pend(self, cases: Iterable[Case]) -> None:
-        """Take the cases that run at present."""
-        pending = list(cases)
-        super().pend(pending)
-        self._sampler.pend(pending)
 
     def skip(self, cases: Iterable[Case]) -> None:
         """Count cases as proposed whose outcomes will not be told."""
         skipped = list(cases)
         super().skip(skipped)
         _count(self._drawn, skipped)
-        self._sampler.skip(skipped)
 
     def drawn(self) -> dict[Case, int]:
         """Return how many draws of each case were proposed, by its start."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -260,3 +261,12 @@ def test_the_package_s_own_vuts_repeat_nothing_without_noise():
     noisy = replace(US23, sense=Sensing(noise_x_m=1.0))
     settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=noisy)
     assert isinstance(settings.with_repeats(sampler), RepeatedWhereItMatters)
+
+
+def test_what_is_said_of_merges_counts_cases(tmp_path):
+    how: dict[str, Any] = {"scenario": "us23-lane", "level": 0, "cases": 12, "repeat": 3}
+    run = api.campaign("gap", out=tmp_path / "run", **how)
+    assert len(run.cases) == 12
+    assert run.summary.cases == 4
+    assert run.merging.cases == 4
+    assert "of 4 where it ends" in run.merging.sentence
