@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
-from typer.core import TyperCommand, TyperOption
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
+from merge_sumo.commands import gone
 from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS, Shared
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
@@ -58,7 +59,8 @@ class GroupedCommand(TyperCommand):
         return super().get_params(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; `UserError` where an option would win over itself."""
+        """Parse the arguments; `UserError` where an option is gone, or would win over itself."""
+        gone.check_options(args, {name for parameter in self.params for name in parameter.opts})
         # Parsing empties the list.
         _, _, given = self.make_parser(ctx).parse_args(args=list(args))
         for option, times in Counter(given).items():
@@ -77,6 +79,15 @@ class GroupedCommand(TyperCommand):
             except KeyboardInterrupt:
                 say("stopped")
                 raise
+
+
+class CommandGroup(TyperGroup):
+    """A group of commands that names the successor of a command that is gone."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return the command that the first argument names; `UserError` where it is gone."""
+        gone.check_command(args)
+        return super().resolve_command(ctx, args)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +118,7 @@ class Commands(typer.Typer):
     """An application whose commands are `GroupedCommand`s, with options of `OPTIONS` and --json."""
 
     def __init__(self, *, help: str, **options: Any) -> None:
-        super().__init__(help=unwrapped(help), **options)
+        super().__init__(cls=CommandGroup, help=unwrapped(help), **options)
 
     def verb(
         self,

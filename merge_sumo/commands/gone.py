@@ -1,0 +1,29 @@
+"""Commands and options of earlier versions, each with a sentence that names its successor."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Mapping, Sequence
+from typing import Final
+
+from merge_sumo.errors import UserError
+
+COMMANDS: Final[Mapping[str, str]] = {}
+"""What replaces a command, by its name."""
+OPTIONS: Final[Mapping[str, str]] = {}
+"""What replaces an option, by its name with dashes, in every command that does not have it."""
+
+
+def check_command(arguments: Sequence[str]) -> None:
+    """Raise `UserError` where the first argument is a command that is gone."""
+    if arguments and arguments[0] in COMMANDS:
+        raise UserError(f"the command {arguments[0]} is gone: {COMMANDS[arguments[0]]}")
+
+
+def check_options(arguments: Sequence[str], known: Container[str]) -> None:
+    """Raise `UserError` where an argument is an option that is gone, and not a `known` one."""
+    for argument in arguments:
+        name = argument.partition("=")[0]
+        if name == "--":
+            return
+        if name in OPTIONS and name not in known:
+            raise UserError(f"the option {name} is gone: {OPTIONS[name]}")
