@@ -13,7 +13,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from merge_sumo.commands import gone
-from merge_sumo.commands.options import GROUP_OF, GROUPS, KEYWORDS, OPTIONS, Shared
+from merge_sumo.commands.options import (
+    GROUP_OF,
+    GROUPS,
+    KEYWORDS,
+    OPTIONS,
+    PANEL_OF,
+    Shared,
+)
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
 from merge_sumo.system.spawning import named
@@ -82,7 +89,13 @@ class GroupedCommand(TyperCommand):
 
 
 class CommandGroup(TyperGroup):
-    """A group of commands that names the successor of a command that is gone."""
+    """A group that shows its commands by `PANELS`, and names the successor of one that is gone."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands in the order of `PANELS`."""
+        order = list(PANEL_OF)
+        names = super().list_commands(ctx)
+        return sorted(names, key=lambda name: order.index(name) if name in order else len(order))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the first argument names; `UserError` where it is gone."""
@@ -162,7 +175,9 @@ class Commands(typer.Typer):
             ]
             command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
             command.__name__, command.__annotations__ = function.__name__, {}
-            self.command(name, cls=GroupedCommand, help=unwrapped(function.__doc__ or ""))(command)
+            panel = PANEL_OF.get(name or function.__name__)
+            text = unwrapped(function.__doc__ or "")
+            self.command(name, cls=GroupedCommand, help=text, rich_help_panel=panel)(command)
             return function
 
         return register

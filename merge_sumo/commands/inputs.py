@@ -9,12 +9,12 @@ import typer
 
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Commands, Given, app
-from merge_sumo.commands.options import HOSTING, Shared, flag, option, optional
+from merge_sumo.commands.options import HOSTING, PANEL_OF, Shared, flag, option, optional
 from merge_sumo.commands.printing import print_json, show
 
 scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
 policies = Commands(help="The learned drivers as files for others.", no_args_is_help=True)
-app.add_typer(scenario, name="scenario")
+app.add_typer(scenario, name="scenario", rich_help_panel=PANEL_OF["scenario"])
 app.add_typer(policies, name="policies")
 
 

@@ -16,14 +16,24 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
 
+PANELS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Search": ("campaign", "run", "probability"),
+    "Look": ("report", "explain", "replay", "export"),
+    "Change": ("rerun", "compare", "repair"),
+    "Bring your own": ("vuts", "check-vut", "scenario", "train"),
+    "Research": ("truth", "benchmark", "reproduce"),
+}
+"""Commands by panel of the help, the most used first."""
+PANEL_OF: Final = {name: panel for panel, names in PANELS.items() for name in names}
+
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
-        *("vut", "vut_command", "against", "level", "pov", "policies", "scenario", "net", "v_vut0"),
+        *("vut", "vut_command", "against", "level", "scenario", "net", "v_vut0"),
         *("mainline", "ramp", "point", "follow_up", "sense", "act", "case", "at", "x", "v", "psi"),
         *("headway_ahead", "headway_behind", "only", "a_min", "check"),
     ),
     "How many cases, and which": (
-        *("sampler", "samplers", "cases", "batch", "in_flight", "seed", "seeds", "radius"),
+        *("samplers", "cases", "seed", "seeds", "radius"),
         *(
             "problems",
             "truth_cases",
@@ -32,20 +42,23 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "distribution",
             "traffic",
             "density",
-            "learn_from",
         ),
         *("param", "cost", "trials", "rounds"),
         *("draws", "stop_after_converged", "audit", "repeat"),
     ),
     "Verdict": (
-        *("fail_when", "require", "tolerate", "people", "gate", "tolerance", "rerun", "confidence"),
+        *("fail_when", "tolerate", "people", "gate", "tolerance", "rerun", "confidence"),
         *("certificate",),
     ),
     "Where it runs, and what it writes": (
-        *("out", "resume", "force", "engine", "crime", "workers", "dask", "junit", "figure"),
+        *("out", "resume", "force", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
-    "Trust and limits": ("trust_vut", "deadline", "limit", "vut_memory", "in_process"),
+    "Trust and limits": ("trust_vut", "limit", "vut_memory", "in_process"),
+    "For experts": (
+        *("require", "pov", "policies", "sampler", "batch", "in_flight", "learn_from"),
+        *("engine", "deadline"),
+    ),
 }
 """Options of the command line by group, in the order in which the groups are shown."""
 GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
