@@ -66,7 +66,7 @@ from merge_sumo.campaigns.campaign import (
     resume_campaign,
     run_campaign,
 )
-from merge_sumo.campaigns.one_case import DEBUG_DEADLINE_S, ONE, Ended, case_of, run_one
+from merge_sumo.campaigns.one_case import ONE, Ended, case_of, run_one
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
@@ -203,7 +203,7 @@ def campaign(
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
             `seed`, `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
             and judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`,
-            `pov`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`), where it runs
+            `pov`, `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
             see `CampaignKeywords`.
 
@@ -418,8 +418,6 @@ def run_case(
     values = {
         name: value for name, value in given.items() if name not in setup and value is not None
     }
-    if debug:
-        setup |= {"in_process": True, "deadline_s": DEBUG_DEADLINE_S}
     if recorded is not None:
         settings, one = _recorded_case(vut, recorded, level, setup, values, trust=trust_vut)
     elif vut is not None:
@@ -430,7 +428,7 @@ def run_case(
         check_new(Path(out))
     for sentence in outside_of_the_pool(one):
         warnings.warn(sentence, Notice, stacklevel=2)
-    plan = resolve(settings, _path(net))
+    plan = resolve(settings, _path(net), debug=debug)
 
     def ended(result: Ended) -> None:
         if out is not None:
@@ -1331,7 +1329,7 @@ def check_vut(
     Args:
         vut: as of `campaign`.
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
-        hosting: `policies`, `vut_command`, `deadline_s`, `vut_memory_gib`, `in_process`; see
+        hosting: `policies`, `vut_command`, `deadline_s`, `vut_memory_gib`; see
             `Hosting`.
     """
     check_keywords("check_vut", hosting, Hosting)

@@ -31,7 +31,6 @@ class Hosting(TypedDict, total=False):
         vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time in s that a VUT may take for a step before the case is a VUT_ERROR.
         vut_memory_gib: memory in GiB that the process of a VUT of your own may take.
-        in_process: run such a VUT in this process, within reach of a debugger.
     """
 
     policies: Path | str | None
@@ -39,7 +38,6 @@ class Hosting(TypedDict, total=False):
     vut_command: str | None
     deadline_s: float
     vut_memory_gib: float
-    in_process: bool
 
 
 class Setup(Hosting, total=False):
@@ -286,7 +284,7 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
     for note in settings.criterion.notes(settings.scenario):
         warnings.warn(f"note: {note}", Notice, stacklevel=3)
-    return settings, replace(runner, workers=_within_reach(workers, given))
+    return settings, replace(runner, workers=workers)
 
 
 def given_again(
@@ -308,7 +306,7 @@ def given_again(
     specs = {"vut": spec, "pov": pov_spec}
     against, workers = _earlier_of(given, workers)
     fields = recordable({**given, **{n: specs[n] for n in named}, **against})
-    return fields, replace(runner, workers=_within_reach(workers, given))
+    return fields, replace(runner, workers=workers)
 
 
 def _earlier_of(given: Mapping[str, Any], workers: int | None) -> tuple[dict[str, str], int | None]:
@@ -317,8 +315,3 @@ def _earlier_of(given: Mapping[str, Any], workers: int | None) -> tuple[dict[str
         return {}, workers
     spec, _, workers = drivers_of(given["against"], None, workers, stacklevel=5)
     return {"against": spec}, workers
-
-
-def _within_reach(workers: int | None, given: Mapping[str, Any]) -> int | None:
-    """Return the number of workers: this process alone for a VUT that a debugger is to reach."""
-    return 1 if workers is None and given.get("in_process") else workers

@@ -28,8 +28,6 @@ ONE: Final[dict[str, Any]] = {
     "repeat": 1,
 }
 """Settings of a campaign that is one case."""
-DEBUG_DEADLINE_S: Final = 86_400.0
-"""A person at a breakpoint takes their time."""
 OPTIONS: Final = {
     "x_pov0_m": "--x",
     "v_pov0_mps": "--v",

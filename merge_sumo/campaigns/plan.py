@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.plan import SimulationPlan
@@ -12,15 +13,24 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.vuts.registry import VutFactory
 
+DEBUG_DEADLINE_S: Final = 86_400.0
+"""A person at a breakpoint takes their time."""
 
-def resolve(settings: CampaignSettings, net: Path | None = None) -> SimulationPlan:
+
+def resolve(
+    settings: CampaignSettings, net: Path | None = None, *, debug: bool = False
+) -> SimulationPlan:
     """Return the plan of what settings name: road, drivers, criterion; `net` replaces the road's.
+
+    With `debug` a controller of the user's runs in this process, without a deadline.
 
     A verb calls it once: it reads files, and loads a VUT of the user's to ask what it is. Raises
     `UserError` for drivers, policies or a road that are missing or cannot be loaded.
     """
     policies = policies_folder(settings.policies, settings.scenario)
     options = settings.vut_options(policies)
+    if debug:
+        options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
     vut = VutFactory(settings.vut, options)
     own = None if settings.pov is None else own_pov(settings.pov, options)
     povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)

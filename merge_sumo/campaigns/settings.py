@@ -54,7 +54,6 @@ class CampaignSettings:
     vut_command: str | None = None
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
-    in_process: bool = False
     policies: str | None = None
     pov: str | None = None
     against: str | None = None
@@ -279,7 +278,6 @@ class CampaignSettings:
             command=self.vut_command,
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
-            in_process=self.in_process,
             policies=policies,
         )
 

@@ -30,7 +30,6 @@ SETTINGS: Final = (
     "v_vut0",
 )
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
-SETUP_OF_A_CASE: Final = tuple(name for name in SETUP if name != "in_process")
 
 
 PEOPLE_OF_REPORT: Final = optional(
@@ -137,7 +136,7 @@ def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path 
 
 
 @app.verb(
-    options=(*COORDINATES, *SETUP_OF_A_CASE, "net", "trust_vut"),
+    options=(*COORDINATES, *SETUP, "net", "trust_vut"),
     own={
         "vut": _vut_option("Vehicle under test.", "with --case the campaign's"),
         "level": optional(

@@ -9,7 +9,9 @@ from merge_sumo.errors import UserError
 
 COMMANDS: Final[Mapping[str, str]] = {}
 """What replaces a command, by its name."""
-OPTIONS: Final[Mapping[str, str]] = {}
+OPTIONS: Final[Mapping[str, str]] = {
+    "--in-process": "`merge-sumo run --debug` runs one case within reach of a debugger",
+}
 """What replaces an option, by its name with dashes, in every command that does not have it."""
 
 

@@ -54,7 +54,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("out", "resume", "force", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
-    "Trust and limits": ("trust_vut", "limit", "vut_memory", "in_process"),
+    "Trust and limits": ("trust_vut", "limit", "vut_memory"),
     "For experts": (
         *("require", "pov", "policies", "sampler", "batch", "in_flight", "learn_from"),
         *("engine", "deadline"),
@@ -299,14 +299,9 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "vut_memory": option(
         float, MEMORY_GIB, "GiB of memory that the process of a VUT of your own may take."
     ),
-    "in_process": flag(
-        "Run a VUT of your own in this process, within reach of a debugger, instead of in one of "
-        "its own.",
-        "--in-process",
-    ),
 }
 
-HOSTING: Final = ("vut_command", "deadline", "vut_memory", "in_process")
+HOSTING: Final = ("vut_command", "deadline", "vut_memory")
 OF_SCENARIO: Final = ("follow_up", "sense", "act")
 SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", *OF_SCENARIO, *HOSTING)
 RUNNING: Final = ("workers", "dask", "quiet")

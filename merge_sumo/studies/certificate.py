@@ -63,7 +63,7 @@ TWICE: Final = 100
 OF_A_SEARCH: Final = (
     *("sampler", "cases", "batch", "in_flight", "audit", "seed"),
     *("stop_after_converged", "learn_from"),
-    *("in_process", "policies"),
+    "policies",
 )
 """Settings of a campaign that decide nothing here."""
 SLACK: Final = 1e-9

@@ -204,9 +204,8 @@ def _differences(
 
 def _why(plan: SimulationPlan, difference: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
-    options, spec = plan.vut.options, plan.vut.spec
-    goes_on = waits_for_client(spec, options.command)
-    if options.in_process or is_here(spec) or goes_on:
+    spec = plan.vut.spec
+    if is_here(spec) or waits_for_client(spec, plan.vut.options.command):
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."

@@ -48,7 +48,7 @@ def vuts(tmp_path_factory) -> dict[str, str]:
 def campaign(vut: str, folder: Path, *options: object) -> Result:
     small = (
         *("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform"),
-        *("-q", "--in-process"),
+        "-q",
     )
     return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
 
@@ -316,9 +316,7 @@ class TestACampaignThatTestedNothing:
 @pytest.fixture(scope="module")
 def mixed(vuts, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mixed") / "run"
-    settings = campaign_settings(
-        vut=vuts["mixed"], sampler="uniform", cases=20, batch=10, seed=1, in_process=True
-    )
+    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, batch=10, seed=1)
     found = judge(run_campaign(settings, folder).outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
     return folder
@@ -424,9 +422,7 @@ def folders(vuts, tmp_path_factory) -> dict[str, Path]:
     """Return campaigns of a good VUT and of broken ones, by name."""
     place = tmp_path_factory.mktemp("versions")
     for name, vut in {"good": "design2", **vuts}.items():
-        settings = campaign_settings(
-            vut=vut, sampler="uniform", cases=20, batch=10, seed=1, in_process=True
-        )
+        settings = campaign_settings(vut=vut, sampler="uniform", cases=20, batch=10, seed=1)
         run_campaign(settings, place / name)
     return {path.name: path for path in place.iterdir()}
 

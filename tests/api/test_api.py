@@ -103,7 +103,6 @@ class TestWrongValues:
             ({"cases": "40"}, "cases is '40': it must be a whole number"),
             ({"batch": 2.5}, "batch is 2.5: it must be a whole number"),
             ({"v_vut0_mps": "x"}, "v_vut0_mps is 'x': it must be a number"),
-            ({"in_process": 1}, "in_process is 1: it must be True or False"),
             ({"fail_when": 3}, "fail_when is 3: it must be a text"),
             ({"deadline_s": "x"}, "deadline_s is 'x': it must be a number"),
             ({"workers": "2"}, "--workers is '2': it must be a whole number, 1 or more"),

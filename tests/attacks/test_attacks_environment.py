@@ -35,7 +35,6 @@ COMMANDS = {
     "campaign --vut nonsense": 2,
     CAMPAIGN.format(workers=1): 0,
     CAMPAIGN.format(workers=2): 0,
-    "campaign --vut own.py:Vut --level 0 --cases 4 --in-process --out new": 0,
     "campaign --vut own.py:Vut --level 0 --cases 4 --out new": 0,
     "run --vut design1 --level 0 --x -200 --v 30 --out new": None,
     "report run": 0,

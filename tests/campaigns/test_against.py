@@ -57,7 +57,6 @@ def both(tmp_path, monkeypatch) -> None:
 
 def settings(**changes) -> CampaignSettings:
     values = {"vut": "new.py:f", "against": "old.py:f", "cases": 20, "seed": 3}
-    values["in_process"] = True  # quicker than a process for each version
     return campaign_settings(**{**values, **changes})
 
 
@@ -225,7 +224,7 @@ def test_the_result_counts_cases_without_a_verdict(command_line):
     text = "def f(seen):\n    if seen.v_pov_mps > 30.0:\n        raise ValueError\n    return 0.0\n"
     Path("new.py").write_text(text)
     asked = ("--vut", "new.py:f", "--against", "old.py:f", "--level", 0, "--cases", 10, "--quiet")
-    code, out, err = command_line("campaign", *asked, "--in-process", "--out", "run")
+    code, out, err = command_line("campaign", *asked, "--out", "run")
     assert code == 0, err
     errors = sum(o.measures.end.is_error for o in Run(Path("run")).outcomes)
     assert 0 < errors < 10

@@ -75,7 +75,6 @@ def vut(tmp_path):
 
 def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
     given = {"vut": spec, "levels": (0,), "cases": 60, "sampler": "uniform", **settings}
-    given = {"in_process": workers == 1 and "deadline_s" not in given, **given}
     with open_workers(workers) as there:
         return run_campaign(CampaignSettings(**{"scenario": US23, **given}), folder, workers=there)
 
@@ -155,7 +154,7 @@ def test_a_callable_object_of_python_begins_every_episode_as_it_was_given(tmp_pa
 def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
     spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
     arguments = ["campaign", "--vut", spec, "--level", "0", "--cases", "60", "--sampler"]
-    arguments += ["uniform", "--in-process"]
+    arguments += ["uniform"]
     done = CliRunner().invoke(cli.app, [*arguments, "--out", str(folder), "-q"])
     assert done.stdout.startswith("Not repeatable: ")
     run = Run(folder)
@@ -210,7 +209,7 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
 
 
 def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
-    settings = campaign_settings(vut=vut(IN_ITS_CLASS), in_process=True)
+    settings = campaign_settings(vut=vut(IN_ITS_CLASS))
     plan = resolve(settings)
     with open_workers(1) as there:
         run = runs_points_on(there, settings, plan, tmp_path)

@@ -200,7 +200,7 @@ class TestACampaign:
         vut = tmp_path / "seeded.py"
         vut.write_text(SEEDED)
         known = {"levels": (0,), "cases": 60, "sampler": "gpr", "batch": 10, "tolerated": 0.3}
-        known |= {"vut": f"{vut}:Vut", "repeat": "auto", "scenario": US23, "in_process": True}
+        known |= {"vut": f"{vut}:Vut", "repeat": "auto", "scenario": US23}
         return CampaignSettings(**{**known, **given})
 
     @pytest.mark.parametrize(
@@ -217,11 +217,11 @@ class TestACampaign:
         resume_campaign(folder)
         assert path.read_bytes() == before
         assert [one for one in read_repeats(run) if not one.same] == []
-        again = api.run_case(settings.vut, recorded=(folder, repeats[0].index), in_process=True)
+        again = api.run_case(settings.vut, recorded=(folder, repeats[0].index))
         assert again.outcome.case == repeats[0].case
         assert again.measures == repeats[0].measures
         row = api.open_run(folder).cases[repeats[0].index]
-        as_row = api.run_case(settings.vut, case=row, in_process=True, fail_when=settings.fail_when)
+        as_row = api.run_case(settings.vut, case=row, fail_when=settings.fail_when)
         assert as_row.outcome.case == repeats[0].case
 
     def test_refuses_other_repeats_of_a_folder(self, tmp_path):

@@ -413,7 +413,7 @@ class TestFromAnotherFolder:
         def begin(spec: str) -> Path:
             (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 1.0\n")
             monkeypatch.chdir(tmp_path)
-            values = settings(vut=spec, in_process=True)
+            values = settings(vut=spec)
             with pytest.raises(Stopped):
                 run_campaign(values, tmp_path / "run", check=StopAfter(2))
             (tmp_path / "other").mkdir()

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from calling import assert_refused
-from conftest import some
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
@@ -99,7 +98,6 @@ def test_a_name_that_nobody_knows_is_answered_with_one_that_was_meant(make, said
 
 
 class TestAWrongSignature:
-    @pytest.mark.parametrize("in_process", some([False, True], True))
     @pytest.mark.parametrize(
         ("source", "said"),
         [
@@ -131,13 +129,10 @@ class TestAWrongSignature:
             ),
         ],
     )
-    def test_is_named_in_the_users_file(
-        self, source, said, in_process, tmp_path, monkeypatch, command_line
-    ):
+    def test_is_named_in_the_users_file(self, source, said, tmp_path, monkeypatch, command_line):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "my.py").write_text(source)
-        hosted = ("--in-process",) if in_process else ()
-        code, out, err = command_line("campaign", "--vut", "my.py:V", *hosted, "--out", "run")
+        code, out, err = command_line("campaign", "--vut", "my.py:V", "--out", "run")
         assert (code, out, err) == (2, "", f"merge-sumo: {said}\n")
         assert not (tmp_path / "run").exists()
 

@@ -63,11 +63,10 @@ SMALL = {
     "batch": 6,
     "seed": 2,
     "sampler": "uniform",
-    "in_process": True,
 }
 
 
-FEW = ("--cases", 8, "--sampler", "uniform", "--in-process")
+FEW = ("--cases", 8, "--sampler", "uniform")
 
 
 @pytest.fixture(autouse=True)
@@ -380,9 +379,9 @@ class TestACampaign:
         assert {outcome.to_record()["level"] for outcome in done.outcomes} == {3}
 
     @pytest.mark.long
-    def test_has_the_same_outcomes_on_two_workers_and_in_process(self, done, tmp_path):
+    def test_has_the_same_outcomes_on_two_workers(self, done, tmp_path):
         with open_workers(2) as workers:
-            hosted = settings("my_pov.py:Pov", in_process=False)
+            hosted = settings("my_pov.py:Pov")
             run_campaign(hosted, tmp_path / "two", workers=workers)
         assert outcomes(tmp_path / "two") == outcomes(done.folder)
 
@@ -397,7 +396,7 @@ class TestACampaign:
 
     def test_from_python_takes_one(self, tmp_path):
         options = {"level": "own", "cases": 4, "out": tmp_path / "run", "pov": pov(YIELDS)}
-        options |= {"sampler": "uniform", "in_process": True}
+        options |= {"sampler": "uniform"}
         done = ms.campaign("design2", **options)
         assert {row["level"] for row in done.cases} == {3}
         assert "<td>own</td>" in done._repr_html_()
@@ -493,7 +492,7 @@ class TestTrust:
     @pytest.fixture
     def theirs(self, tmp_path, monkeypatch) -> Path:
         """Return a campaign with a POV that somebody sent; nobody here has its key."""
-        few = settings(pov(TELLTALE), in_process=False, cases=4, batch=2)
+        few = settings(pov(TELLTALE), cases=4, batch=2)
         folder = run_campaign(few, tmp_path / "run").folder
         Path("it-ran").unlink()
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))

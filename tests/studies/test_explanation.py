@@ -258,7 +258,7 @@ class TestParameters:
             "        return -self.brake_mps2 if seen.t_s < 0.05 else 1.0\n"
         )
         keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.001"}
-        run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, in_process=True, **keywords)
+        run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, **keywords)
         (one,) = ms.explain(run, 0, params=["brake_mps2=0..4"]).found
         # In steps of .1 from 3 on, then in eighths of that: it fails above 2.001.
         assert one.parameters == (ParameterChange("brake_mps2", 3.0, 0.0, 4.0, below=2.0),)

@@ -84,7 +84,6 @@ def campaigns(tmp_path_factory):
                 cases=20,
                 sampler="uniform",
                 fail_when=CRITERION,
-                in_process=True,
                 out=folder / name,
                 **HERE,
             )

@@ -92,7 +92,6 @@ def campaigns(tmp_path_factory):
             tolerated=0.35,
             scenario=US23,
             fail_when='end == "TIMEOUT"',
-            in_process=True,
         )
         made.append(run_campaign(settings, folder / f"run-{name}"))
     return made

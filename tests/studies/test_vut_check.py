@@ -21,7 +21,7 @@ def check(tmp_path):
     def run(source: str, *arguments: str) -> tuple[int, str]:
         path = tmp_path / f"vut{len(list(tmp_path.iterdir()))}.py"
         path.write_text(source)
-        arguments = "check-vut", f"{path}:Vut", "--in-process", *arguments
+        arguments = "check-vut", f"{path}:Vut", *arguments
         done = CliRunner().invoke(cli.app, arguments)
         return done.exit_code, done.stdout
 

@@ -446,7 +446,7 @@ class TestCampaigns:
             "--sampler",
             "uniform",
             *("--fail-when", 'end == "TIMEOUT"', "--out", tmp_path / "run", "--json"),
-            *("-q", "--in-process", "--gate", "failures"),
+            *("-q", "--gate", "failures"),
         )
         found = json.loads(out)
         assert (code, found["failures"], found["timeouts"]) == (1, 2, 0)

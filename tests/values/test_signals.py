@@ -57,7 +57,6 @@ def campaign(tmp_path):
         path = tmp_path / "my_vut.py"
         path.write_text(source, encoding="utf-8")
         given = {"levels": (0,), "cases": 24, "batch": 12, "sampler": "uniform", **settings}
-        given = {"in_process": workers == 1, **given}
         folder = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
         with open_workers(workers) as there:
             return run_campaign(
@@ -71,9 +70,8 @@ def campaign(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", [LEAVES, FUNCTION])
-@pytest.mark.parametrize("in_process", [False, True])
-def test_every_step_has_what_was_left_at_it(campaign, source, in_process):
-    run = campaign(source, in_process=in_process, cases=40, batch=40)
+def test_every_step_has_what_was_left_at_it(campaign, source):
+    run = campaign(source, cases=40, batch=40)
     for outcome in Run(run.folder).outcomes:
         found = Run(run.folder).trajectory(outcome.index)
         assert found.signals is not None

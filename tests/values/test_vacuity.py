@@ -358,7 +358,7 @@ class TestAfterTheRun:
         monkeypatch.chdir(tmp_path)
         Path("hard.py").write_text("def f(seen):\n    return 9.0\n")
         asked = (
-            *("campaign", "--vut", "hard.py:f", "--level", 0, "--cases", 6, "--in-process"),
+            *("campaign", "--vut", "hard.py:f", "--level", 0, "--cases", 6),
             *("--sampler", "uniform"),
         )
         code, out, err = command_line(*asked, "--out", "run")
