@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 TEMPLATES: Final = Path(__file__).parent / "templates"
 
 
-def page(template: str, *, styles: tuple[str, ...] = (), script: str = "", **words: Any) -> str:
-    """Return a page as HTML, with style sheets and a script in it, by name, and words as needed."""
-    style, source = "".join(map(source_of, styles)), source_of(script) if script else ""
+def page(
+    template: str, *, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **words: Any
+) -> str:
+    """Return a page as HTML, with style sheets and scripts in it, by name, and words as needed."""
+    style, source = ("".join(map(source_of, names)) for names in (styles, scripts))
     policy = {"style_hash": _policy_hash(style), "script_hash": _policy_hash(source)}
     own = {"style": Markup(style), "script": Markup(source)}  # noqa: S704 (our own files)
     return _environment().get_template(template).render({**own, **policy, **words})

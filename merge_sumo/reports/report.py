@@ -1,9 +1,9 @@
 """The report of a campaign: one HTML file that needs no network.
 
 What a reader needs is in the page as text and tables; maps, motion and charts are drawn by
-`templates/report.js` from JSON in the page. Names and messages come from outside, so the template
-escapes them, the JSON holds no "<", the script sets text and never markup, and the page's own
-policy lets nothing run but that script and lets nothing load at all.
+`templates/player.js` and `report.js` from JSON in the page. Names and messages come from outside,
+so the template escapes them, the JSON holds no "<", the script sets text and never markup, and the
+page's own policy lets nothing run but that script and lets nothing load at all.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def report_page(
     return page(
         "report.html.jinja",
         styles=("report.css",),
-        script="report.js",
+        scripts=("player.js", "report.js"),
         sections=sections,
         data=Markup(data),  # noqa: S704 (JSON without "<")
         **words,

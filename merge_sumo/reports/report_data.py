@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import math
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,9 +14,9 @@ from merge_sumo.analysis.diagnosis import Diagnosis, Kind
 from merge_sumo.analysis.people import HEE_PEOPLE, Place
 from merge_sumo.analysis.predictions import prediction_error_m
 from merge_sumo.analysis.verdict import shortened
+from merge_sumo.reports.player import motion_row, packed, player_data
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
-from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.studies.explanation import in_sentences
 from merge_sumo.studies.parameter_ranges import Range
 from merge_sumo.system.records import to_plain
@@ -28,22 +26,15 @@ from merge_sumo.values.fmc import fmc
 from merge_sumo.values.measures import Measure
 from merge_sumo.values.scenario import (
     ALL_LEVELS,
-    DT_S,
-    VEHICLES,
-    MergeScenario,
     Scenario,
-    lane_of,
     level_name,
 )
 from merge_sumo.values.score import measures_in
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
-from merge_sumo.values.trajectory import End, Trajectory
 
 SVO_NEAR_RAD: Final = 0.1
 NEAR_SHARE: Final = 1.0 / 16.0
-SPEED_UNIT_MPS: Final = 0.002
-"""Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
 MOST_STEPS: Final = 40
 """Batches, or groups of batches, in the charts of the search."""
 MOST_BALLS: Final = 20_000
@@ -56,17 +47,12 @@ UNKNOWN: Final = Diagnosis(None, None, False, False, None)
 
 def page_data(facts: ReportModel) -> dict[str, Any]:
     """Return what the script draws from: plain JSON."""
-    speeds, offsets = _packed(facts.motion)
+    speeds, offsets = packed(facts.motion)
     scenario = facts.run.scenario
     return {
-        "dt": DT_S,
-        "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
         "goal": scenario.goal,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
-        "speed_unit_mps": SPEED_UNIT_MPS,
         "coordinates": [_coordinate(c) for c in facts.coordinates],
-        "vehicles": VEHICLES[: facts.run.scenario.vehicles],
-        "ends": [end.value for end in End],
         "drivers": HEE_PEOPLE,
         "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
@@ -78,7 +64,6 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
             for o in facts.shown
             if o.measures.error
         },
-        "speeds": speeds,
         "signals": {i: to_record(t.signals) for i, t in facts.motion.items() if t.signals},
         "maps": _maps(facts),
         "search": _search(facts),
@@ -86,8 +71,7 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "why": _explanations(facts),
         "explain": f"merge-sumo explain {_quoted(facts.run.folder)}",
         "report": f"merge-sumo report {_quoted(facts.run.folder)}",
-        **_road(facts.road),
-        **_lane(scenario),
+        **player_data(scenario, facts.road, speeds),
     }
 
 
@@ -116,7 +100,7 @@ def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
 
 
 def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
-    ends, kinds, severities = list(End), list(Kind), list(Severity)
+    kinds, severities = list(Kind), list(Severity)
     listed = listed_measures(facts.run.scenario)
     columns: dict[str, list[Any]] = {}
     for o in facts.shown:
@@ -125,9 +109,7 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "index": o.index,
             "level": o.case.level,
             **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in facts.coordinates},
-            "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
-            "nearest": VEHICLES.index(o.measures.nearest),
-            "end": ends.index(o.measures.end),
+            **motion_row(o, facts.motion.get(o.index), offsets.get(o.index, 0)),
             "severity": None
             if o.measures.severity is None
             else severities.index(Severity(o.measures.severity)),
@@ -143,8 +125,6 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "vut_accelerates": int(found.vut_accelerates),
             "pov_accelerates": int(found.pov_accelerates),
             "kind": kinds.index(facts.kinds[o.index]) if o.index in facts.kinds else None,
-            "offset": offsets.get(o.index, 0),
-            "rows": len(facts.motion[o.index].motion) if o.index in facts.motion else 0,
         }
         if facts.repeated:
             row["runs"] = _runs(facts.repeated.get(o.index))
@@ -290,54 +270,6 @@ def _median(values: FloatArray) -> float | None:
     """Return the median of those that are numbers, if there are any."""
     known = values[~np.isnan(values)]
     return round(float(np.median(known)), 3) if len(known) else None
-
-
-def _packed(motion: Mapping[int, Trajectory]) -> tuple[str, dict[int, int]]:
-    """Return the speeds of all vehicles at every step in base64, and the first row of a case."""
-    offsets, first = {}, 0
-    parts = [np.empty(0, dtype="<u2")]
-    for index, trajectory in motion.items():
-        speeds = trajectory.motion[:, :, 1]
-        packed = np.rint(np.clip(speeds / SPEED_UNIT_MPS, 0, 65535)).astype("<u2")
-        parts.append(packed.ravel())
-        offsets[index] = first
-        first += len(speeds)
-    return base64.b64encode(np.concatenate(parts).tobytes()).decode(), offsets
-
-
-def _road(road: Corridor) -> dict[str, Any]:
-    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
-
-    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
-    """
-    at = road.lane_point(0.0, on_ramp=False)
-    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
-
-    def place(x: float, y: float) -> list[float]:
-        dx, dy = x - at.x_m, y - at.y_m
-        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
-        return [round(along, 2), round(left, 2)]
-
-    def points(path: LanePath) -> list[list[float]]:
-        return [
-            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
-            for piece in path.pieces
-            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
-        ]
-
-    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
-    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
-    return {
-        "main": points(road.mainline),
-        "ramp": points(road.ramp),
-        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
-    }
-
-
-def _lane(scenario: Scenario) -> dict[str, Any]:
-    """Return the acceleration lane, and what sentences call the place of a merge; or nothing."""
-    lane_m = lane_of(scenario)
-    return {} if lane_m is None else {"lane": lane_m, "place": scenario.place}
 
 
 def _quoted(path: Path) -> str:

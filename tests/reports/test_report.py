@@ -24,8 +24,8 @@ from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failure
 from merge_sumo.reports import report_data
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.headline import headline
+from merge_sumo.reports.player import SPEED_UNIT_MPS
 from merge_sumo.reports.report import report_page, write_report
-from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth

@@ -24,7 +24,7 @@ from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.report_data import _road
+from merge_sumo.reports.player import road_data
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program
@@ -350,7 +350,7 @@ def test_the_report_draws_cars_where_they_are_with_m_as_origin_and_the_road_to_t
     corridor, name
 ):
     road = corridor(name)
-    drawn = _road(road)
+    drawn = road_data(road)
     m = road.lane_point(0.0, on_ramp=False)
     turn = math.radians(m.angle_deg - 90.0)
     for on_ramp, path in ((False, drawn["main"]), (True, drawn["ramp"])):

@@ -1,0 +1,237 @@
+"use strict";
+// The motion of one case, or of two beside each other: the road from above, and charts over time.
+// Everything that is drawn comes from the JSON in #data; text is set as text, never as markup.
+const data = JSON.parse(document.getElementById("data").textContent);
+const byId = (id) => document.getElementById(id);
+const namespace = document.querySelector("svg").namespaceURI;
+const DT = data.dt, CRASH = data.crash_m;
+const LANE = data.lane ?? null; // an acceleration lane: [begin, end]
+const vehicles = data.vehicles, POV = vehicles.indexOf("pov"), VUT = vehicles.indexOf("vut");
+const NAMES = { pov: "POV", vut: "VUT", ahead: "car ahead", behind: "car behind" };
+const cases = data.cases;
+
+function draw(parent, tag, attributes = {}, text = null) {
+  const node = document.createElementNS(namespace, tag);
+  for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
+  if (text !== null) node.textContent = text;
+  parent.append(node);
+  return node;
+}
+const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
+const fixed = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
+const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
+const path = (points) => points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(2)} ${y.toFixed(2)}`).join("");
+
+const speedBytes = bytes(data.speeds);
+const speeds = new DataView(speedBytes.buffer);
+const speedAt = (k) => speeds.getUint16(2 * k, true) * data.speed_unit_mps;
+
+function motion(i) {
+  // Speeds are kept; positions follow by x' = x + v dt, as the vehicles moved.
+  const rows = cases.rows[i], first = cases.offset[i];
+  if (!rows) return null;
+  const v = vehicles.map((_, who) => Array.from({ length: rows }, (_, t) => speedAt((first + t) * vehicles.length + who)));
+  const x = v.map((speed, who) => {
+    const places = [cases.starts[i][who]];
+    for (let t = 1; t < rows; t++) places.push(places[t - 1] + speed[t - 1] * DT);
+    return places;
+  });
+  // On an acceleration lane the last row is that of the merge.
+  const merge = LANE && data.ends[cases.end[i]] === "MERGED" ? x[VUT][rows - 1] : null;
+  return { rows, v, x, met: cases.nearest[i], merge };
+}
+
+/* ---------- plots over time ---------- */
+function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], windows = [], dots = [], flags = [], xTicks = 4, yTicks = true, decimals = null }) {
+  const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
+  const left = 40, right = w - 12, top = 8, bottom = h - 28;
+  const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
+  const Y = (y) => bottom - (y - yRange[0]) / (yRange[1] - yRange[0] || 1) * (bottom - top);
+  svg.replaceChildren();
+  for (const [name, [low, high]] of [...windows.map((ends) => ["window", ends]), ...bands.map((ends) => ["danger", ends])]) {
+    const [a, b] = [Y(clamp(high, ...yRange)), Y(clamp(low, ...yRange))];
+    draw(svg, "rect", { class: name, x: left, y: a, width: right - left, height: b - a });
+  }
+  const step = nice((yRange[1] - yRange[0]) / 5);
+  for (let y = Math.ceil(yRange[0] / step) * step; yTicks && y <= yRange[1] + 1e-12; y += step) {
+    draw(svg, "line", { class: "grid", x1: left, x2: right, y1: Y(y), y2: Y(y) });
+    draw(svg, "text", { x: left - 5, y: Y(y) + 4, "text-anchor": "end" }, fixed(Math.abs(y) < step / 1e6 ? 0 : y, decimals ?? digits(step)));
+  }
+  const xStep = Math.max(1, nice((xRange[1] - xRange[0]) / xTicks));
+  for (let x = Math.ceil(xRange[0] / xStep) * xStep; x <= xRange[1] + 1e-9; x += xStep) {
+    draw(svg, "text", { x: X(x), y: bottom + 13, "text-anchor": "middle" }, fixed(x, 0));
+  }
+  draw(svg, "text", { x: right, y: h - 3, "text-anchor": "end" }, xLabel);
+  for (const { name, x0, x1, y0, y1 } of bars) draw(svg, "rect", { class: name, x: X(x0), width: Math.max(X(x1) - X(x0) - 0.6, 0.4), y: Y(y1), height: Y(y0) - Y(y1) });
+  for (const { name, points } of lines) {
+    draw(svg, "path", { class: `line ${name}`, d: path(points.map(([x, y]) => [X(x), Y(clamp(y, ...yRange))])) });
+    if (points.length === 1) draw(svg, "circle", { class: name, cx: X(points[0][0]), cy: Y(points[0][1]), r: 2 });
+  }
+  for (const { name, x, y } of dots) draw(svg, "circle", { class: name, cx: X(x), cy: Y(y), r: 4 });
+  for (const { name, x, y } of flags) draw(svg, "path", { class: name, d: `M${X(x)} ${Y(y) - 2}l-4.5 -7h9Z` });
+  return { X, now: draw(svg, "line", { class: "now", x1: -9, x2: -9, y1: top, y2: bottom }), from: left, to: right, end: xRange[1] };
+}
+function nice(step) {
+  if (!(step > 0)) return 1;
+  const power = 10 ** Math.floor(Math.log10(step));
+  return power * [1, 2, 5, 10].find((f) => f * power >= step);
+}
+const digits = (step) => Math.max(0, -Math.floor(Math.log10(step) + 1e-9));
+function range(values, pad = 0.06) {
+  const low = Math.min(...values), high = Math.max(...values), more = pad * (high - low) || 1;
+  return [low - more, high + more];
+}
+
+/* ---------- road, motion, charts ---------- */
+const slider = byId("time"), views = ["view", "view-beside"].map((id) => new TopView(byId(id)));
+let moving = null, step = 0, final = 0, playing = false, last = 0, charts = [];
+function showMotions(first, second, names, flags = [], more = () => []) { // a motion, and another one beside it, whose lines are faint
+  const { v, x, met } = moving = first;
+  const over = (values) => values.map((value, t) => [t * DT, value]);
+  const lines = (values, more = "") => vehicles.map((name, who) => ({ name: name + more, points: over(values[who]) }));
+  const both = (key) => (second ? [...lines(second[key], " beside"), ...lines(first[key])] : lines(first[key]));
+  const all = (key) => [...first[key].flat(), ...(second?.[key].flat() ?? [])];
+  const secondGap = second ? second.x[second.met].map((place, t) => place - second.x[VUT][t]) : [];
+  const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
+  const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
+  const inView = range([...gap[met], ...secondGap, -12, 12]); // of the car that the VUT meets
+  const merges = [second, first].filter((one) => one && one.merge !== null)
+    .map((one) => ({ name: one === second ? "merged beside" : "merged", x: (one.rows - 1) * DT, y: one.merge }));
+  final = Math.max(first.rows, second?.rows ?? 0) - 1;
+  const end = final * DT, common = { xRange: [0, end], xLabel: "time, s" };
+  charts = [
+    plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: both("v"), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
+    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x"), windows: LANE ? [LANE] : [], dots: merges }),
+    plot(byId("chart-gap"), {
+      ...common, yRange: inView, bands: [[-CRASH, CRASH]],
+      lines: [...(second ? [{ name: "gap beside", points: over(secondGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
+    }),
+    ...more(end),
+  ];
+  slider.max = final;
+  byId("views").classList.toggle("two", second !== null);
+  views[0].show(first, names[0]);
+  views[1].show(second, names[1]);
+}
+const extent = (values) => [Math.min(...values), Math.max(...values)];
+function pose(path, along) { // front bumper at a lane coordinate of a path
+  let k = path.findIndex(([at], i) => i > 0 && along < at);
+  if (k < 0) k = path.length - 1;
+  // Where a lane begins its point stands twice, and some lanes are as short as a point.
+  while (k > 1 && path[k][0] === path[k - 1][0]) k--;
+  const [[s0, x0, y0], [s1, x1, y1]] = [path[k - 1], path[k]], share = (along - s0) / (s1 - s0 || 1);
+  return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), angle: Math.atan2(y0 - y1, x1 - x0) * 180 / Math.PI };
+}
+function TopView(figure) {
+  const svg = figure.querySelector("svg"), caption = figure.querySelector("figcaption");
+  const cars = {};
+  let name = "";
+  this.svg = svg;
+  this.cars = cars;
+  this.moving = null; // what it shows
+  this.show = (moving, named) => {
+    this.moving = moving;
+    name = named;
+    figure.hidden = moving === null;
+    svg.replaceChildren();
+    // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
+    for (const lane of data.lanes) draw(svg, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
+    LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
+    for (const who of vehicles) {
+      const group = draw(svg, "g");
+      draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
+      const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
+      const label = draw(svg, "text", { "text-anchor": "middle" });
+      cars[who] = { group, brake, label };
+    }
+  };
+  const across = (name, from, to, x) => { // a line over the road between two paths, at a lane coordinate
+    const a = pose(from, x), b = pose(to, x), length = Math.hypot(b.x - a.x, b.y - a.y) || 1, u = 2.4 * (b.x - a.x) / length, v = 2.4 * (b.y - a.y) / length;
+    draw(svg, "line", { class: name, x1: a.x - u, y1: -(a.y - v), x2: b.x + u, y2: -(b.y + v), "stroke-width": 0.25 });
+  };
+  const drawLane = () => { // the acceleration lane, and where the VUT left it
+    const begin = LANE[0] + 0.01, end = LANE[1] - 0.01; // at its very ends are those of other lanes, too
+    const inside = data.ramp.filter(([at]) => at > begin && at < end).map(([at]) => at);
+    const points = [begin, ...inside, end].map((at) => pose(data.ramp, at));
+    draw(svg, "path", { class: "window", d: path(points.map(({ x, y }) => [x, -y])), "stroke-width": 3.05 });
+    if (this.moving && this.moving.merge !== null) across("merge", data.main, data.ramp, Math.min(this.moving.merge, end));
+  };
+  const row = (t) => { // the rows of the motion that a step is between; its last one stays
+    const { rows } = this.moving, s = Math.min(t, rows - 1), k = Math.min(Math.floor(s), Math.max(rows - 2, 0));
+    return { k, next: Math.min(k + 1, rows - 1), share: s - k };
+  };
+  const mix = (values, { k, next, share }) => (1 - share) * values[k] + share * values[next];
+  const hasMerged = (t) => this.moving.merge !== null && t >= this.moving.rows - 1;
+  this.places = (t) => this.moving.x.map((x, who) => pose(who === VUT && !hasMerged(t) ? data.ramp : data.main, mix(x, row(t))));
+  this.at = (t, { x: middle, y: centre, width, height }) => {
+    const now = row(t), places = this.places(t), vutAbove = places[VUT].y > places[POV].y;
+    const size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
+    // Letters of a small picture are 11 pixels high.
+    const letters = Math.max(2.6 * size, 11 * width / (svg.clientWidth || width)), aside = 0.5 * width - 3.6 * letters;
+    svg.setAttribute("viewBox", `${middle - width / 2} ${-centre - height / 2} ${width} ${height}`);
+    for (const [who, name] of vehicles.entries()) {
+      const { x, y, angle } = places[who], v = this.moving.v[who], a = (v[now.next] - v[now.k]) / DT;
+      const { group, brake, label } = cars[name];
+      group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
+      brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
+      const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
+      label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
+      const below = -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters);
+      label.setAttribute("y", clamp(below, letters - centre - height / 2, height / 2 - centre - 0.4 * letters));
+      label.style.fontSize = `${letters}px`;
+      label.textContent = named ? `${NAMES[name]} ${fixed(mix(v, now), 1)} m/s` : name;
+      // The POV's own label has the room where two would lie on each other.
+      label.setAttribute("visibility", named || Math.abs(x - places[POV].x) > 0.14 * width ? "visible" : "hidden");
+    }
+    const end = (this.moving.rows - 1) * DT;
+    caption.textContent = t < this.moving.rows - 1 ? name : `${name}, ended at ${fixed(end, 1)} s`;
+  };
+}
+function at(t) {
+  if (!moving) return;
+  step = clamp(t, 0, final);
+  const shown = views.filter((view) => view.moving), places = shown.flatMap((view) => view.places(step));
+  // The view follows all cars, never closer than 90 m; of two cases it is the same stretch of road.
+  const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
+  const { clientWidth, clientHeight } = views[0].svg, ratio = clientHeight / (clientWidth || 1) || 0.25;
+  const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90);
+  for (const view of shown) view.at(step, { x: (low + high) / 2, y: (bottom + top) / 2, width, height: width * ratio });
+  slider.value = Math.round(step);
+  slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
+  byId("time-value").textContent = `${fixed(step * DT, 1)} s`;
+  for (const { X, now } of charts) { now.setAttribute("x1", X(step * DT)); now.setAttribute("x2", X(step * DT)); }
+}
+function play(on) {
+  playing = on && moving !== null;
+  const button = byId("play");
+  button.textContent = playing ? "❚❚" : "▶";
+  button.setAttribute("aria-label", playing ? "Pause" : "Play");
+  if (!playing) return;
+  if (step >= final) at(0);
+  last = performance.now();
+  requestAnimationFrame(frame);
+}
+function frame(now) {
+  if (!playing) return;
+  at(step + (now - last) / 1000 / DT * Number(byId("rate").value));
+  last = now;
+  step >= final ? play(false) : requestAnimationFrame(frame);
+}
+slider.addEventListener("input", () => { play(false); at(Number(slider.value)); });
+byId("play").addEventListener("click", () => play(!playing));
+slider.addEventListener("keydown", (event) => {
+  if (event.key === " ") { event.preventDefault(); play(!playing); }
+});
+for (const id of ["chart-speed", "chart-position", "chart-gap"]) {
+  const svg = byId(id);
+  const scrub = (event) => {
+    if (event.type === "pointermove" && !event.buttons) return;
+    const point = new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
+    play(false);
+    at((point.x - charts[0].from) / (charts[0].to - charts[0].from) * charts[0].end / DT);
+  };
+  svg.addEventListener("pointerdown", scrub);
+  svg.addEventListener("pointermove", scrub);
+}
+addEventListener("resize", () => at(step));
+addEventListener("beforeprint", () => at(step));
