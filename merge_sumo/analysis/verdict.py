@@ -13,7 +13,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from merge_sumo.analysis.people import PeopleSummary
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import counted, printable
@@ -206,8 +205,6 @@ def in_words(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 
-HUMAN_FAILURES: Final = "human failures"
-"""The gate that counts failures in which the POV does no more than people."""
 REGRESSIONS: Final = "regressions"
 """The gate that counts the cases that fail and pass with an earlier version of the VUT."""
 
@@ -217,8 +214,8 @@ class Gate:
     """What a campaign must not show: more than `above` of something.
 
     Attributes:
-        what: "failures", "human failures" (those in which the POV does no more than people),
-            "errors", "timeouts", "regressions" (a number of cases) or "fmc" (at some POV level).
+        what: "failures", "errors", "timeouts", "regressions" (a number of cases) or "fmc" (at
+            some POV level).
         above: the gate is met beyond this.
     """
 
@@ -230,9 +227,7 @@ class Gate:
         """The gate as it is written."""
         return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
 
-    def check(
-        self, verdict: Verdict, summary: Summary, people: PeopleSummary, regressions: int = 0
-    ) -> GateResult:
+    def check(self, verdict: Verdict, summary: Summary, regressions: int = 0) -> GateResult:
         """Return whether a campaign meets the gate, and what it shows.
 
         `regressions` are the cases that fail and pass with the version that the campaign is
@@ -246,8 +241,6 @@ class Gate:
             )
             said = f"FMC {most:.4f} at level {level_name(level)}"
             return GateResult(self.name, most > self.above, said)
-        if self.what == HUMAN_FAILURES:
-            return GateResult(self.name, people.inside > 0, people.gate_found)
         regressed = self.what == REGRESSIONS
         number: int = regressions if regressed else getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
@@ -284,14 +277,13 @@ def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
 
 
 def _parse_gate(text: str) -> Gate:
-    if text in ("failures", HUMAN_FAILURES, "errors", "timeouts", REGRESSIONS):
+    if text in ("failures", "errors", "timeouts", REGRESSIONS):
         return Gate(text)
     what, sign, number = (part.strip() for part in text.partition(">"))
     if (what, sign) != ("fmc", ">"):
         raise UserError(
             f"there is no gate {printable(text)!r}: choose failures, "
-            f'"{HUMAN_FAILURES}", errors, timeouts, {REGRESSIONS} or "fmc>X" (in quotes, or the '
-            'shell takes the ">")'
+            f'errors, timeouts, {REGRESSIONS} or "fmc>X" (in quotes, or the shell takes the ">")'
         )
     try:
         above = float(number)

@@ -202,8 +202,8 @@ def campaign(
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
             `seed`, `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
-            and judged (`people`, `scenario`, `follow_up_s`, `fail_when`, `require`, `policies`,
-            `pov`, `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
+            and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
+            `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
             see `CampaignKeywords`.
 
@@ -607,27 +607,19 @@ def export(
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
-def report(run: AnyRun, *, people: float | None = None) -> Path:
-    """Write the report of a campaign again and return its path; as `merge-sumo report`.
-
-    Args:
-        run: the campaign, or its folder.
-        people: share of published drivers beside whom the report holds failures, instead of the
-            campaign's, which stays as it is.
-    """
-    opened = _opened(run)
-    return (opened if people is None else CampaignRun(opened.run, people=people)).report()
+def report(run: AnyRun) -> Path:
+    """Write the report of a campaign again and return its path; as `merge-sumo report`."""
+    return _opened(run).report()
 
 
-def board(run: AnyRun, *, certificate: AnyPath | None = None, people: float | None = None) -> Shown:
+def board(run: AnyRun, *, certificate: AnyPath | None = None) -> Shown:
     """Write the page of a campaign for a safety board, and its JSON; as `merge-sumo board`.
 
     Args:
         run: the campaign, or its folder.
         certificate: folder of a certificate of the same VUT, as `certify` writes it.
-        people: as of `report`.
     """
-    html, record = write_board(_opened(run).run, _path(certificate), people=people)
+    html, record = write_board(_opened(run).run, _path(certificate))
     return Shown({"board": str(html), "record": str(record)}, [str(html), str(record)])
 
 

@@ -98,8 +98,6 @@ class Settings(Setup, total=False):
         repeat: how often each case runs, once by default, with another draw of what is random;
             "auto" repeats cases where chance decides. Runs count as cases.
         tolerated: share of its runs in which a case may fail, 0 by default: it fails where more do.
-        people: share of published drivers; a failure in which the POV does more than they do is
-            shown apart, whatever decides it. 1 by default: the hardest of them.
         learn_from: folders of earlier campaigns to learn the VUT from.
         against: an earlier version of the VUT, anything that `vut` takes but "traci": the sampler
             looks for cases that the VUT alone fails.
@@ -116,7 +114,6 @@ class Settings(Setup, total=False):
     audit: int | None
     repeat: int | Literal["auto"]
     tolerated: float
-    people: float
     learn_from: Sequence[Path | str] | None
     against: AnyVut | None
 
@@ -159,8 +156,8 @@ class CampaignKeywords(Settings, Running, total=False):
     Attributes:
         on_case: called with the outcome of every case as it ends.
         check: called after every batch; may raise to stop there.
-        gates: "failures", "human failures", "errors", "timeouts", "fmc>X", or "regressions" with
-            `against`: what `passed` of the result depends on.
+        gates: "failures", "errors", "timeouts", "fmc>X", or "regressions" with `against`: what
+            `passed` of the result depends on.
         junit: new file to write for CI: JUnit XML.
     """
 

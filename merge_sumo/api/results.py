@@ -15,7 +15,6 @@ import numpy as np
 from merge_sumo.analysis.chance import ChanceSummary, chance_in
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
-from merge_sumo.analysis.people import PeopleSummary, beside_people
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
@@ -91,15 +90,9 @@ def _cell(value: object) -> str:
 
 
 class CampaignRun(Result):
-    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder.
+    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder."""
 
-    `people` is the share of people beside whom failures are held, by default the campaign's.
-    """
-
-    def __init__(
-        self, folder: Path | str | Run, gates: Iterable[str] = (), people: float | None = None
-    ) -> None:
-        self._people = people
+    def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
         self._gates = parse_gates(gates, against=self._run.settings.get(AGAINST) is not None)
         _ = self._run.levels  # A folder without levels is no campaign's.
@@ -155,12 +148,6 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels, self._run.tolerated)
 
     @cached_property
-    def people(self) -> PeopleSummary:
-        """Failures beside published drivers: in which the POV does no more than they do."""
-        share = self._run.people if self._people is None else self._people
-        return beside_people(self._run.cases, share, self._run.levels)
-
-    @cached_property
     def chance(self) -> ChanceSummary | None:
         """What repeats show of chance; None without any."""
         return chance_in(self._run.outcomes, self._run.tolerated)
@@ -193,8 +180,8 @@ class CampaignRun(Result):
     @cached_property
     def gates(self) -> list[GateResult]:
         """The gates that were given, and whether the campaign meets them."""
-        regressions, people = len(self.regressions), self.people
-        return [gate.check(self.verdict, self.summary, people, regressions) for gate in self._gates]
+        regressions = len(self.regressions)
+        return [gate.check(self.verdict, self.summary, regressions) for gate in self._gates]
 
     @property
     def passed(self) -> bool:
@@ -222,7 +209,7 @@ class CampaignRun(Result):
         from merge_sumo.studies.expectation import note_expectation
 
         note_expectation(self._run)
-        return write_report(self._run, people=self.people.share)
+        return write_report(self._run)
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo campaign --json` prints."""
@@ -232,7 +219,6 @@ class CampaignRun(Result):
             **self.verdict.to_record(),
             **merging_record(outcomes),
             **({} if self.chance is None else {"chance": self.chance.to_record()}),
-            "people": self.people.to_record(),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
@@ -266,7 +252,6 @@ class CampaignRun(Result):
         optional += (
             [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]
         )
-        optional.append(self.people.line)
         optional += self._against_lines()
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.cases)[:1]

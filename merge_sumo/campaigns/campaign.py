@@ -214,11 +214,9 @@ def _compared(
     """
     recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, RAN_AGAIN, SEAL)}
     record = record_of(settings, plan)
-    # Where policies are decides nothing: what is in them does. The share of people is of reports.
-    of_no_case = ("policies", "people")
-    known = RECORDED_BY_DEFAULT | recorded
-    moved = any(known[name] != record[name] for name in of_no_case)
-    recorded |= {name: record[name] for name in of_no_case}
+    # Where policies are decides nothing: what is in them does.
+    moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
+    recorded["policies"] = record["policies"]
     # What was loaded while it ran must be the same, too, although it is not loaded yet.
     for name in FILES:
         record[name] = _files_now(recorded, name, record[name] or {}) or None

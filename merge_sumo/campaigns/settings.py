@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from merge_sumo.analysis.audit import CONFIDENCE, AuditCase, missed_share
-from merge_sumo.analysis.people import ALL_PEOPLE, check_share
 from merge_sumo.campaigns.audit import Audit, AuditedSampler
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
@@ -61,7 +60,6 @@ class CampaignSettings:
     scenario: Scenario
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
-    people: float = ALL_PEOPLE
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -100,7 +98,6 @@ class CampaignSettings:
             )
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
-        check_share(self.people)
         check_tolerated(self.tolerated)
         if isinstance(self.repeat, int) and self.repeat > self.cases:
             raise UserError(

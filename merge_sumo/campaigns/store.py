@@ -30,7 +30,6 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.analysis.people import ALL_PEOPLE
 from merge_sumo.campaigns.ownership import RECORD, note_run
 from merge_sumo.errors import UserError
 from merge_sumo.system.anchors import Anchor
@@ -118,14 +117,6 @@ class Run:
         if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
             raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no list of levels")
         return levels
-
-    @property
-    def people(self) -> float:
-        """The share of people beside whom failures are held; `UserError` for none."""
-        share = self.settings.get("people", ALL_PEOPLE)
-        if not isinstance(share, (int, float)) or not 0.0 < share <= 1.0:
-            raise UserError(f"{self.folder / SETTINGS} has something else than a share as people")
-        return float(share)
 
     @property
     def tolerated(self) -> float:

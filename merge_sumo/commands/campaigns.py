@@ -32,14 +32,6 @@ SETTINGS: Final = (
 COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
 
 
-PEOPLE_OF_REPORT: Final = optional(
-    float,
-    "Share of published drivers beside whom failures are held.",
-    metavar="SHARE",
-    show_default="the campaign's",
-)
-
-
 def _vut_option(help: str, show_default: str) -> Shared:
     return optional(
         str, help, metavar="SPEC", show_default=show_default, autocompletion=complete.vuts
@@ -55,7 +47,6 @@ def _vut_option(help: str, show_default: str) -> Shared:
             "repeat",
             "tolerate",
             *SETUP,
-            "people",
             "net",
         ),
         *(*RUNNING, "trust_vut"),
@@ -84,9 +75,8 @@ def campaign(
         list[str] | None,
         typer.Option(
             metavar="GATE",
-            help='Exit with 1 if there are failures, "human failures" (the POV does no more than '
-            'people), errors, timeouts, "fmc>X": an FMC above X at some level, or, with '
-            "--against, regressions. May be given several times.",
+            help='Exit with 1 if there are failures, errors, timeouts, "fmc>X": an FMC above X at '
+            "some level, or, with --against, regressions. May be given several times.",
             autocompletion=complete.gates,
         ),
     ] = None,
@@ -319,7 +309,7 @@ def replay(
     raise typer.Exit(0 if result.identical else 1)
 
 
-@app.verb(own={"people": PEOPLE_OF_REPORT})
+@app.verb()
 def report(given: Given, run: RunArgument) -> None:
     """Write the report of a campaign again and print its path.
 
@@ -328,7 +318,7 @@ def report(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
     opened = api.open_run(run)
-    path = api.report(opened, **given.keywords)
+    path = api.report(opened)
     if given.as_json:
         print_json({"report": str(path)})
     else:
@@ -346,8 +336,7 @@ def _say_interruption(opened: CampaignRun) -> None:
     own={
         "certificate": optional(
             Path, "Folder of a certificate of the same VUT, as `certify` writes it.", metavar="DIR"
-        ),
-        "people": PEOPLE_OF_REPORT,
+        )
     }
 )
 def board(given: Given, run: RunArgument) -> None:
@@ -411,7 +400,7 @@ def compare_runs(
         campaigns = {
             name.lower(): {
                 **run.verdict.to_record(),
-                **{"careful": run.careful, "people": run.people.to_record()},
+                "careful": run.careful,
             }
             for name, run in runs.items()
         }
@@ -431,8 +420,6 @@ def compare_runs(
 def _print_comparison(compared: RunComparison, runs: dict[str, CampaignRun]) -> None:
     for name, run in runs.items():
         show(f"{name}: {run.folder} ({run.run.vut}): {run.verdict.counts}")
-        if run.people.line is not None:
-            show(f"  {run.people.line}")
         if run.careful is not None:
             show(f"  {run.careful}")
         for line in run.verdict.trouble_lines():

@@ -121,11 +121,8 @@ def formats(incomplete: str) -> Completions:
 
 def gates(incomplete: str) -> Completions:
     """Return what a gate may be."""
-    from merge_sumo.analysis.verdict import HUMAN_FAILURES
-
     known = (
         ("failures", "a case fails"),
-        (HUMAN_FAILURES, "a case fails in which the POV does no more than people"),
         ("errors", "a case errs"),
         ("timeouts", "a case never ends"),
         ("regressions", "a case fails that passes with --against"),

@@ -11,6 +11,8 @@ COMMANDS: Final[Mapping[str, str]] = {}
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
     "--in-process": "`merge-sumo run --debug` runs one case within reach of a debugger",
+    "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "
+    "'clearance_m <= 0 and pov_sustained_brake_mps2 <= 2.06'",
 }
 """What replaces an option, by its name with dashes, in every command that does not have it."""
 

@@ -47,7 +47,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("draws", "stop_after_converged", "audit", "repeat"),
     ),
     "Verdict": (
-        *("fail_when", "tolerate", "people", "gate", "tolerance", "rerun", "confidence"),
+        *("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),
         *("certificate",),
     ),
     "Where it runs, and what it writes": (
@@ -254,13 +254,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
-    ),
-    "people": option(
-        float,
-        1.0,
-        "Share of published drivers: failures in which the POV brakes harder or slows down by more "
-        "are shown apart; 1 is the hardest of them.",
-        metavar="SHARE",
     ),
     "tolerance": option(
         float,

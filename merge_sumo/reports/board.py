@@ -26,24 +26,21 @@ PAGE: Final = "board.html"
 RECORD: Final = "board.json"
 SCHEMA: Final = "merge-sumo board 1"
 """Name and version of what `board.json` holds."""
-IN_SHORT: Final = ("often", "people", "simulators", "robust")
+IN_SHORT: Final = ("often", "simulators", "robust")
 """Topics whose first sentence stands at the top of the page."""
 
 
-def write_board(
-    run: Run, certificate: Path | None = None, *, people: float | None = None
-) -> list[Path]:
+def write_board(run: Run, certificate: Path | None = None) -> list[Path]:
     """Write `board.html` and `board.json` into the folder of a run, and return their paths.
 
-    `certificate` is the folder of a certificate of the same VUT, `people` the share of people
-    beside whom failures are held, by default the campaign's. Raises `UserError` where a file
+    `certificate` is the folder of a certificate of the same VUT. Raises `UserError` where a file
     that is read is not as it was written or of another campaign, or one of the two is there and is
     not ours.
     """
     html, record = run.folder / PAGE, run.folder / RECORD
     check_page(html)
     _check_record(record)
-    model = BoardModel(run, certificate, people=people)
+    model = BoardModel(run, certificate)
     if model.stress is not None:
         check_stress_of(run, model.stress)
     if model.crosscheck is not None:

@@ -13,18 +13,6 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.analysis.exposure import read_distribution
-from merge_sumo.analysis.people import (
-    ALL_PEOPLE,
-    BRAKING,
-    HEE_PEOPLE,
-    HEE_SOURCE,
-    PUBLISHED,
-    SLOWDOWN,
-    PeopleSummary,
-    beside_people,
-    none_of,
-)
-from merge_sumo.analysis.people import CONFIDENCE as PEOPLE_CONFIDENCE
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Verdict, judge
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
@@ -134,11 +122,6 @@ def _in_1000(per_merge: float, key: str) -> Figure:
     return Figure(per_merge, two_digits(1000.0 * per_merge), PER_MERGE, key)
 
 
-def _driver(people: PeopleSummary) -> str:
-    """Return what a sentence calls the driver that is held against people."""
-    return "the other driver" if people.car == "the POV" else people.car
-
-
 def _files(settings: Mapping[str, Any], name: str) -> dict[str, Any]:
     """Return the hashes of files that a record has; a record is data, and may hold anything."""
     files = settings.get(name)
@@ -158,12 +141,10 @@ class BoardModel:
         run: Run,
         certificate: Path | None = None,
         *,
-        people: float | None = None,
         summary: Summary | None = None,
     ) -> None:
         """Read the run, what studies left in its folder, and the folder of a certificate.
 
-        `people` is the share of people beside whom failures are held, by default the campaign's;
         `summary` is that of the run, where it is known.
         """
         self.run = run
@@ -171,8 +152,6 @@ class BoardModel:
         self.verdict: Verdict = judge(run.cases)
         self.kept: dict[str, Path] = {}
         """Files of the cache that sentences name, by name."""
-        held = run.people if people is None else people
-        self.people = beside_people(run.cases, held, run.levels)
         self.avoidance = read_avoidance(run)
         self.per_merge = per_merge_of(run.folder)
         self.probability = probability_of(run.folder)
@@ -207,7 +186,6 @@ class BoardModel:
             ("found", "What was found?", self._found()),
             ("remains", "How much was searched, and what may remain?", self._remains()),
             ("often", "How often would that be on a road?", self._often()),
-            ("people", "Would a person do this?", self._people()),
             ("avoidable", "Would a careful driver have avoided it?", self._avoidable()),
             ("robust", "Is it robust, or does it hang by a thread?", self._robust()),
             ("simulators", "Is it this simulator?", self._simulators()),
@@ -548,69 +526,6 @@ class BoardModel:
             "Source of the traffic: {}. {}.",
             figure(known.traffic.source, PER_MERGE, "traffic.source"),
             Figure(known.counted, f"{counted[:1].upper()}{counted[1:]}", PER_MERGE, "counted"),
-        )
-
-    def _people(self) -> Iterator[Statement]:
-        known, failing = self.people, self._failing
-        if not known.failures:
-            yield Statement("No failure is there to ask it of.")
-            return
-        if known.left_out:
-            yield Statement(f"Not known: {known.left_out}.")
-            return
-        people, which = figure(HEE_PEOPLE, HEE_SOURCE, "people"), failing
-        braking, slowdown = (published.limit(known.share) for published in PUBLISHED)
-        some = "the hardest" if known.share == ALL_PEOPLE else f"{100.0 * known.share:g} %"
-        text = f"In {{}} of {{}} failures {_driver(known)} does no more than {some} of {{}} "
-        text += "published drivers on a motorway, who brake at {} m/s2 or less over 1.6 s"
-        names = " and ".join(published.name for published in PUBLISHED)
-        figures = [
-            self._lines(known.inside, f"{which}, {names} within the figures"),
-            self._lines(known.failures, which),
-            people,
-            figure(braking or 0.0, HEE_SOURCE, BRAKING.about),
-        ]
-        if slowdown is not None:
-            text += " and slow down by {} m/s or less"
-            figures.append(figure(slowdown, HEE_SOURCE, SLOWDOWN.about))
-        beyond = sum(one.slows_beyond for one in known.levels.values())
-        if beyond and slowdown is None:
-            # Beside the count in the same sentence, as it may be read alone.
-            step = SLOWDOWN.steps[-1]
-            text += "; but in {} it slows down by more than {} m/s, as {} of them did, and by how "
-            text += "much is not published"
-            figures += [
-                self._lines(beyond, f"{which}, {SLOWDOWN.name} > {step.above:g}"),
-                figure(step.above, HEE_SOURCE, SLOWDOWN.about),
-                figure(round(step.share * HEE_PEOPLE), HEE_SOURCE, SLOWDOWN.about),
-            ]
-        yield say(f"{text}.", *figures)
-        if known.unknown:
-            unknown = self._lines(known.unknown, f"{which}, {BRAKING.name} = null")
-            yield say("In {} of these it is not recorded what would decide.", unknown)
-        for level, one in known.levels.items():
-            if one.failures and one.hardest_mps2 is not None:
-                at = f"{which}, level = {level}"
-                yield say(
-                    f"Level {level_name(level)}: in {{}} of {{}} failures {_driver(known)} brakes "
-                    "harder than that; the hardest is {} m/s2.",
-                    self._lines(one.brakes_harder, f"{at}, {BRAKING.name} > {braking:g}"),
-                    self._lines(one.failures, at),
-                    figure(one.hardest_mps2, OUTCOMES, f"{at}: largest {BRAKING.name}", ".3g"),
-                )
-            if one.slows_more:
-                yield say(
-                    f"Level {level_name(level)}: in {{}} of {{}} failures {_driver(known)} slows "
-                    "down by more than that.",
-                    self._lines(one.slows_more, f"{which}, level = {level}: {SLOWDOWN.name}"),
-                    self._lines(one.failures, f"{which}, level = {level}"),
-                )
-        yield say(
-            "What none of {} drivers does may still be what up to {} of drivers do ({} "
-            "confidence): a failure outside is rare beside these people, and not impossible.",
-            people,
-            share(none_of(HEE_PEOPLE), HEE_SOURCE, "1 - 0.05^(1/people)"),
-            share(PEOPLE_CONFIDENCE, HEE_SOURCE, "confidence"),
         )
 
     def _avoidable(self) -> Iterator[Statement]:

@@ -36,7 +36,6 @@ def write_report(
     summary: Summary | None = None,
     workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
-    people: float | None = None,
 ) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
@@ -46,7 +45,7 @@ def write_report(
     """
     check_report(run.folder)
     path = run.folder / REPORT
-    html = report_page(run, summary, workers, on_part, people)
+    html = report_page(run, summary, workers, on_part)
     replace_own(path, html.encode(errors="backslashreplace"))
     write_against(run)
     return path
@@ -77,10 +76,9 @@ def report_page(
     summary: Summary | None = None,
     workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
-    people: float | None = None,
 ) -> str:
     """Return the report of a run as HTML."""
-    model = ReportModel(run, summary, workers, on_part, people)
+    model = ReportModel(run, summary, workers, on_part)
     words = shared_words(model)
     sections = sections_of(model, words)
     model.part_ended()

@@ -11,7 +11,6 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import Coordinate
 from merge_sumo.analysis.diagnosis import Diagnosis, Kind
-from merge_sumo.analysis.people import HEE_PEOPLE, Place
 from merge_sumo.analysis.predictions import prediction_error_m
 from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.player import motion_row, packed, player_data
@@ -53,7 +52,6 @@ def page_data(facts: ReportModel) -> dict[str, Any]:
         "goal": scenario.goal,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "coordinates": [_coordinate(c) for c in facts.coordinates],
-        "drivers": HEE_PEOPLE,
         "severities": [severity.value for severity in Severity],
         "kinds": [kind.value for kind in Kind],
         "measures": _headings(facts),
@@ -118,7 +116,6 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             "score": _rounded(o.score, 1),
             "region": facts.regions.get(o.index),
             **_avoidance(facts, o.index),
-            **_people(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
             "vut_brakes": found.vut_brakes_s,
             "pov_brakes": found.pov_brakes_s,
@@ -159,24 +156,6 @@ def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
         "latest_takeover": None if found is None else found.latest_takeover_s,
         "pov_careful": None if found is None else int(found.pov_careful),
     }
-
-
-def _people(facts: ReportModel, index: int) -> dict[str, Any]:
-    """Return the place of a failure beside people, and whether it is inside; of others nothing."""
-    if not facts.people.places:
-        return {}
-    place = facts.people.places.get(index)
-    if place is None:
-        return dict.fromkeys(("inside", "braked_as_hard", "slowed_as_much"))
-    return {
-        "inside": int(place.inside),
-        "braked_as_hard": _share_range(place.braking),
-        "slowed_as_much": _share_range(place.slowdown),
-    }
-
-
-def _share_range(place: Place | None) -> tuple[float, float] | None:
-    return None if place is None else (round(place.at_least, 3), round(place.at_most, 3))
 
 
 def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:

@@ -12,7 +12,6 @@ from typing import Final, TypeVar
 from merge_sumo.analysis.chance import chance_in
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.analysis.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.analysis.people import beside_people
 from merge_sumo.analysis.predictions import surprises
 from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.surface import Surface, learn_surface
@@ -62,14 +61,12 @@ class ReportModel:
         summary: Summary | None = None,
         workers: Workers | None = None,
         on_part: OnPart = lambda _done, _total: None,
-        people: float | None = None,
     ) -> None:
         """Read what the page shows; `UserError` where settings have no list of levels.
 
         `summary` is that of the run, where it is known; on several `workers` its surrogates are
         asked. `on_part` is told how many parts of the report are ready, and how many there are,
-        from 0 on; also from another thread. `people` is the share of people beside whom failures
-        are held, by default the campaign's.
+        from 0 on; also from another thread.
         """
         self.run = run
         self.road = road_of_run(run)
@@ -80,8 +77,6 @@ class ReportModel:
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
         self.verdict = judge(self.cases)
         self.levels = list(self.summary.levels)
-        share = run.people if people is None else people
-        self.people = beside_people(self.cases, share, self.levels)
         # The surrogate of each level; the cases; the text; the data.
         self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
         self._counting = threading.Lock()

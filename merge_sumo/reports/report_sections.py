@@ -6,7 +6,7 @@ The head of the page and several sections share words: those of `shared_words`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -15,15 +15,6 @@ from markupsafe import Markup
 
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE, merging_of
-from merge_sumo.analysis.people import (
-    BRAKING,
-    HEE_MEAN_MPS,
-    HEE_PEOPLE,
-    HEE_SOURCE,
-    MEAN_TTC_S,
-    POV_FIRST,
-    SLOWDOWN,
-)
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -100,7 +91,6 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": _avoidance(model),
-        "people": model.people,
         "chance": model.chance,
         "repeated": model.repeated,
     }
@@ -132,6 +122,8 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
     outcomes, scenario = model.cases, model.run.scenario
     return {
         "found": model.verdict,
+        "hardest_mps2": _largest(model.worst, "pov_sustained_brake_mps2"),
+        "slowdown_mps": _largest(model.worst, "pov_slowdown_mps"),
         "truth_cases": " or ".join(
             f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in model.levels})
         ),
@@ -147,6 +139,11 @@ def _numbers(model: ReportModel) -> dict[str, Any]:
     }
 
 
+def _largest(outcomes: Sequence[Outcome], name: str) -> float | None:
+    """Return the largest value of a measure; None where no outcome has one."""
+    return max((v for o in outcomes if (v := o.measures.value(name)) is not None), default=None)
+
+
 def _maps(model: ReportModel) -> dict[str, Any]:
     scenario = model.run.scenario
     return {
@@ -156,7 +153,7 @@ def _maps(model: ReportModel) -> dict[str, Any]:
 
 
 def _board(model: ReportModel) -> dict[str, Any]:
-    topics = BoardModel(model.run, people=model.people.share, summary=model.summary).topics()
+    topics = BoardModel(model.run, summary=model.summary).topics()
     return {"topics": topics, "command": f"merge-sumo board {quoted(model.run.folder)}"}
 
 
@@ -174,24 +171,6 @@ def _merging(model: ReportModel) -> dict[str, Any] | None:
         "rows": [("all", found), *((name, one) for name, one in levels.items() if one)],
         "sites": SITES,
         "headway_s": REAR_HEADWAY_S,
-        "source": SOURCE,
-    }
-
-
-def _people(model: ReportModel) -> dict[str, Any] | None:
-    """Return what failures are beside people; None without failures."""
-    found = model.people
-    if not found.failures:
-        return None
-    return {
-        "braking": BRAKING,
-        "slowdown": SLOWDOWN,
-        "pov_first": POV_FIRST,
-        "mean_ttc_s": MEAN_TTC_S,
-        "headway_s": REAR_HEADWAY_S,
-        "drivers": HEE_PEOPLE,
-        "drivers_mps": HEE_MEAN_MPS,
-        "drivers_source": HEE_SOURCE,
         "source": SOURCE,
     }
 
@@ -382,7 +361,6 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "board": ReportSection(template=_own("board"), words=_board),
         "against": ReportSection(template=_own("against"), words=_against),
         "merging": ReportSection(template=_own("merging"), words=_merging),
-        "people": ReportSection(template=_own("people"), words=_people),
         "words": ReportSection(template=_own("words"), words=_in_words),
         "stress": ReportSection(template=_own("stress"), words=_stress),
         "peers": ReportSection(template=_own("peers"), words=_peers),

@@ -17,7 +17,6 @@ import numpy as np
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.diagnosis import Kind
 from merge_sumo.analysis.merging import SOURCE, MergeStatistics
-from merge_sumo.analysis.people import LevelBesidePeople
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns.against import AGAINST, earlier_run
 from merge_sumo.campaigns.store import Run
@@ -418,20 +417,7 @@ def _table(history: History, level: int) -> list[tuple[str, list[str]]]:
         (name, ["" if one is None else str(value(one)) for one in of_versions])
         for name, value in rows
     ]
-    return [*table, *_people_rows(history, level), *_merging_rows(history, level)]
-
-
-def _people_rows(history: History, level: int) -> list[tuple[str, list[str]]]:
-    """Return the failures beside people by version; none where no version has failures."""
-    if not any(version.people.places for version in history.versions):
-        return []
-    found = [version.people.levels.get(level) for version in history.versions]
-    rows: list[tuple[str, Callable[[LevelBesidePeople], str]]] = [
-        ("failures inside what people do", lambda one: str(one.inside)),
-        ("FMC inside", lambda one: f"{one.fmc:.4f}"),
-        ("POV brakes over 1.6 s, m/s²", lambda one: _or_dash(one.hardest_mps2, ".1f")),
-    ]
-    return [(name, ["" if one is None else value(one) for one in found]) for name, value in rows]
+    return [*table, *_merging_rows(history, level)]
 
 
 def _merging_rows(history: History, level: int) -> list[tuple[str, list[str]]]:

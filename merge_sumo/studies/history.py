@@ -25,7 +25,6 @@ from scipy.spatial import cKDTree
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.analysis.merging import MergeStatistics, merging_of
-from merge_sumo.analysis.people import PeopleSummary, beside_people
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import severities_of
 from merge_sumo.analysis.verdict import Verdict, in_words, judge
@@ -83,7 +82,6 @@ class Version:
         levels: by POV level.
         merging: merges from an acceleration lane by POV level, and in all at None; empty without a
             lane.
-        people: failures beside people, within the share that the campaign names.
     """
 
     folder: str
@@ -92,7 +90,6 @@ class Version:
     verdict: Verdict
     levels: dict[int, LevelOfVersion]
     merging: dict[int | None, MergeStatistics]
-    people: PeopleSummary
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
@@ -107,7 +104,7 @@ class Version:
             for level, found in self.merging.items()
         }
         more = {"merging": merging} if merging else {}
-        return {**record, **counts, "levels": levels, **more, "people": self.people.to_record()}
+        return {**record, **counts, "levels": levels, **more}
 
 
 class RegionChange(StrEnum):
@@ -228,7 +225,6 @@ class History(Result):
             text.append(f"{number}: {version.folder} ({version.vut}): {version.verdict.counts}")
             text += version.verdict.trouble_lines()
             text += [f"  {version.merging[None].sentence}"] if version.merging else []
-            text += [f"  {version.people.line}"] if version.people.line else []
         for step in self.steps:
             counts = [f"{n} {became}" for became in RegionChange if (n := step.count(became))]
             text.append(
@@ -293,8 +289,6 @@ def _notes(runs: Sequence[Run], levels_by_run: Sequence[list[int]]) -> list[str]
             "Not every campaign has every POV level: at a level, a version is compared with the "
             "last one before it that has the level."
         )
-    if len({run.people for run in runs}) > 1:
-        notes.append("The campaigns hold failures beside different shares of people.")
     for number, run in enumerate(runs, start=1):
         wanted = run.settings.get("cases")
         if run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted):
@@ -315,7 +309,6 @@ def _version(run: Run, levels: Sequence[int]) -> Version:
         verdict=judge(run.cases),
         levels={level: _level(run, level, known) for level in levels},
         merging={level: found for level, ran in cases.items() if (found := merging_of(ran))},
-        people=beside_people(run.cases, run.people, levels),
     )
 
 

@@ -65,7 +65,7 @@ MU_TASK: Final = 45.0
 GAP_SCALE_M: Final = 15.0
 """Length over which P_safety decays with the gap; tens of metres, so that a surrogate sees it."""
 SUSTAINED_STEPS: Final = 16
-"""Steps over which braking counts as sustained: 1.6 s, as in figures of people (`people.py`)."""
+"""Steps over which braking counts as sustained: 1.6 s, as in published braking of drivers."""
 TTC_SHARE: Final = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 

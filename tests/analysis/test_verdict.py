@@ -16,7 +16,6 @@ from lxml import etree
 from typer.testing import Result
 
 import merge_sumo as ms
-from merge_sumo.analysis.people import beside_people
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Gate, judge, parse_gates
 from merge_sumo.campaigns.store import Run, failures, read_settings
@@ -115,7 +114,7 @@ class TestAGate:
         "text", ["", "fmc", "error", "FMC>0.1", "failures>3", "fmc<0.1", "\x1b"]
     )
     def test_that_is_none_is_refused(self, text):
-        with pytest.raises(UserError, match='choose failures, "human failures", errors'):
+        with pytest.raises(UserError, match="choose failures, errors"):
             parse_gates([text])
 
     @pytest.mark.parametrize("text", ["fmc>", "fmc>x", "fmc>nan", "fmc>-0.1", "fmc>1", "fmc>inf"])
@@ -125,7 +124,7 @@ class TestAGate:
 
     @pytest.mark.parametrize(("fmc", "met"), [(0.05, False), (0.0501, True), (0.0, False)])
     def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, tmp_path, fmc, met):
-        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc), beside_people([]))
+        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc))
         assert found.met is met
         level = 1 if fmc else 0
         assert found.sentence == (
@@ -136,28 +135,14 @@ class TestAGate:
     def test_on_cases_is_met_by_one_of_them(self, tmp_path, name):
         run = write_run(tmp_path / "run", 20, levels=(0,), errors={0: "x"}, timeouts=(1,))
         summary = summarise(run.outcomes, (0,))
-        people = beside_people(run.outcomes)
-        assert Gate(name).check(judge(run.outcomes), summary, people).met
+        assert Gate(name).check(judge(run.outcomes), summary).met
         of = {
             "failures": lambda o: o.failed,
             "errors": lambda o: o.measures.end.is_error,
             "timeouts": lambda o: o.measures.end is End.TIMEOUT,
         }[name]
         rest = judge(o for o in run.outcomes if not of(o))
-        assert not Gate(name).check(rest, summary, people).met
-
-    def test_on_human_failures_counts_those_in_which_the_pov_does_no_more_than_people(
-        self, tmp_path
-    ):
-        # The POV of these cases brakes at .5 m/s2, for 3 s: within the hardest, not within half.
-        run = write_run(tmp_path / "run", 20, levels=(1,))
-        (gate,), number = parse_gates(["human failures"]), len(failures(run.outcomes))
-        assert number
-        for share, inside in ((1.0, number), (0.5, 0)):
-            people = beside_people(run.outcomes, share)
-            found = gate.check(judge(run.outcomes), summarise(run.outcomes, (1,)), people)
-            assert found.met is (inside > 0)
-            assert found.found.startswith(f"{inside} failures within ")
+        assert not Gate(name).check(rest, summary).met
 
 
 # The shape that Jenkins (xunit plugin), GitLab and others read, in the attributes that count.
@@ -211,8 +196,7 @@ class TestJUnit:
         )
         verdict = judge(run.outcomes)
         gates = [
-            Gate(name).check(verdict, summarise(run.outcomes, (0, 2)), beside_people([]))
-            for name in ("errors", "fmc")
+            Gate(name).check(verdict, summarise(run.outcomes, (0, 2))) for name in ("errors", "fmc")
         ]
         write_junit(tmp_path / "junit.xml", run, (0, 2), verdict, gates)
         self.run = run

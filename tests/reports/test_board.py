@@ -123,17 +123,6 @@ class TestNumbers:
         assert levels[-1].figures[1].value == abs(worst[measure])
         assert levels[-1].figures[1].key == f"line {worst['index']}: {measure}"
 
-    def test_of_people_are_those_of_the_outcomes(self, made):
-        lines = [json.loads(line) for line in (made.folder / OUTCOMES).read_text().splitlines()]
-        failing = [o for o in lines if o["score"] is not None and o["score"] < -500]
-        inside = [o for o in failing if o["pov_sustained_brake_mps2"] <= 2.06]
-        first, *_, caveat = sentences(made, "people")
-        beyond = [o for o in failing if o["pov_slowdown_mps"] > 2.0 + 1e-9]
-        known = [len(inside), len(failing), 23, 2.06, *([len(beyond), 2.0, 1] if beyond else [])]
-        assert [f.value for f in first.figures] == known
-        assert caveat.figures[1].value == pytest.approx(1 - 0.05 ** (1 / 23), abs=1e-12)
-        assert "up to 12.2 % of drivers" in caveat.text
-
     def test_of_files_are_what_the_file_has_at_the_key(self, made):
         assert checked_figures(made, [STRESS, CROSSCHECK]) >= 5
 
@@ -214,7 +203,6 @@ class TestWhatWasNotRun:
     def test_nor_found_is_said_as_such(self, tmp_path):
         quiet = write_run(tmp_path / "quiet", per_level=4, levels=(0,), errors={2: "a", 3: "a"})
         assert sentences(quiet, "found")[0].text == "None of 2 tested cases fails."
-        assert sentences(quiet, "people")[0].text == "No failure is there to ask it of."
         lost = write_run(tmp_path / "lost", per_level=2, levels=(0,), errors={0: "a", 1: "b"})
         assert sentences(lost, "found")[0].text == "Nothing was tested: 2 cases ran."
 

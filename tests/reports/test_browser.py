@@ -793,34 +793,6 @@ def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
         assert bright.count() == len(others)
 
 
-def test_failures_in_which_the_pov_does_more_than_people_are_marked_and_filtered(browser, tmp_path):
-    # The POV brakes at .5 m/s2 and slows by 1.4 m/s and more, but for level 0: it keeps its speed.
-    run = write_run(tmp_path / "run", error=None, people=0.9)
-    inside = sorted(o.index for o in failures(run.outcomes) if o.case.level == 0)
-    outside = sorted(o.index for o in failures(run.outcomes) if o.case.level > 0)
-    assert inside
-    assert outside
-    with shown(browser, report.write_report(run)) as page:
-        for button, wanted in (("outside", outside), ("inside", inside)):
-            page.locator(f"[data-filter=people][data-value={button}]").click()
-            assert bright(page) == all_rows(page) == wanted
-            assert set(column(page, "people")) == {button}
-            assert f"people={button}" in page.url
-            assert page.locator(".map .beyond").count() == len(outside)
-            assert page.locator(".map .beyond:not(.faint)").count() == (
-                len(wanted) if button == "outside" else 0
-            )
-        assert "outside what people do" in page.evaluate(f"words(place.get({outside[0]}))")
-        section = page.inner_text("section[aria-labelledby=people]")
-        assert "90 % of 23 published drivers" in section
-        assert "up to 12.2% of drivers" in section
-    with shown(browser, report.write_report(run, people=1.0)) as page:
-        assert page.locator(".map .beyond").count() == 0
-        assert page.locator("[data-filter=people][data-value=inside] b").inner_text() == str(
-            len(inside) + len(outside)
-        )
-
-
 def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     run = write_run(tmp_path / "run", error=None)
     first, second = [o for o in failures(run.outcomes) if o.case.level == 1][:2]

@@ -261,27 +261,6 @@ def of_another_test(*_: object) -> None:
     """Accept what test_severity.py (before M) and test_avoidance.py (other drivers) check."""
 
 
-def check_people(
-    told: Told, braking: str, braked: str, slowing: str, slowed: str, where: str
-) -> None:
-    v_mps = [row[1] for row in told.pov]
-    over_mps2 = max(0.0, *((v - w) / 1.6 for v, w in zip(v_mps, v_mps[16:], strict=False)))
-    less_mps = v_mps[0] - min(v_mps)
-    near(braking, over_mps2)
-    near(slowing, less_mps)
-    assert braked == share_of(over_mps2, {0.66: "50 to 100", 1.4: "5 to 50", 2.06: "4 to 5"}, "0")
-    steps = {0.5: "22 to 100", 1.0: "9 to 22", 2.0: "4 to 9"}
-    assert slowed == share_of(less_mps, steps, "0 to 4")
-    assert (where == "inside") == (over_mps2 <= 2.06)
-
-
-def share_of(value: float, steps: dict[float, str], beyond: str) -> str:
-    """Return the share of 23 drivers who did at least as much, by the published steps."""
-    if value < 1e-9:
-        return "100"
-    return next((share for most, share in steps.items() if value <= most + 1e-9), beyond)
-
-
 CHECKS: dict[str, Callable[..., None]] = {
     r"(Contact|Conflict|Harsh|Safe)(?: \(([^)]+)\))?\.": check_severity,
     rf"The VUT reaches M at {NUMBER} s; the front bumper of the (VUT|POV) is {NUMBER} m ahead\.":
@@ -305,8 +284,6 @@ CHECKS: dict[str, Callable[..., None]] = {
     r"No reference driver in the VUT's place would have avoided it\.": of_another_test,
     r"The last time at which the fuzzy safety model \(fsm\) can take over .+ s\.": of_another_test,
     r"A careful driver in the POV's place avoids it, too\.": of_another_test,
-    rf"The POV brakes at {NUMBER} m/s² over 1\.6 s, as (.+) % of 23 published drivers did, and "
-    rf"slows down by {NUMBER} m/s \((.+) %\): (inside|outside) what people do\.": check_people,
 }  # fmt: skip
 """The sentences of the case view, and what checks their numbers and words."""
 

@@ -46,15 +46,6 @@ function conduct(i) { // what both did, by their speeds
   const of = (brakes, accelerates) => brakes !== null ? `begins to brake at ${fixed(brakes, 1)} s` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
   return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
 }
-const ofDrivers = ([low, high]) => `${low < high ? `${fixed(100 * low, 0)} to ` : ""}${fixed(100 * high, 0)} %`;
-function besidePeople(i) { // what the car that the VUT meets does in a failure
-  const met = NAMES[vehicles[cases.nearest[i]]], slowed = cases.slowed_as_much[i];
-  if (slowed === null || cases.pov_sustained_brake_mps2[i] === null) return "";
-  if (cases.pov_sustained_brake_mps2[i] <= 0 && cases.pov_slowdown_mps[i] <= 0) return "";
-  const brakes = `brakes at ${fixed(cases.pov_sustained_brake_mps2[i], 1)} m/s² over 1.6 s, as ${ofDrivers(cases.braked_as_hard[i])} of ${data.drivers} published drivers did`;
-  const slows = `slows down by ${fixed(cases.pov_slowdown_mps[i], 1)} m/s (${ofDrivers(slowed)})`;
-  return `The ${met} ${brakes}, and ${slows}: ${cases.inside[i] ? "inside" : "outside"} what people do.`;
-}
 function placeOfMerge(i) { // on an acceleration lane
   const share = cases.lane_share[i];
   return share >= 1 ? "where the lane ends" : `after ${fixed(100 * share, 0)} % of the lane`;
@@ -85,7 +76,6 @@ function words(i) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
-  if (cases.inside && cases.inside[i] !== null) parts.push(besidePeople(i));
   if (cases.kind[i] !== null) {
     const until = cases.way_out[i];
     const none = LANE ? `Neither full braking nor full acceleration of the VUT would ever have kept ${fixed(CRASH, 0)} m at this place.` : "There never was a way out for the VUT.";
@@ -208,7 +198,6 @@ function FailureMap(figure) {
       const faint = near(i) && wanted(i) ? "" : " faint";
       drawMark(svg, i, x, y, faint);
       drawShare(svg, i, x, y, faint);
-      if (cases.inside && cases.inside[i] === 0) draw(svg, "circle", { class: `beyond${faint}`, cx: x, cy: y, r: 7 });
     }
     const most = figure.querySelector(".most");
     if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";
@@ -359,7 +348,7 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
 }
 
 /* ---------- the address: #case-111&verdict=failure ---------- */
-const form = byId("filters"), FILTERS = ["box", "level", "verdict", "severity", "region", "kind", "people", "avoided", "measure", "from", "to"];
+const form = byId("filters"), FILTERS = ["box", "level", "verdict", "severity", "region", "kind", "avoided", "measure", "from", "to"];
 let opened = -1; // the case that the reader asked for
 function filtersSet() { // [name, value] of what is not as it was
   const bounded = form.elements.from.value !== "" || form.elements.to.value !== "";
@@ -549,17 +538,15 @@ for (const table of document.querySelectorAll(".list")) {
 const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : data.ends[cases.end[i]]);
 function allCases() { // gives what shows the cases that the filters let through
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
-  const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided, people = form.elements.people; // null where that is not known
+  const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
   const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
   const kindOf = (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]);
-  const besides = (i) => (cases.inside && cases.inside[i] !== null ? (cases.inside[i] ? "inside" : "outside") : null);
   const columns = [
     { name: "case", exact: true, value: (i) => cases.index[i] },
     { name: "level", value: (i) => cases.level[i], text: (value) => data.level_names[value] },
     { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !data.errors[cases.index[i]] ? value : `${value}: ${data.errors[cases.index[i]]}`) },
     { name: "severity", words: true, value: severity, order: rank },
     { name: "kind", words: true, value: kindOf },
-    ...(people ? [{ name: "people", words: true, value: besides }] : []),
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
     ...coordinates.map((c) => number(c.field, `${c.name}${c.unit === "rad" ? "" : ` ${c.unit}`}`, c.digits)),
     ...(cases.runs ? [
@@ -587,7 +574,6 @@ function allCases() { // gives what shows the cases that the filters let through
   ordered.sort(([a], [b]) => a[0] - b[0] || a[1] - b[1]);
   for (const [[l, r], value, n] of ordered) option(region, value, `level ${data.level_names[l]}, region ${r + 1} (${n})`);
   for (const [value, n] of count(kindOf)) option(kind, value, `${value} (${n})`);
-  if (people) for (const [value, n] of count(besides)) option(people, value, `${value} (${n})`);
   const severities = count(severity);
   for (const value of data.severities) if (severities.has(value)) option(severe, value, `${value} (${severities.get(value)})`);
   for (const c of columns) if (c.exact && c.name !== "case") option(measure, c.name);
@@ -626,7 +612,7 @@ function allCases() { // gives what shows the cases that the filters let through
     found = all.filter((i) => (!level.value || cases.level[i] === Number(level.value))
       && (!ended.value || verdict(i) === ended.value || `: ${message(i)}` === ended.value)
       && (!severe.value || severity(i) === severe.value) && (!region.value || where(i) === region.value) && (!kind.value || kindOf(i) === kind.value)
-      && (!people?.value || besides(i) === people.value) && (!avoided?.value || avoidedBy(i, avoided.value)) && (!inside || inside.has(cases.index[i]))
+      && (!avoided?.value || avoidedBy(i, avoided.value)) && (!inside || inside.has(cases.index[i]))
       && (!bounded || (measured(i) !== null && measured(i) >= low && measured(i) <= high)));
     matching = filtersSet().length ? new Set(found) : null;
     list();
