@@ -190,7 +190,6 @@ AnyRun = CampaignRun | Path | str
 def campaign(
     vut: AnyVut,
     *,
-    net: AnyPath | None = None,
     out: AnyPath | None = None,
     **given: Unpack[CampaignKeywords],
 ) -> CampaignRun:
@@ -198,10 +197,9 @@ def campaign(
 
     Args:
         vut: vehicle under test: a spec, a class, a function, or an object.
-        net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
-            `seed`, `v_vut0_mps`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
+            `seed`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
             and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
             `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
@@ -212,7 +210,7 @@ def campaign(
     check_keywords("campaign", given, CampaignKeywords)
     settings, runner = settings_for(vut, given)
     folder = dated(settings.vut) if out is None else Path(out)
-    plan = resolve(settings, _path(net))
+    plan = resolve(settings)
     _notice_untrained(settings, plan, given)
     return _concluded(settings, plan, folder, runner)
 
@@ -221,7 +219,6 @@ def resume(
     run: AnyRun,
     *,
     vut: AnyVut | None = None,
-    net: AnyPath | None = None,
     force: bool = False,
     trust_vut: bool = False,
     **given: Unpack[CampaignKeywords],
@@ -232,7 +229,6 @@ def resume(
         run: the campaign, or its folder.
         vut: the VUT again, where it was an object of a process that is gone: only its name tells
             that it is the same. So with a `pov`.
-        net: net for that; must be the one of the campaign.
         force: go on although something differs that decides outcomes.
         trust_vut: run the controller that a folder names although it was not made here.
         given: as of `campaign`. The settings must be those of the campaign: `cases` may be more.
@@ -249,9 +245,7 @@ def resume(
         levels = parse_levels(str(named["level"]), policies, scenario_levels, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
-    return _concluded(
-        settings, resolve(settings, _path(net)), folder, runner, goes_on=True, force=force
-    )
+    return _concluded(settings, resolve(settings), folder, runner, goes_on=True, force=force)
 
 
 def _concluded(
@@ -388,7 +382,6 @@ def run_case(
     *,
     recorded: tuple[AnyRun, int] | None = None,
     level: int | str | None = None,
-    net: AnyPath | None = None,
     debug: bool = False,
     gui: bool = False,
     out: AnyPath | None = None,
@@ -403,7 +396,6 @@ def run_case(
         case: a row of `run.cases` or `run.failures`: default of level and coordinates.
         recorded: a campaign, or its folder, and the index of its case: default of everything.
         level: POV level 0, 1 or 2, or "own" for a `pov`; by default that of the case, else 0.
-        net: SUMO net to use instead of the scenario's.
         debug: run the VUT in this process without a deadline, so that breakpoints work.
         gui: show it in sumo-gui while it runs; returns when the window is closed.
         out: new folder to keep it in.
@@ -428,7 +420,7 @@ def run_case(
         check_new(Path(out))
     for sentence in outside_of_the_pool(one):
         warnings.warn(sentence, Notice, stacklevel=2)
-    plan = resolve(settings, _path(net), debug=debug)
+    plan = resolve(settings, debug=debug)
 
     def ended(result: Ended) -> None:
         if out is not None:
@@ -548,10 +540,10 @@ def _today(
     run: Run, given: RerunKeywords, vut: AnyVut | None, stacklevel: int
 ) -> tuple[CampaignSettings, SimulationPlan, Runner]:
     """Return how and where cases of a campaign run today: settings, their plan, and the runner."""
-    others = {name: one for name, one in given.items() if name not in ("net", "trust_vut")}
+    others = {name: one for name, one in given.items() if name != "trust_vut"}
     fields, runner = given_again(vut, others, {"vut": run.vut}, stacklevel)
     settings = settings_today(run, fields, trust=given.get("trust_vut", False))
-    return settings, resolve(settings, _path(given.get("net"))), runner
+    return settings, resolve(settings), runner
 
 
 def _listed(indices: Iterable[int] | int) -> tuple[int, ...]:
@@ -579,7 +571,6 @@ def export(
     *,
     file_format: str = "sumo",
     out: AnyPath | None = None,
-    net: AnyPath | None = None,
 ) -> list[Path]:
     """Write cases of a campaign for others, and return the paths; as `merge-sumo export`.
 
@@ -589,7 +580,6 @@ def export(
         file_format: "sumo", "openscenario" or "commonroad" for folders, "csv" or "parquet" for one
             table, or the name of a format that an installed package brings.
         out: folder; `scenarios` or `exports` in that of the campaign when left out.
-        net: SUMO net to use instead of the scenario's.
     """
     loaded = _opened(run).run
     wanted = None if indices is None else list(_listed(indices))
@@ -603,7 +593,7 @@ def export(
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
         raise UserError(f"--format {file_format} needs the indices of cases")
-    road = road_for(loaded.scenario, _path(net))
+    road = road_for(loaded.scenario)
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
@@ -623,28 +613,27 @@ def board(run: AnyRun, *, certificate: AnyPath | None = None) -> Shown:
     return Shown({"board": str(html), "record": str(record)}, [str(html), str(record)])
 
 
-def replay(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> Replay:
+def replay(folder: AnyRun, index: int | None = None) -> Replay:
     """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
 
     Args:
         folder: a scenario folder, or a campaign.
         index: the case of the campaign, which is exported where it is not yet.
-        net: SUMO net to use instead of the scenario's.
 
     `diverged_at_s` of the result is None where the replay is identical.
     """
-    return replayer.replay(_scenario_folder(folder, index, net))
+    return replayer.replay(_scenario_folder(folder, index))
 
 
-def open_in_gui(folder: AnyRun, index: int | None = None, *, net: AnyPath | None = None) -> int:
+def open_in_gui(folder: AnyRun, index: int | None = None) -> int:
     """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
 
     The arguments are those of `replay`. Raises `UserError` without a display.
     """
-    return replayer.open_gui(_scenario_folder(folder, index, net))
+    return replayer.open_gui(_scenario_folder(folder, index))
 
 
-def _scenario_folder(folder: AnyRun, index: int | None, net: AnyPath | None) -> Path:
+def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
     """Return the replay folder of a case, written where it does not exist yet."""
     path = folder.folder if isinstance(folder, CampaignRun) else Path(folder)
     if not (path / SETTINGS).is_file():
@@ -657,7 +646,7 @@ def _scenario_folder(folder: AnyRun, index: int | None, net: AnyPath | None) -> 
         )
     exported = path / SCENARIOS / case_name(index)
     if not exported.is_dir():
-        export(folder, index, net=net)
+        export(folder, index)
     return exported
 
 
@@ -669,7 +658,6 @@ def compare_runs(
     b: AnyRun,
     *,
     rerun: bool = True,
-    net: AnyPath | None = None,
     policies: AnyPath | None = None,
     trust_vut: bool = False,
     out: AnyPath | None = None,
@@ -683,7 +671,6 @@ def compare_runs(
         a: the campaign before, or its folder.
         b: the campaign after, or its folder.
         rerun: run the failures, errors and timeouts of each with the other's VUT.
-        net: net for that; must be the one of the campaigns.
         policies: folder of the learned drivers, where they are elsewhere now.
         trust_vut: run the controllers that the folders name although they were not made here.
         out: page to write; nothing may be there. None is written when left out.
@@ -693,14 +680,13 @@ def compare_runs(
         check_new_file(Path(out))
     first, second = _opened(a).run, _opened(b).run
     given = {} if policies is None else {"policies": str(policies)}
-    road = road_for(first.scenario, _path(net)) if rerun else None
     motions: dict[tuple[str, int], Trajectory] = {}
 
     def keep(of: str, index: int, trajectory: Trajectory) -> None:
         motions[of, index] = trajectory
 
     compared = versions.compare_runs(
-        first, second, rerun=rerun, net=road, given=given, trust=trust_vut, on_motion=keep
+        first, second, rerun=rerun, given=given, trust=trust_vut, on_motion=keep
     )
     if out is not None:
         write_page(comparison_page(compared, first, second, motions, tolerance), Path(out))
@@ -940,7 +926,6 @@ def certify(
     level: int | str = "all",
     *,
     radius: float = 0.01,
-    net: AnyPath | None = None,
     out: AnyPath | None = None,
     resume: bool = False,
     engine: str = Engine.SUMO,
@@ -953,7 +938,6 @@ def certify(
         vut: as of `campaign`.
         level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
         radius: radius of the balls, as a share of the axes of the pool.
-        net: SUMO net to use instead of the scenario's.
         out: new folder to write; `runs/certify-<vut>-<date>` by default.
         resume: go on with the certificate in `out`.
         engine: "sumo", or "kinematic": see `truths`.
@@ -968,7 +952,7 @@ def certify(
     folder = dated(f"certify-{settings.vut}") if out is None else Path(out)
     if not resume:
         check_new(folder)
-    plan = resolve(settings, _path(net)).with_engine(engine)
+    plan = resolve(settings).with_engine(engine)
     total = sum(map(len, lattices.values()))
     with (
         runner.open(plan, at_once=True) as opened,
@@ -1182,12 +1166,11 @@ def repair(
     def fresh(spec: str, number: int) -> tuple[Run, RunComparison]:
         campaign = folder / mending.CAMPAIGN.format(number)
         settings = mending.fresh_settings(today, asked, spec, number)
-        ran = _fresh_campaign(settings, campaign, given.get("net"), runner)
+        ran = _fresh_campaign(settings, campaign, runner)
         seen = motions[ran.folder] = {}
         compared = versions.compare_runs(
             before,
             ran,
-            net=plan.road,
             given={} if today.policies is None else {"policies": today.policies},
             trust=given.get("trust_vut", False),
             on_motion=lambda of, index, motion: seen.update({(of, index): motion}),
@@ -1213,11 +1196,9 @@ def repair(
     return RepairResult(found, folder, page)
 
 
-def _fresh_campaign(
-    settings: CampaignSettings, folder: Path, net: AnyPath | None, runner: Runner
-) -> Run:
+def _fresh_campaign(settings: CampaignSettings, folder: Path, runner: Runner) -> Run:
     """Run a campaign into a folder, or go on with it where it has begun."""
-    plan = resolve(settings, _path(net))
+    plan = resolve(settings)
     begun = folder.exists()
     if begun:
         check_report(folder)

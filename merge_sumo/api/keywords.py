@@ -92,7 +92,6 @@ class Settings(Setup, total=False):
         batch: cases per batch; by default as many as the sampler wants.
         in_flight: most cases that run or wait while the sampler is asked, instead of batches.
         seed: same seed, same outcomes.
-        v_vut0_mps: initial speed of the VUT; the scenario's by default.
         stop_after_converged: stop when less than this share of new coverage is expected.
         audit: uniform cases among them, which bound what the campaign missed; none by default.
         repeat: how often each case runs, once by default, with another draw of what is random;
@@ -109,7 +108,6 @@ class Settings(Setup, total=False):
     batch: int | None
     in_flight: int | None
     seed: int
-    v_vut0_mps: float | None
     stop_after_converged: float | None
     audit: int | None
     repeat: int | Literal["auto"]
@@ -142,11 +140,9 @@ class RerunKeywords(Hosting, Running, total=False):
     """Keywords of what runs cases of a recorded campaign: of `Hosting` and `Running`, and these.
 
     Attributes:
-        net: net for that; must be the one of the campaign.
         trust_vut: run the controller that the folder names although it was not made here.
     """
 
-    net: Path | str | None
     trust_vut: bool
 
 

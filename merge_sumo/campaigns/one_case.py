@@ -32,7 +32,6 @@ OPTIONS: Final = {
     "x_pov0_m": "--x",
     "v_pov0_mps": "--v",
     "svo_rad": "--psi",
-    "v_vut0_mps": "--v-vut0",
     "headway_ahead_s": "--headway-ahead",
     "headway_behind_s": "--headway-behind",
 }

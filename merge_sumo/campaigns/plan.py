@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Final
 
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -17,10 +16,8 @@ DEBUG_DEADLINE_S: Final = 86_400.0
 """A person at a breakpoint takes their time."""
 
 
-def resolve(
-    settings: CampaignSettings, net: Path | None = None, *, debug: bool = False
-) -> SimulationPlan:
-    """Return the plan of what settings name: road, drivers, criterion; `net` replaces the road's.
+def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPlan:
+    """Return the plan of what settings name: road, drivers, criterion.
 
     With `debug` a controller of the user's runs in this process, without a deadline.
 
@@ -38,7 +35,7 @@ def resolve(
         povs.check_level(level)
     return SimulationPlan(
         scenario=settings.scenario,
-        road=road_for(settings.scenario, net),
+        road=road_for(settings.scenario),
         vut=vut,
         povs=povs,
         criterion=settings.criterion,

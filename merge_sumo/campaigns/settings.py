@@ -48,7 +48,6 @@ class CampaignSettings:
     repeat: int | Literal["auto"] = 1
     tolerated: float = 0.0
     seed: int = 0
-    v_vut0_mps: float | None = None
     stop_after_converged: float | None = None
     vut_command: str | None = None
     deadline_s: float = DEADLINE_S
@@ -64,7 +63,6 @@ class CampaignSettings:
     def __post_init__(self) -> None:
         check_fields(self)
         self._check_texts()
-        self._take_speed()
         criterion = self.criterion
         object.__setattr__(self, "fail_when", criterion.fail_when)
         object.__setattr__(self, "require", criterion.require)
@@ -105,19 +103,6 @@ class CampaignSettings:
                 "the cases of the campaign, and cannot be more"
             )
         self.stopping_rule()
-
-    def _take_speed(self) -> None:
-        """Take the initial speed of the VUT from the scenario, or narrow the scenario to it."""
-        fixed = self.scenario.v_vut0_mps
-        if self.v_vut0_mps is None and isinstance(fixed, float):
-            object.__setattr__(self, "v_vut0_mps", fixed)
-        elif self.v_vut0_mps is not None and not isinstance(fixed, float):
-            # Then it is no coordinate of the pool any more.
-            narrowed = replace(self.scenario, v_vut0_mps=float(self.v_vut0_mps))
-            object.__setattr__(self, "scenario", narrowed)
-        most_mps = self.scenario.v_start_max_mps
-        if self.v_vut0_mps is not None and not 0.0 <= self.v_vut0_mps <= most_mps:
-            raise UserError(f"--v-vut0 is {self.v_vut0_mps}: choose between 0 and {most_mps:g} m/s")
 
     def _check_texts(self) -> None:
         for option, text in (
@@ -281,12 +266,11 @@ class CampaignSettings:
     @property
     def pool(self) -> Pool:
         """The cases to choose from."""
-        return Pool(levels=self.levels, v_vut0_mps=self.v_vut0_mps, scenario=self.scenario)
+        return Pool(levels=self.levels, scenario=self.scenario)
 
 
 RECORDED_BY_DEFAULT: Final = {
     **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
-    "v_vut0_mps": US23.v_vut0_mps,
     "scenario": US23.to_record(),
 }
 """What the settings were in a campaign that does not record them."""

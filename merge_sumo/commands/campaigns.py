@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
 SETTINGS: Final = (
     *("vut", "against", "level", "sampler", "cases", "batch", "in_flight", "seed", "learn_from"),
-    "v_vut0",
 )
-COORDINATES: Final = ("x", "v", "psi", "v_vut0", "headway_ahead", "headway_behind")
+COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
 
 
 def _vut_option(help: str, show_default: str) -> Shared:
@@ -47,7 +46,6 @@ def _vut_option(help: str, show_default: str) -> Shared:
             "repeat",
             "tolerate",
             *SETUP,
-            "net",
         ),
         *(*RUNNING, "trust_vut"),
     )
@@ -101,7 +99,7 @@ def campaign(
     for_ci: dict[str, Any] = {"gates": gates, "junit": junit}
 
     def how_to_go_on() -> str:
-        return _how_to_go_on(folder, given.keywords["net"], gates, junit)
+        return _how_to_go_on(folder, gates, junit)
 
     with stoppable("batch", how_to_go_on) as check:
         if resume is None:
@@ -115,18 +113,18 @@ def campaign(
     raise typer.Exit(0 if run.passed else 1)
 
 
-def _how_to_go_on(folder: Path, net: Path | None, gates: list[str], junit: Path | None) -> str:
+def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
     # None of these is a setting of the campaign, which its folder would remember.
-    options = [("--resume", folder), ("--net", net), *(("--gate", gate) for gate in gates)]
-    options.append(("--junit", junit))
-    words = " ".join(f"{option} {quoted(value)}" for option, value in options if value is not None)
-    return f"stopped; go on with: merge-sumo campaign {words}"
+    words = [f"--resume {quoted(folder)}", *(f"--gate {quoted(gate)}" for gate in gates)]
+    if junit is not None:
+        words.append(f"--junit {quoted(junit)}")
+    return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
 
 
 @app.verb(
-    options=(*COORDINATES, *SETUP, "net", "trust_vut"),
+    options=(*COORDINATES, *SETUP, "trust_vut"),
     own={
         "vut": _vut_option("Vehicle under test.", "with --case the campaign's"),
         "level": optional(
@@ -198,7 +196,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
 
 
 @app.verb(
-    options=("level", *HOSTING, "policies", "net", "tolerance", *RUNNING, "trust_vut"),
+    options=("level", *HOSTING, "policies", "tolerance", *RUNNING, "trust_vut"),
     own={"vut": _vut_option("The changed VUT.", "the campaign's, as its files are now")},
 )
 def rerun(
@@ -243,7 +241,6 @@ def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
 
 
 @app.verb(
-    options=["net"],
     own={
         "file_format": option(
             str,
@@ -281,7 +278,7 @@ def export(
         show(path)
 
 
-@app.verb(options=["net"])
+@app.verb()
 def replay(
     given: Given,
     folder: Annotated[
@@ -356,7 +353,7 @@ def board(given: Given, run: RunArgument) -> None:
 
 @app.verb(
     "compare-runs",
-    options=["tolerance", "net", "policies", "trust_vut"],
+    options=["tolerance", "policies", "trust_vut"],
     own={
         "rerun": option(
             bool,

@@ -11,8 +11,10 @@ COMMANDS: Final[Mapping[str, str]] = {}
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
     "--in-process": "`merge-sumo run --debug` runs one case within reach of a debugger",
+    "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "
     "'clearance_m <= 0 and pov_sustained_brake_mps2 <= 2.06'",
+    "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
 }
 """What replaces an option, by its name with dashes, in every command that does not have it."""
 

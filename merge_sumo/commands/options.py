@@ -28,8 +28,9 @@ PANEL_OF: Final = {name: panel for panel, names in PANELS.items() for name in na
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
-        *("vut", "vut_command", "against", "level", "scenario", "net", "v_vut0"),
-        *("mainline", "ramp", "point", "follow_up", "sense", "act", "case", "at", "x", "v", "psi"),
+        *("vut", "vut_command", "against", "level", "scenario"),
+        *("net", "mainline", "ramp", "point", "follow_up", "sense", "act", "case", "at"),
+        *("x", "v", "psi"),
         *("headway_ahead", "headway_behind", "only", "a_min", "check"),
     ),
     "How many cases, and which": (
@@ -64,7 +65,6 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
 
 KEYWORDS: Final = {
-    "v_vut0": "v_vut0_mps",
     "density": "density_veh_per_km",
     "deadline": "deadline_s",
     "limit": "limit_s",
@@ -161,7 +161,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME|FILE",
         autocompletion=complete.scenarios,
     ),
-    "net": optional(Path, "SUMO net to use instead of the shipped US-23 ramp."),
     "follow_up": optional(
         float,
         "Time for which both drive on after the merge, with measures of its own.",
@@ -184,9 +183,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "x": optional(float, "Initial position of the POV in m; M is 0.", "--x"),
     "v": optional(float, "Initial speed of the POV in m/s.", "--v"),
     "psi": optional(float, "Social value orientation of the POV in rad, at level 2."),
-    "v_vut0": optional(
-        float, "Initial speed of the VUT in m/s.", show_default="the scenario's, 18 in us23"
-    ),
     "headway_ahead": optional(float, "Headway to the car ahead in s, in traffic."),
     "headway_behind": optional(float, "Headway of the car behind in s, in traffic."),
     "sampler": option(

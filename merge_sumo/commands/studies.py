@@ -24,7 +24,7 @@ from merge_sumo.commands.options import (
 )
 from merge_sumo.commands.printing import folder_of, same_command, say, stoppable
 
-OF_RECORDED: Final = ("net", "policies", "pov", *HOSTING, *RUNNING, "trust_vut")
+OF_RECORDED: Final = ("policies", "pov", *HOSTING, *RUNNING, "trust_vut")
 """Options of the studies that run cases of a recorded campaign."""
 TRUTH_CASES: Final = "10000, at level 2 20000"
 
@@ -185,7 +185,7 @@ def benchmark(
 
 
 @app.verb(
-    options=("level", *SETUP, "net", "engine", "dask", "quiet"),
+    options=("level", *SETUP, "engine", "dask", "quiet"),
     own={
         "radius": option(float, 0.01, "Radius of the balls, as a share of the axes of the pool."),
         "workers": CORES,

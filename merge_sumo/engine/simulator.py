@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any, Self
 
 from merge_sumo.drivers.actuation import ActuatedDriver
@@ -116,14 +115,13 @@ def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None 
     return library if lane_of(scenario) is None else LanePov(library)
 
 
-def road_for(scenario: Scenario, net: Path | None = None) -> Corridor:
-    """Return the road of a scenario, or another net with the same edges.
+def road_for(scenario: Scenario) -> Corridor:
+    """Return the road of a scenario.
 
     Raises `UserError` where there is no such merge, or not room enough for its vehicles.
     """
-    if net is None and scenario.net is not None:
-        # Where a path says nothing of folders, the net is one that the package brings.
-        net = resource("sumo_net") / scenario.net
+    # Where a path says nothing of folders, the net is one that the package brings.
+    net = None if scenario.net is None else resource("sumo_net") / scenario.net
     edges = scenario.pov_edges, scenario.vut_edges
     road = road_of(net, *edges, scenario.room_after_m, lane_of(scenario))
     road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)

@@ -37,7 +37,7 @@ from merge_sumo.values.severity import Severity, meanings
 SLOWEST_TRAFFIC_MPS: Final = 17.0
 """Less than one car in a hundred of the traffic that a command names drives slower."""
 OF_A_CAMPAIGN: Final = (
-    *("vut", "levels", "scenario", "fail_when", "require", "v_vut0_mps"),
+    *("vut", "levels", "scenario", "fail_when", "require"),
     *("policies_sha256", "net_sha256"),
 )
 """Settings in which a study is the same as the campaign that it is of."""

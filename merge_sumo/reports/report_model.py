@@ -190,12 +190,8 @@ def _truth(run: Run, road: Corridor, level: int) -> Truth | None:
 
 def kept_truth(run: Run, road: Corridor, level: int) -> tuple[Truth, Path] | None:
     """Return the ground truth of `_truth`, and its file in the cache."""
-    settings, fixed = run.settings, run.scenario.v_vut0_mps
-    same = (
-        settings.get("net_sha256") == road.sha256
-        and settings.get("versions") == versions()
-        and settings.get("v_vut0_mps") == (fixed if isinstance(fixed, float) else None)
-    )
+    settings = run.settings
+    same = settings.get("net_sha256") == road.sha256 and settings.get("versions") == versions()
     policies = settings.get("policies_sha256", {})
     if not same or not isinstance(policies, dict):
         return None

@@ -27,7 +27,7 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import Record, convert, decode
+from merge_sumo.system.records import Record, decode
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.scenario import DX_CRASH_M, level_name
@@ -84,12 +84,7 @@ def learned_twin(run: Run, levels: list[int]) -> Twin:
     povs = Povs(policies=policies_of(run.scenario))
     if povs.sha256() != run.settings.get("policies_sha256"):
         raise UserError("the run had other drivers than those that are here")
-    speed = None
-    if run.settings.get("v_vut0_mps") is not None:
-        speed = convert(run.settings["v_vut0_mps"], float)
-    if speed is not None and not 0.0 <= speed <= run.scenario.v_start_max_mps:
-        raise UserError(f"the VUT began with {speed} m/s, which no campaign of ours has")
-    pool = Pool(levels=tuple(levels), v_vut0_mps=speed, scenario=run.scenario)
+    pool = Pool(levels=tuple(levels), scenario=run.scenario)
     lines = centre_lines(road_for(run.scenario))
     twin = Twin(pool, povs, 0, criterion=run.criterion, lines=lines)
     last = run.outcomes[-MOST_CASES:]

@@ -661,7 +661,7 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
         centre = to_unit([case], case.level, case.scenario)
         offsets = rng.uniform(-RADIUS, RADIUS, (NEIGHBOURS, centre.shape[1]))
         near = np.clip(centre + offsets, 0.0, 1.0)
-        found += from_unit(near, case.level, case.v_vut0_mps, scenario=case.scenario)
+        found += from_unit(near, case.level, scenario=case.scenario)
     return found
 
 

@@ -39,12 +39,9 @@ class RunStudy:
     def check_same_system(self) -> None:
         """Raise `UserError` where the campaign had another net or other policies than this plan."""
         today, run = self.record(), self.run
-        for name, what, others in (
-            ("net_sha256", "net", "another"),
-            ("policies_sha256", "policies", "other"),
+        for name, difference in (
+            ("net_sha256", f"another net than {self.plan.road.path} is now: put that back"),
+            ("policies_sha256", "other policies: name what it was run with, --policies"),
         ):
             if run.settings.get(name) != today[name]:
-                raise UserError(
-                    f"{run.folder} was run with {others} {what}: name what it was run with, "
-                    f"--{what}"
-                )
+                raise UserError(f"{run.folder} was run with {difference}")

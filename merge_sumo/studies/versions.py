@@ -31,7 +31,6 @@ from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_her
 from merge_sumo.engine.plan import versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.hashing import changed
 from merge_sumo.system.printable import counted
@@ -421,7 +420,6 @@ def compare_runs(
     b: Run,
     *,
     rerun: bool = True,
-    net: Corridor | None = None,
     given: Mapping[str, object] | None = None,
     trust: bool = False,
     on_motion: OnMotion = lambda _run, _index, _trajectory: None,
@@ -435,7 +433,6 @@ def compare_runs(
         a: campaign of A.
         b: campaign of B.
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
-        net: net for that; must be the one of the campaigns.
         given: settings in the place of what the folders name: policies that are elsewhere.
         trust: run the controllers that the folders name although they may be a stranger's.
         on_motion: told what a VUT did in a case of the other's campaign.
@@ -453,15 +450,15 @@ def compare_runs(
     )
     again_a = again_b = _RunAgain("was not run again")
     if rerun:
-        road = net or road_for(a.scenario)
+        road = road_for(a.scenario)
         for run in (a, b):
             if run.settings.get("net_sha256") != road.sha256:
                 raise UserError(
-                    f"{run.folder} was run on another net than {road.path}: give that with --net, "
-                    "or compare the records with --no-rerun"
+                    f"{run.folder} was run on another net than {road.path} is now: put that "
+                    "back, or compare the records with --no-rerun"
                 )
-        again_b = _run_again(b, a, telling_a, road, given, partial(on_motion, "A"), trust=trust)
-        again_a = _run_again(a, b, telling_b, road, given, partial(on_motion, "B"), trust=trust)
+        again_b = _run_again(b, a, telling_a, given, partial(on_motion, "A"), trust=trust)
+        again_a = _run_again(a, b, telling_b, given, partial(on_motion, "B"), trust=trust)
     runs_a, runs_b = (_repeated(run.outcomes) for run in (a, b))
     cases = [
         *(
@@ -488,12 +485,6 @@ def check_comparable(a: Run, b: Run, levels: Iterable[int]) -> None:
         raise UserError(
             f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
             f"changed one, {b.scenario.name}: compare campaigns of one scenario"
-        )
-    speeds = [run.settings.get("v_vut0_mps") for run in (a, b)]
-    if speeds[0] != speeds[1]:
-        raise UserError(
-            f"the VUT starts at {speeds[0]} m/s in {a.folder} and at {speeds[1]} m/s in "
-            f"{b.folder}: compare campaigns with the same --v-vut0"
         )
     if a.criterion != b.criterion:
         raise UserError(
@@ -543,7 +534,6 @@ def _run_again(
     run: Run,
     other: Run,
     telling: Sequence[Outcome],
-    net: Corridor,
     given: Mapping[str, object] | None,
     on_motion: Callable[[int, Trajectory], None],
     *,
@@ -562,7 +552,7 @@ def _run_again(
     draws = [[o.case for o in _runs_of(o, repeated)] for o in telling]
     cases = [*(o.case for o in checked), *chain.from_iterable(draws)]
     settings = settings_of(run.folder, run.settings, given, trust=trust)
-    plan = resolve(settings, net.path).for_cases(len(cases))
+    plan = resolve(settings).for_cases(len(cases))
     shows_chance = any(one.varies for one in _repeated(run.outcomes).values())
     results = [result for _, result in sorted(evaluate(plan, cases), key=itemgetter(0))]
     for before, result in zip(checked, results, strict=False):
@@ -727,7 +717,7 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Rerun:
     road = plan.road
     if run.settings.get("net_sha256", road.sha256) != road.sha256:
         raise UserError(
-            f"{run.folder} was run on another net than {road.path}: give that with --net"
+            f"{run.folder} was run on another net than {road.path} is now: put that back"
         )
     levels = sorted({outcome.case.level for outcome in before})
     today = study.record()

@@ -82,7 +82,7 @@ class MeasureContract:
     """
 
     measure: Measure
-    pool: Pool = Pool(levels=(0,), v_vut0_mps=17.5, scenario=US23)
+    pool: Pool = Pool(levels=(0,), scenario=US23)
 
     def values(self) -> list[float | None]:
         """Return the values of some episodes."""

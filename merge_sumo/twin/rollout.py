@@ -76,12 +76,11 @@ class TwinRollout:
             d.field: d.low + u * (d.high - d.low)
             for d, u in zip(scenario.dimensions(level), points.T, strict=True)
         }
-        fixed_mps = self._pool.v_vut0_mps
         n, v_vut0_mps = len(points), scenario.bounds("v_vut0_mps")[0]
         x_m, v_mps = np.zeros((2, scenario.vehicles, n))
         x_m[POV], v_mps[POV] = values["x_pov0_m"], values["v_pov0_mps"]
         x_m[VUT] = scenario.x_vut0_m
-        v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps if fixed_mps is None else fixed_mps)
+        v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps)
         if scenario.vehicles > 2:
             v_mps[[AHEAD, BEHIND]] = v_mps[POV]
             x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]

@@ -240,16 +240,14 @@ class ToldCase(Case):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pool:
-    """The cases that a campaign may choose from: POV levels, and the VUT's observed speed."""
+    """The cases that a campaign may choose from: those of a scenario at POV levels."""
 
     levels: tuple[int, ...]
-    v_vut0_mps: float | None = None
-    """None for the scenario's; where that is a range, it is a coordinate."""
     scenario: Scenario
 
     def cases(self, points: FloatArray, level: int) -> list[Case]:
         """Return the cases at points, (n, d), of a level's unit cube."""
-        return from_unit(points, level, self.v_vut0_mps, scenario=self.scenario)
+        return from_unit(points, level, scenario=self.scenario)
 
 
 def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> FloatArray:
@@ -265,19 +263,13 @@ def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> Flo
     return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dims)))
 
 
-def from_unit(
-    points: FloatArray,
-    level: int,
-    v_vut0_mps: float | None = None,
-    *,
-    scenario: Scenario,
-) -> list[Case]:
+def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Case]:
     """Return the cases at points, (n, d), of the unit cube; the inverse of `to_unit`."""
     dims = scenario.dimensions(level)
-    given = scenario.bounds("v_vut0_mps")[0] if v_vut0_mps is None else v_vut0_mps
+    v_vut0_mps, _ = scenario.bounds("v_vut0_mps")
     cases = []
     for row in points.tolist():
-        values = {"v_vut0_mps": given}
+        values = {"v_vut0_mps": v_vut0_mps}
         values |= {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
         if level == 2:
             values["svo_rad"] = min(values["svo_rad"], math.nextafter(SVO.high, 0.0))

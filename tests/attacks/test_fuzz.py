@@ -303,7 +303,7 @@ class TestAScenario:
 
 words = st.text(max_size=12) | st.integers().map(str) | st.floats().map(str)
 awkward = st.sampled_from(["", "-", "--", "nan", "1e9", "all", "0", "level0", "."])
-OPTIONS = ["vut", "level", "sampler", "batch", "seed", "v-vut0", "workers", "net", "resume", "out"]
+OPTIONS = ["vut", "level", "sampler", "batch", "seed", "workers", "resume", "out"]
 
 
 @here
@@ -327,7 +327,6 @@ def test_a_command_with_an_option_of_any_value_says_what_is_wrong(option, value,
             "cases": st.integers(),
             "batch": st.integers(),
             "seed": st.integers(),
-            "v_vut0_mps": st.floats(),
         }
     )
 )
@@ -336,7 +335,6 @@ def test_settings_of_any_value_are_settings_or_a_sentence(values):
     if found is not None:
         assert 1 <= found.batch <= found.cases
         assert found.seed >= 0
-        assert 0.0 <= found.v_vut0_mps <= 45.0
         assert set(found.levels) <= {0, 1, 2}
 
 

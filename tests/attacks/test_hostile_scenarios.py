@@ -635,7 +635,7 @@ def test_a_hostile_folder_does_nothing_and_gets_a_sentence_or_a_true_verdict(sce
 
 @pytest.mark.parametrize("name", [name for name, (file, *_) in TEXTS.items() if file == NET])
 def test_a_hostile_net_does_nothing_on_its_way_to_a_world_and_to_opendrive(scene, name):
-    """As `--net` takes it: nothing of it reaches libsumo, netconvert or an export."""
+    """As a scenario names it: nothing of it reaches libsumo, netconvert or an export."""
     attack, expected = attack_of(name)
     attack(scene)
     path = scene.folder / NET

@@ -178,7 +178,6 @@ class TestWhatDiffers:
             ({"sampler": "gpr"}, "sampler differs"),
             ({"cases": 24}, "cases differs"),
             ({"batch": 4}, "batch differs"),
-            ({"v_vut0_mps": 17.0}, "v_vut0_mps differs"),
         ],
     )
     def test_of_the_settings_is_refused_by_name(self, folder, given, name):
@@ -222,7 +221,7 @@ class TestWhatDiffers:
         assert [outcome.batch for outcome in run.outcomes][-9:] == [3] + [4] * 8
 
     def test_is_nothing_where_what_is_given_is_what_was_recorded(self, whole, folder):
-        resume_campaign(folder, given={"seed": 2, "levels": (0,), "v_vut0_mps": 18})
+        resume_campaign(folder, given={"seed": 2, "levels": (0,)})
         assert outcomes(folder) == outcomes(whole)
 
     def test_by_hand(self):

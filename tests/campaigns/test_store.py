@@ -270,7 +270,7 @@ def test_a_run_with_measures_of_an_absent_package_names_the_package(tmp_path):
 
 class TestAJournal:
     def test_gives_back_settings_outcomes_and_trajectories_to_the_last_bit(self, tmp_path):
-        settings = {"vut": "design1", "levels": [0], "seed": 3, "v_vut0_mps": 0.1 + 0.2}
+        settings = {"vut": "design1", "levels": [0], "seed": 3, "tolerated": 0.1 + 0.2}
         journal = Journal.create(tmp_path / "run", settings)
         ran = [episode(index, batch=index // 2, steps=20 + 7 * index) for index in range(5)]
         for batch in range(3):

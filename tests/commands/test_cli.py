@@ -61,9 +61,6 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
             (("--cases", "10", "--batch", "11"), ("--batch is 11", "--cases is 10")),
             (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
             (("--seed", "-1"), ("--seed is -1",)),
-            (("--v-vut0", "46"), ("46", "45")),
-            (("--v-vut0", "nan"), ("nan", "45")),
-            (("--net", "nowhere.net.xml"), ("nowhere.net.xml",)),
         ],
         ids=" ".join,
     )

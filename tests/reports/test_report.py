@@ -341,15 +341,11 @@ class TestTheTruth:
 
     def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
         net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))
-        run = write_run(
-            *(tmp_path / "run", 10, (0, 2)), scenario=ranged, net_sha256=net, v_vut0_mps=None
-        )
+        run = write_run(tmp_path / "run", 10, (0, 2), scenario=ranged, net_sha256=net)
         maps = data_of(report_page(run))["maps"]
         assert {grid["truth"] is None for of in maps.values() for grid in of["grids"]} == {False}
 
-    @pytest.mark.parametrize(
-        "settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}, {"v_vut0_mps": 10.0}]
-    )
+    @pytest.mark.parametrize("settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}])
     def test_of_something_else_is_not(self, tmp_path, cached, settings):
         run = write_run(
             tmp_path / "run", per_level=10, **{"net_sha256": road_of().sha256, **settings}

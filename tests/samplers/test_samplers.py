@@ -20,11 +20,11 @@ from merge_sumo.values.trajectory import End
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
 POOLS = {
-    "2-d": Pool(levels=(0,), v_vut0_mps=17.5, scenario=US23),
-    "3-d": Pool(levels=(2,), v_vut0_mps=17.5, scenario=US23),
-    "2-d and 3-d": Pool(levels=(0, 1, 2), v_vut0_mps=17.5, scenario=US23),
-    "4-d": Pool(levels=(0,), v_vut0_mps=17.5, scenario=TRAFFIC),
-    "4-d and 5-d": Pool(levels=(1, 2), v_vut0_mps=17.5, scenario=TRAFFIC),
+    "2-d": Pool(levels=(0,), scenario=US23),
+    "3-d": Pool(levels=(2,), scenario=US23),
+    "2-d and 3-d": Pool(levels=(0, 1, 2), scenario=US23),
+    "4-d": Pool(levels=(0,), scenario=TRAFFIC),
+    "4-d and 5-d": Pool(levels=(1, 2), scenario=TRAFFIC),
     "6-d": Pool(levels=(2,), scenario=replace(TRAFFIC, v_vut0_mps=(14.0, 22.0))),
 }
 LONG = ("2-d", "3-d", "4-d and 5-d", "6-d")

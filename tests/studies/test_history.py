@@ -32,7 +32,7 @@ Point = tuple[float, float, str]
 def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> Run:
     """Write a campaign with cases at points of the unit square that pass, fail or err."""
     record = {"vut": folder.name, "levels": [level], "sampler": "by hand", "cases": len(points)}
-    record |= {"v_vut0_mps": 18.0, **settings}
+    record |= settings
     journal = Journal.create(folder, record)
     ran = []
     for index, (x, v, became) in enumerate(points):
@@ -155,7 +155,6 @@ class TestIsRefused:
         ("settings", "said"),
         [
             ({"scenario": asdict(replace(US23, tau_s=2.0))}, "scenario"),
-            ({"v_vut0_mps": 10.0}, "--v-vut0"),
             ({"policies_sha256": {"pov1": "other"}}, "POV of level 1"),
         ],
     )

@@ -169,10 +169,6 @@ class TestRefused:
             with pytest.raises(UserError, match="has no case at a POV level of both"):
                 compare_runs(*pair)
 
-    def test_with_another_initial_speed(self, tmp_path, run):
-        with pytest.raises(UserError, match="--v-vut0"):
-            compare_runs(run, changed(tmp_path / "b", run, v_vut0_mps=10.0))
-
     def test_on_another_net_unless_only_records_count(self, tmp_path, run):
         other = changed(tmp_path / "b", run, net_sha256="0")
         with pytest.raises(UserError, match="--no-rerun"):

@@ -6,11 +6,13 @@ import json
 import math
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from calling import assert_refused
 
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import NetFile
@@ -18,6 +20,7 @@ from merge_sumo.sumo import conversion
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
 from merge_sumo.sumo.opendrive import opendrive
+from merge_sumo.values.scenario import US23
 
 NODES = {1: (-1500, 0), 2: (-700, 0), 3: (0, 0), 4: (1500, 0), 5: (-600, -120), 6: (-300, -60)}
 WAYS = {10: ([1, 2, 3], "motorway"), 11: ([3, 4], "motorway"), 12: ([5, 6, 3], "motorway_link")}
@@ -119,11 +122,9 @@ class TestTheCommand:
         )
         assert sorted(path.name for path in here.iterdir()) == before
 
-    def test_of_another_option_says_how_a_map_becomes_a_net(self, here, command_line):
-        assert_refused(
-            command_line("campaign", "--vut", "level0", "--net", "ramp.osm"),
-            "`merge-sumo scenario new` makes one of such a map",
-        )
+    def test_that_a_scenario_names_is_answered_with_how_it_becomes_a_net(self, here):
+        with pytest.raises(UserError, match="`merge-sumo scenario new` makes one of such a map"):
+            road_for(replace(US23, net=str(here / "ramp.osm")))
 
 
 def test_maps_are_known_by_their_names():

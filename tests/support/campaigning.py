@@ -18,19 +18,16 @@ def campaign_settings(**settings: Any) -> CampaignSettings:
     return CampaignSettings(**{"levels": (0,), "scenario": US23, **settings})
 
 
-def run_campaign(
-    settings: CampaignSettings, folder: Path, *, net: Path | None = None, **other: Any
-) -> Run:
-    return campaign.run_campaign(settings, resolve(settings, net), folder, **other)
+def run_campaign(settings: CampaignSettings, folder: Path, **other: Any) -> Run:
+    return campaign.run_campaign(settings, resolve(settings), folder, **other)
 
 
 def resume_campaign(
     folder: Path,
     given: Mapping[str, object] | None = None,
     *,
-    net: Path | None = None,
     trust: bool = False,
     **other: Any,
 ) -> Run:
     settings = settings_of(folder, read_settings(folder), given, trust=trust, goes_on=True)
-    return campaign.resume_campaign(settings, resolve(settings, net), folder, **other)
+    return campaign.resume_campaign(settings, resolve(settings), folder, **other)

@@ -85,7 +85,6 @@ def write_run(
         "cases": len(cases),
         "batch": BATCH,
         "seed": 1,
-        "v_vut0_mps": 18.0,
         "versions": versions(),
         **({} if scenario == US23 else {"scenario": asdict(scenario)}),
         **settings,

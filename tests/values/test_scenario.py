@@ -126,7 +126,7 @@ class TestACase:
         )
 
     def test_is_a_point_of_the_pool_of_its_scenario(self):
-        pool = Pool(levels=(2,), v_vut0_mps=10.0, scenario=OTHER)
+        pool = Pool(levels=(2,), scenario=OTHER)
         points = np.random.default_rng(0).random((5, 3))
         cases = pool.cases(points, 2)
         assert all(case.scenario is OTHER and case.v_vut0_mps == 10.0 for case in cases)
@@ -178,7 +178,6 @@ class TestACampaign:
 
     def test_records_its_scenario_and_is_read_with_it(self, elsewhere):
         assert elsewhere.settings["scenario"] == json.loads(json.dumps(OTHER.to_record()))
-        assert elsewhere.settings["v_vut0_mps"] == 10.0
         assert Run(elsewhere.folder).scenario == OTHER
         assert all(outcome.case.scenario == OTHER for outcome in Run(elsewhere.folder).outcomes)
 
@@ -267,5 +266,5 @@ def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_train
 
 
 def test_points_of_one_scenario_are_cases_of_it():
-    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, 10.0, scenario=OTHER)
+    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, scenario=OTHER)
     assert (case.x_pov0_m, case.v_pov0_mps) == (-200.0, 15.0)
