@@ -158,7 +158,7 @@ from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.vuts.onnx_export import export_onnx
 from merge_sumo.vuts.python import SeenBatch, installed_vuts
-from merge_sumo.vuts.registry import KINDS, LEARNED, PYTHON, built_in_vuts
+from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS, PYTHON
 
 if TYPE_CHECKING:
     from merge_sumo.values.case import Case
@@ -1284,7 +1284,7 @@ def vuts(policies: AnyPath | None = None) -> Shown:
     `policies` is the folder of learned drivers instead of the shipped ones.
     """
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
-    built_in = [name for name in built_in_vuts() if LEARNED.get(name, name) in (name, *trained)]
+    built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
     kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
     names = {"built in": built_in, "installed": list(installed_vuts())}
     listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]

@@ -26,11 +26,11 @@ def _matching(incomplete: str, values: Iterable[tuple[str, str]]) -> Completions
 def vuts(incomplete: str) -> Completions:
     """Return the VUTs by name, the kinds of one's own, and Python files in the folder."""
     from merge_sumo.vuts.python import installed_vuts
-    from merge_sumo.vuts.registry import KINDS, built_in_vuts
+    from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS
 
     if ":" in incomplete:
         return _matching(incomplete, _names_in(incomplete.rpartition(":")[0]))
-    named = [(name, "built in") for name in built_in_vuts()]
+    named = [(name, "built in") for name in BUILT_IN_VUTS]
     named += [(name, "installed") for name in installed_vuts()]
     named += [
         (_common_prefix(name, kind.form), kind.what) for name, kind in KINDS.items() if kind.form

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import POV, VUT
 from merge_sumo.values.signals import Left
@@ -183,6 +186,20 @@ class Driver(ABC):
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
         """Release what the driver holds: processes, sockets."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Design:
+    """Parameters of a driver of this package, with units in their names.
+
+    Raises `UserError` for what is no number from 0 up; subclasses check what else makes no driver.
+    """
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
 
 
 class DriverWrapper(Driver):

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.base import Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
-from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, US23
 
@@ -19,8 +17,8 @@ STANDS_MPS: Final = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GapDesign:
-    """Parameters of a VUT that accepts gaps; raises `UserError` for values that make no design.
+class GapDesign(Design):
+    """Parameters of a VUT that accepts gaps.
 
     Attributes:
         line_m: distance before M of the line at which it waits.
@@ -33,12 +31,6 @@ class GapDesign:
     lead_s: float
     lag_s: float
     brake_mps2: float
-
-    def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
 
 
 ROUNDABOUT: Final = GapDesign(line_m=7.0, lead_s=1.8, lag_s=2.0, brake_mps2=1.5)

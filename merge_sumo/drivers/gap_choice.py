@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Design, Scene
 from merge_sumo.drivers.lane import acc_mps2, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
@@ -24,8 +22,8 @@ FREE_M: Final = 1e6
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GapChoice:
-    """Parameters of a VUT that chooses a gap; raises `UserError` for values that make no driver.
+class GapChoice(Design):
+    """Parameters of a VUT that chooses a gap.
 
     Attributes:
         headway_s: the least time gaps, ahead and behind, of a gap that it accepts.
@@ -36,12 +34,12 @@ class GapChoice:
     brake_mps2: float = 3.0
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
+        Design.__post_init__(self)
         if self.brake_mps2 == 0.0:
             raise UserError("brake_mps2 is 0: a VUT that cannot brake comes to no stand")
+
+
+HEADWAY: Final = GapChoice()
 
 
 class GapChoiceVut(Level0Vut):
@@ -55,10 +53,10 @@ class GapChoiceVut(Level0Vut):
     car ahead no closer than ACC does. Where there is no lane it is the level-0 VUT.
     """
 
-    def __init__(self, corridors: int, choice: GapChoice | None = None) -> None:
+    def __init__(self, corridors: int, choice: GapChoice = HEADWAY) -> None:
         """Prepare a controller with these parameters for each corridor."""
         super().__init__(corridors)
-        self.choice = choice or GapChoice()
+        self.choice = choice
         self._lane_m = np.zeros((2, corridors))
         """Where the lanes begin and end; 0 and 0 without one."""
         self._pov_length_m = np.full(corridors, US23.pov_length_m)
@@ -66,10 +64,6 @@ class GapChoiceVut(Level0Vut):
         self._before_mps: FloatArray | None = None
         """Speeds of all vehicles a step ago, (A, K)."""
         self._wishes = np.full(corridors, NO_WISH, dtype=np.int8)
-
-    def parameters(self) -> Mapping[str, float]:
-        """Return the parameters of the choice."""
-        return asdict(self.choice)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the profile, the lane and the lengths of the case's scenario."""

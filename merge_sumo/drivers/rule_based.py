@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.base import Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, FloatArray
@@ -17,8 +15,8 @@ from merge_sumo.values.scenario import DT_S, US23
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class RuleBasedDesign:
-    """Parameters of a rule-based VUT; raises `UserError` for values that make no design.
+class RuleBasedDesign(Design):
+    """Parameters of a rule-based VUT.
 
     Attributes:
         x1_m: distance before M at which stage 2 begins.
@@ -41,11 +39,7 @@ class RuleBasedDesign:
     lag_s: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the order of the stages and the signs."""
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
+        Design.__post_init__(self)
         if self.x2_m > self.x1_m:
             raise UserError(f"x2_m is {self.x2_m}: stage 3 cannot begin before stage 2 (x1_m)")
 
@@ -78,10 +72,6 @@ class RuleBasedVut(Level0Vut):
         self._actuator = np.zeros(corridors)
         self._a_min = np.full(corridors, US23.a_min_mps2)
         self._a_max = np.full(corridors, US23.a_max_mps2)
-
-    def parameters(self) -> Mapping[str, float]:
-        """Return the parameters of the design."""
-        return asdict(self.design)
 
     def begin(self, corridor: int, case: Case) -> None:
         """Reset the PID and the actuator of a corridor; take the limits of its scenario."""

@@ -71,6 +71,8 @@ class Vut:
     vut_type: Mapping[str, str] | None = None
     """Attributes of the SUMO vType with which SUMO itself drives; None if it does not."""
     files: tuple[Path, ...] = ()  # files of the user's that it is made of, as far as they are known
+    parameters: Mapping[str, float] | None = None
+    """Numbers that its spec may set, with their present values; None where its driver has them."""
     named_only: bool = False  # whether it may be made of unknown files besides `files`
     by_arrays: bool = False
     """Whether it is a driver of this package, which needs nothing of SUMO and takes any number

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from inspect import Parameter
 from types import MemberDescriptorType
@@ -48,7 +48,7 @@ class Parameters:
         keywords = {name: value for name, value in given.items() if name in defaults}
         attributes = {name: value for name, value in given.items() if name not in defaults}
         if attributes and inspect.isroutine(target):
-            raise _unknown(spec, next(iter(attributes)), defaults)
+            raise unknown_parameter(spec, next(iter(attributes)), defaults)
         known = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
         return cls(spec, keywords, attributes, known)
 
@@ -68,7 +68,7 @@ class Parameters:
             present = self.present(made)
             for name, value in self.attributes.items():
                 if name not in present:
-                    raise _unknown(self.spec, name, present)
+                    raise unknown_parameter(self.spec, name, present)
                 try:
                     setattr(made, name, value)
                 except Exception as error:
@@ -118,7 +118,8 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def _unknown(spec: str, name: str, known: Mapping[str, Any]) -> UserError:
+def unknown_parameter(spec: str, name: str, known: Iterable[str]) -> UserError:
+    """Return the error for a parameter of a spec that the controller does not have."""
     names = ", ".join(sorted(known))
     return UserError(
         f"--vut {spec}: it has no parameter {name!r}: "

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut
-from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
+from merge_sumo.drivers.base import Design, Driver
+from merge_sumo.drivers.gap_acceptance import ROUNDABOUT, GapAcceptanceVut
+from merge_sumo.drivers.gap_choice import HEADWAY, GapChoiceVut
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedDesign, RuleBasedVut
+from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files, hashed
@@ -28,6 +28,7 @@ from merge_sumo.vuts.frozen import FROZEN, frozen_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
 from merge_sumo.vuts.onnx import onnx_vut
+from merge_sumo.vuts.parameters import unknown_parameter
 from merge_sumo.vuts.python import installed_vut, installed_vuts, python_vut
 from merge_sumo.vuts.sumo_model import sumo_vut
 from merge_sumo.vuts.traci.vut import traci_vut
@@ -57,37 +58,68 @@ class VutKind:
 
 
 def _python_file(spec: str) -> str:
-    source = _file_before_options(spec).rpartition(":")[0]
+    source = _before_options(spec).rpartition(":")[0]
     return source if source.endswith(".py") else ""
 
 
-def _file_before_options(argument: str) -> str:
+def _before_options(argument: str) -> str:
     return argument.partition("?")[0]
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltInVut:
+    """A VUT that the package brings.
+
+    Attributes:
+        make: makes its driver for a number of corridors, by its design where it has one, by a
+            folder of networks where it is learned.
+        design: the parameters that a spec may set, with their values where it does not.
+        network: name of the network by which a learned VUT acts.
+        ramp_only: whether it cannot drive a POV.
+    """
+
+    make: Callable[..., Driver]
+    design: Design | None = None
+    network: str = ""
+    ramp_only: bool = False
+
+
+BUILT_IN_VUTS: Final[dict[str, BuiltInVut]] = {
+    "level0": BuiltInVut(Level0Vut, ramp_only=True),
+    "level1": BuiltInVut(partial(load_driver, "vut1"), network="vut1", ramp_only=True),
+    "level2": BuiltInVut(partial(load_driver, "vut2"), network="vut2", ramp_only=True),
+    **{name: BuiltInVut(RuleBasedVut, design) for name, design in DESIGNS.items()},
+    "gap": BuiltInVut(GapChoiceVut, HEADWAY, ramp_only=True),
+    "roundabout": BuiltInVut(GapAcceptanceVut, ROUNDABOUT),
+    **{name: BuiltInVut(driver) for name, driver in REFERENCES.items()},
+}
+"""The VUTs that the package brings, by name."""
+
+
+def is_built_in(spec: str) -> bool:
+    """Return whether a spec names a VUT that the package brings, with parameters or without."""
+    return _before_options(spec) in BUILT_IN_VUTS
 
 
 def _built_in_vut(spec: str, options: VutOptions) -> Vut:
     name, given = split_options(spec, spec)
-    make = built_in_vuts(options.policies)[name]
-    if given:
-        make = _with_parameters(name, given, spec)
-    return Vut(make=lambda corridors, _world: make(corridors), by_arrays=True)
+    built_in = BUILT_IN_VUTS[name]
+    known = {} if built_in.design is None else asdict(built_in.design)
+    chosen = {parameter: float(value) for parameter, value in numbers_of(given, spec).items()}
+    for parameter in chosen:
+        if parameter not in known:
+            raise unknown_parameter(spec, parameter, known)
+    arguments: tuple[Any, ...] = (options.policies,) if built_in.network else ()
+    if built_in.design is not None:
+        try:
+            arguments = (replace(built_in.design, **chosen),)
+        except UserError as error:
+            raise UserError(f"--vut {spec}: {error}") from error
 
+    def make(corridors: int, _world: World | None) -> Driver:
+        return built_in.make(corridors, *arguments)
 
-def _with_parameters(name: str, given: dict[str, str], spec: str) -> Callable[[int], Driver]:
-    """Return what makes a built-in VUT with other parameters; `UserError` for what are none."""
-    present = PARAMETERS.get(name)
-    known = [] if present is None else [field.name for field in fields(present)]
-    for option in given:
-        if option not in known:
-            has = f"choose from {', '.join(known)}" if known else "it has none"
-            raise UserError(f"--vut {spec}: {name} has no option {option!r}: {has}")
-    values = {option: float(value) for option, value in numbers_of(given, spec).items()}
-    try:
-        if isinstance(present, GapChoice):
-            return partial(GapChoiceVut, choice=replace(present, **values))
-        return partial(RuleBasedVut, design=replace(DESIGNS[name], **values))
-    except UserError as error:
-        raise UserError(f"--vut {spec}: {error}") from error
+    return Vut(make=make, by_arrays=True, parameters=known | chosen)
 
 
 PYTHON: Final = VutKind(
@@ -134,7 +166,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             no_parameters="the parameters of a network are its weights",
             prepare=onnx_vut,
             hosted=True,
-            file_of=_file_before_options,
+            file_of=_before_options,
         ),
         "fmu": VutKind(
             form="fmu:FILE[?VARIABLE=NAME&...]",
@@ -143,7 +175,7 @@ KINDS: Final[Registry[VutKind]] = Registry(
             no_parameters="the options of an FMU are the names of its variables",
             prepare=fmu_vut,
             hosted=True,
-            file_of=_file_before_options,
+            file_of=_before_options,
         ),
         FROZEN: VutKind(
             form="frozen:NAME",
@@ -160,27 +192,6 @@ KINDS: Final[Registry[VutKind]] = Registry(
     contract="a merge_sumo.vuts.registry.VutKind",
 )
 """The kinds that have a name of their own before the colon."""
-
-
-GAP: Final = "gap"
-"""The built-in VUT that chooses a gap on an acceleration lane."""
-PARAMETERS: Final[Mapping[str, GapChoice | RuleBasedDesign]] = {GAP: GapChoice(), **DESIGNS}
-"""Parameters of the built-in VUTs that have any, which a spec may set: `design2?x1_m=150`."""
-LEARNED: Final = {"level1": "vut1", "level2": "vut2"}
-"""The network of each learned VUT."""
-
-
-def built_in_vuts(policies: Path | None = None) -> dict[str, Callable[[int], Driver]]:
-    """Return the VUTs that the package brings, by name; the learned ones act by `policies`."""
-    designs = {name: partial(RuleBasedVut, design=design) for name, design in DESIGNS.items()}
-    learned = {vut: partial(load_driver, name, folder=policies) for vut, name in LEARNED.items()}
-    rules: dict[str, Callable[[int], Driver]] = {GAP: GapChoiceVut, "roundabout": GapAcceptanceVut}
-    return {"level0": Level0Vut, **learned, **designs, **rules, **REFERENCES}
-
-
-def is_built_in(spec: str) -> bool:
-    """Return whether a spec names a VUT that the package brings, with options or without."""
-    return spec.partition("?")[0] in built_in_vuts()
 
 
 @dataclass(frozen=True)
@@ -250,10 +261,9 @@ def kind_of(spec: str) -> VutKind:
     prefix, colon, _ = spec.partition(":")
     if prefix in KINDS:
         return KINDS[prefix]
-    if spec.partition("?")[0] in ("level0", GAP, *LEARNED):
-        return RAMP_ONLY
-    if is_built_in(spec):
-        return BUILT_IN
+    built_in = BUILT_IN_VUTS.get(_before_options(spec))
+    if built_in is not None:
+        return RAMP_ONLY if built_in.ramp_only else BUILT_IN
     return PYTHON if colon else INSTALLED
 
 
@@ -282,9 +292,8 @@ def parameters_of(factory: VutFactory) -> dict[str, float]:
     kind = kind_of(factory.spec)
     if kind.no_parameters:
         raise UserError(f"{factory.spec} has no parameters to change: {kind.no_parameters}")
-    if factory.vut.vut_type is not None:
-        _, given = split_options(factory.spec, factory.spec)
-        return numbers_of(given, factory.spec)
+    if factory.vut.parameters is not None:
+        return dict(factory.vut.parameters)
     with closing(factory(1)) as driver:
         return dict(driver.parameters())
 
@@ -320,7 +329,7 @@ def _without_values(spec: str) -> str:
 def _why_unknown(spec: str) -> str:
     if spec.endswith(".py"):
         return f"{spec} is a file: name a class or a function of it, {spec}:NAME"
-    names = [*built_in_vuts(), *installed_vuts()]
+    names = [*BUILT_IN_VUTS, *installed_vuts()]
     choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
     if not spec:
         return f"name the vehicle under test, as in --vut design2: {choice}"

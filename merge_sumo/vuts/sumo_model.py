@@ -9,7 +9,6 @@ to merge: the lane on which the VUT is after SUMO's step is its wish.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,7 +21,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT
-from merge_sumo.vuts.base import Vut, VutOptions, split_options
+from merge_sumo.vuts.base import Vut, VutOptions, numbers_of, split_options
+from merge_sumo.vuts.parameters import unknown_parameter
 
 SHARED_OPTIONS: Final = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),
@@ -70,32 +70,20 @@ def sumo_vut(argument: str, _options: VutOptions) -> Vut:
         raise UserError(f"--vut {spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
     own, defaults = MODELS[model]
     known = SHARED_OPTIONS | own
-    values = dict(defaults)
-    for name, text in given.items():
+    chosen = numbers_of(given, spec)
+    for name, value in chosen.items():
         if name not in known:
-            raise UserError(
-                f"--vut {spec}: {model} has no option {name!r}: choose from "
-                f"{', '.join(sorted(known))}"
-            )
-        values[name] = _number(text, name, spec)
+            raise unknown_parameter(spec, name, known)
+        if value < 0.0:
+            raise UserError(f"--vut {spec}: {name} is {value}: give a number from 0 up")
 
     def make(corridors: int, world: World | None) -> Driver:
         if world is None:
             raise UserError(f"--vut {spec} drives in a SUMO world only")
         return SumoVut(corridors, world)
 
-    vut_type = {name: f"{value:.12g}" for name, value in values.items()}
-    return Vut(make=make, vut_type={"carFollowModel": model, **vut_type})
-
-
-def _number(text: str, name: str, spec: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0.0):
-        raise UserError(f"--vut {spec}: {name} is {text!r}: give a number from 0 up")
-    return value
+    vut_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
+    return Vut(make=make, vut_type={"carFollowModel": model, **vut_type}, parameters=chosen)
 
 
 class SumoVut(Driver):

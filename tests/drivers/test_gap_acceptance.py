@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from merge_sumo.drivers.base import Scene
-from merge_sumo.drivers.gap_acceptance import ROUNDABOUT, GapAcceptanceVut, GapDesign
+from merge_sumo.drivers.gap_acceptance import ROUNDABOUT, GapAcceptanceVut
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import MergeCase
 
@@ -92,9 +91,3 @@ def test_corridors_do_not_know_of_each_other():
     both = (np.full(2, value) for value in (8.0, -50.0, 6.0))
     seen = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), x_pov_m, *both)
     assert vut.act(seen).tolist() == [1.0, 0.0]
-
-
-@pytest.mark.parametrize("value", [-1.0, float("nan"), float("inf")])
-def test_numbers_that_make_no_design_are_refused(value):
-    with pytest.raises(UserError, match=r"lead_s is .*: it must be a number from 0 up"):
-        GapDesign(line_m=7.0, lead_s=value, lag_s=2.0, brake_mps2=1.5)

@@ -9,8 +9,7 @@ import pytest
 from vut_contract import LANE, ON_LANE, begin, factory, run_on
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
-from merge_sumo.drivers.gap_choice import GapChoice, GapChoiceVut
-from merge_sumo.errors import UserError
+from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
@@ -23,7 +22,7 @@ def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scen
     return Scene(np.array([True]), np.array([9]), x, v, merged=np.array([merged]))
 
 
-def asked(x_m, v_mps, *, merged=False, choice=None, case=ON_LANE) -> tuple[float, int]:
+def asked(x_m, v_mps, *, merged=False, choice=HEADWAY, case=ON_LANE) -> tuple[float, int]:
     """Return its answer and its wish."""
     vut = GapChoiceVut(1, choice)
     begin(vut, case)
@@ -101,26 +100,6 @@ def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
         assert all(t.x_vut_m[-1] < 130.0 for t in ran), "no merge is forced"
         mean_m.append(np.mean([t.x_vut_m[-1] for t in ran]))
     assert mean_m[0] < mean_m[1]
-
-
-@pytest.mark.parametrize(
-    ("spec", "said"),
-    [
-        ("gap?headway=1", "gap has no option 'headway': choose from headway_s, brake_mps2"),
-        ("gap?headway_s=long", "headway_s is 'long': give a number"),
-        ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
-        ("gap?headway_s=nan", "headway_s is 'nan': give a number"),
-        ("gap?brake_mps2=0", "brake_mps2 is 0"),
-        ("gap?headway_s", "'headway_s' is not an option: write NAME=VALUE"),
-        ("design1?headway_s=1", "design1 has no option 'headway_s': choose from x1_m,"),
-        ("design2?x2_m=140", "x2_m is 140.0: stage 3 cannot begin before stage 2"),
-        ("level1?x=1", "level1 has no option 'x': it has none"),
-    ],
-)
-def test_what_it_has_no_option_for_is_refused_in_a_sentence(spec, said):
-    with pytest.raises(UserError, match="--vut") as refused:
-        factory(spec)
-    assert said in str(refused.value)
 
 
 def test_a_point_of_its_own_is_the_scenarios():

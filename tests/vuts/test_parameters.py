@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
 import pytest
 
-from merge_sumo.drivers.rule_based import DESIGNS
+from merge_sumo import api
+from merge_sumo.drivers.base import Design, Driver
 from merge_sumo.errors import UserError
 from merge_sumo.vuts.base import VutOptions, with_options
 from merge_sumo.vuts.host import hosted
 from merge_sumo.vuts.in_memory import keep
-from merge_sumo.vuts.registry import VutFactory, parameters_of
+from merge_sumo.vuts.registry import BUILT_IN_VUTS, BuiltInVut, VutFactory, parameters_of
 
 SOURCE = """
 class Vut:
@@ -80,21 +85,32 @@ def test_a_hosted_controller_tells_the_same(file):
 
 
 @pytest.mark.parametrize(
-    ("named", "said"),
+    ("spec", "said"),
     [
-        ("Vut?nothing=1", "it has no parameter 'nothing': choose from gain, late_m, shift"),
-        ("Vut?_hidden=1", "it has no parameter '_hidden'"),
-        ("Vut?on=1", "it has no parameter 'on'"),
-        ("Batch?corridors=3", "it has no parameter 'corridors': choose from gain"),
-        ("law?seen=1", "it has no parameter 'seen': choose from gain"),
-        ("Vut?gain=fast", "gain is 'fast': give a number"),
-        ("Vut?gain=1&gain=2", "the option gain is there twice"),
-        ("Vut?gain", "'gain' is not an option: write NAME=VALUE"),
+        ("{}:Vut?nothing=1", "it has no parameter 'nothing': choose from gain, late_m, shift"),
+        ("{}:Vut?_hidden=1", "it has no parameter '_hidden'"),
+        ("{}:Vut?on=1", "it has no parameter 'on'"),
+        ("{}:Batch?corridors=3", "it has no parameter 'corridors': choose from gain"),
+        ("{}:law?seen=1", "it has no parameter 'seen': choose from gain"),
+        ("{}:Vut?gain=fast", "gain is 'fast': give a number"),
+        ("{}:Vut?gain=1&gain=2", "the option gain is there twice"),
+        ("{}:Vut?gain", "'gain' is not an option: write NAME=VALUE"),
+        ("gap?headway=1", "it has no parameter 'headway': choose from brake_mps2, headway_s"),
+        ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
+        ("gap?headway_s=nan", "headway_s is 'nan': give a number"),
+        ("gap?brake_mps2=0", "brake_mps2 is 0"),
+        ("design1?headway_s=1", "it has no parameter 'headway_s': choose from gap_m, kd,"),
+        ("design2?x2_m=140", "x2_m is 140.0: stage 3 cannot begin before stage 2"),
+        ("roundabout?headway_s=1", "it has no parameter 'headway_s': choose from brake_mps2,"),
+        ("level1?x=1", "it has no parameter 'x': it has none"),
+        ("sumo:IDM?taw=1", "it has no parameter 'taw': choose from accel,"),
+        ("sumo:IDM?sigma=1", "it has no parameter 'sigma'"),
+        ("sumo:IDM?tau=-1", "tau is -1: give a number from 0 up"),
     ],
 )
-def test_what_is_no_parameter_is_refused_in_a_sentence(file, named, said):
+def test_what_is_no_parameter_is_refused_in_a_sentence(file, spec, said):
     with pytest.raises(UserError, match="--vut") as refused:
-        parameters(f"{file}:{named}")
+        parameters(spec.format(file))
     assert said in str(refused.value)
 
 
@@ -111,11 +127,47 @@ def test_an_object_is_copied_before_it_is_changed():
     assert vut.gain == 2.0
 
 
-def test_a_built_in_design_keeps_what_is_not_set():
-    changed = parameters("design2?gap_m=20")
-    assert changed.pop("gap_m") == 20.0
-    assert changed == {name: getattr(DESIGNS["design2"], name) for name in changed}
-    assert len(changed) == 7
+@pytest.mark.parametrize("name", [n for n, vut in BUILT_IN_VUTS.items() if vut.design])
+def test_a_built_in_vut_keeps_what_is_not_set(name):
+    known = asdict(BUILT_IN_VUTS[name].design)  # type: ignore[arg-type]
+    first = next(iter(known))
+    assert parameters(f"{name}?{first}=150") == {**known, first: 150.0}
+    VutFactory(f"{name}?{first}=150")(2).close()
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class OneBrake(Design):
+    brake_mps2: float = 3.0
+    until_s: float = 0.05
+
+
+class OneBrakeVut(Driver):
+    def __init__(self, corridors: int, design: OneBrake) -> None:
+        super().__init__(corridors)
+        self.design = design
+
+    def act(self, scene):
+        return np.where(scene.step * 0.1 < self.design.until_s, -self.design.brake_mps2, 1.0)
+
+
+def test_a_vut_that_is_registered_as_contributing_says_has_parameters(tmp_path, monkeypatch):
+    monkeypatch.setitem(BUILT_IN_VUTS, "brakes", BuiltInVut(OneBrakeVut, OneBrake()))
+    assert parameters("brakes?until_s=0.2") == {"brake_mps2": 3.0, "until_s": 0.2}
+    here: dict[str, Any] = {"workers": 1, "progress": False}
+    run = api.campaign(
+        "brakes",
+        level=0,
+        cases=4,
+        sampler="uniform",
+        fail_when="vut_max_brake_mps2 > 2.001",
+        out=tmp_path / "run",
+        **here,
+    )
+    (explained,) = api.explain(run, 0, params=["brake_mps2=0..4"]).found
+    assert explained.parameters[0].below == 2.0
+    few: dict[str, Any] = {"trials": 6, "rounds": 1, **here}
+    repaired = api.repair(run, ["brake_mps2=0..4"], out=tmp_path / "out", **few)
+    assert 0.0 <= repaired.repair.chosen.values["brake_mps2"] <= 2.001  # type: ignore[union-attr]
 
 
 def test_an_option_is_set_in_the_place_of_an_older_one():

@@ -82,13 +82,6 @@ def test_options_reach_sumo():
     [
         ("sumo:", "choose one of sumo:Krauss"),
         ("sumo:idm", "choose one of sumo:Krauss"),
-        ("sumo:IDM?taw=1", "IDM has no option 'taw'"),
-        ("sumo:IDM?sigma=1", "IDM has no option 'sigma'"),
-        ("sumo:IDM?tau", "'tau' is not an option: write NAME=VALUE"),
-        ("sumo:IDM?tau=fast", "tau is 'fast': give a number"),
-        ("sumo:IDM?tau=-1", "tau is '-1': give a number from 0 up"),
-        ("sumo:IDM?tau=nan", "tau is 'nan': give a number"),
-        ("sumo:IDM?tau=1&tau=2", "the option tau is there twice"),
     ],
 )
 def test_what_sumo_does_not_have_is_refused_in_a_sentence(spec, said):
