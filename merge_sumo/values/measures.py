@@ -8,7 +8,7 @@ report, exports and documentation show it like any other.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from traceback import extract_tb
@@ -20,8 +20,8 @@ from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.scenario import Scenario
 from merge_sumo.values.trajectory import Trajectory
 
-Further = tuple[tuple[str, float | None], ...]
-"""Values of further measures by name."""
+Further = tuple[tuple[str, float], ...]
+"""Values of further measures by name; one without a value is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +301,7 @@ def further_measures() -> dict[str, Measure]:
 def further_of(
     trajectory: Trajectory, lines: CentreLines | None, names: Iterable[str] | None = None
 ) -> Further:
-    """Return the values of further measures, all or those of some names.
+    """Measure an episode by further measures, all or those of some names.
 
     Args:
         trajectory: what happened; after an error no measure has a value.
@@ -314,7 +314,12 @@ def further_of(
     chosen = further_measures()
     if names is not None:
         chosen = {name: chosen[name] for name in names if name in chosen}
-    return tuple((name, _value(one, trajectory, lines)) for name, one in chosen.items())
+    return with_values({name: _value(one, trajectory, lines) for name, one in chosen.items()})
+
+
+def with_values(measured: Mapping[str, float | None]) -> Further:
+    """Leave out the measures that have no value."""
+    return tuple((name, value) for name, value in measured.items() if value is not None)
 
 
 def _value(measure: Measure, trajectory: Trajectory, lines: CentreLines | None) -> float | None:

@@ -29,6 +29,7 @@ from merge_sumo.values.measures import (
     Measure,
     further_measures,
     further_of,
+    with_values,
 )
 from merge_sumo.values.merge import (
     brake_after_mps2,
@@ -241,7 +242,7 @@ class Outcome:
         if self.case.draw:
             record["draw"] = self.case.draw
         record |= {name: getattr(self.measures, name) for name in measure_names}
-        record |= dict(self.measures.further)
+        record |= {name: self.measures.value(name) for name in further_measures()}
         if self.margin is not None:
             record["margin"] = self.margin
         if self.prediction is not None:
@@ -262,7 +263,7 @@ class Outcome:
         case = scenario.case_type(**coordinates, draw=known.draw, scenario=scenario)
         measures = Measures(
             **{name: getattr(known, name) for name in measure_names},
-            further=tuple((name, getattr(known, name)) for name in further_measures()),
+            further=with_values({name: getattr(known, name) for name in further_measures()}),
         )
         told = known.foretold, known.margin, known.audit
         return cls(known.index, known.batch, case, measures, *told)

@@ -102,6 +102,18 @@ def test_commands_that_read_the_campaign_know_it(folder, merge_sumo):
     assert json.loads(lines[3])["case"] == 3
 
 
+def test_records_survive_although_its_measure_has_no_value(merge_sumo):
+    """Adding a measure changes its own file alone: tests of records pass as they are."""
+    tests = PLUGIN.parent
+    said = merge_sumo(
+        *("-q", "-n", "0", "-p", "no:cacheprovider", "-k", "record or Record"),
+        *(tests / "campaigns/test_store.py", tests / "values/test_chance.py"),
+        program=("-m", "pytest"),
+    )
+    assert " passed" in said
+    assert "failed" not in said
+
+
 @pytest.mark.slow
 def test_it_keeps_the_contracts(merge_sumo):
     said = merge_sumo("-q", "-n", "0", PLUGIN, "-p", "no:cacheprovider", program=("-m", "pytest"))
