@@ -698,7 +698,7 @@ def _last_moment(outcome: Outcome, avoidance: Avoidance | None) -> Iterator[str]
         yield (
             f"The last way out closes at {measures.last_avoidable_s:.1f} s: after that neither "
             f"full braking nor full acceleration of the VUT keeps {kept}, with the POV moving as "
-            "it did."
+            "it did, and then at its last speed."
         )
     elif measures.avoidable is False:
         yield f"At no time would full braking or full acceleration of the VUT have kept {kept}."

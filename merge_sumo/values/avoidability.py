@@ -17,6 +17,10 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
     rolled out from every step of the record at once. On an acceleration lane it is about the place
     where the VUT merged. In traffic every car has to be avoided, and
     gaps between cars are left out.
+
+    Other cars move as recorded, and keep their last speed after that. The VUT moves by eq. (4), as
+    in the record: by the speed before a step, so what it decides in one moves it from the next on.
+    By the speed after the step the time would be a step later, and up to 0.5 s.
     """
     place_m = place_of_merge_m(trajectory)
     cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario

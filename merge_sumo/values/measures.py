@@ -180,8 +180,9 @@ OURS: Final = (
     _low(
         "last_avoidable_s",
         "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or full "
-        "braking, would have kept 6 m against the recorded motion of the POV and the other cars "
-        "(taken on at constant speed); None when there was no such time, and where |dx| >= 6 m",
+        "braking by eq. (4), would have kept 6 m against the recorded motion of the POV and the "
+        "other cars (taken on at their last speed); None when there was no such time, and where "
+        "|dx| >= 6 m",
         unit="s",
         label="avoidable until",
     ),

@@ -37,6 +37,7 @@ from merge_sumo.studies.counterfactuals import (
     write_avoidance,
 )
 from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
@@ -297,3 +298,32 @@ class TestItIsShown:
         a = tmp_path / "a"
         code, out, err = command_line("compare-runs", a, a, "--no-rerun")
         assert out.count("would have been avoided by a careful and competent driver") == 2
+
+
+ESCAPES = """
+class Escapes:
+    def __init__(self, until_s, a_mps2):
+        self.until_s, self.a_mps2 = until_s, a_mps2
+
+    def act(self, seen):
+        level0 = min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
+        return level0 if seen.t_s < self.until_s - 0.05 else self.a_mps2
+"""
+
+
+@pytest.mark.parametrize("dx_m", [-5.0, 0.0, 5.0])
+def test_after_the_last_way_out_neither_braking_nor_acceleration_helps_in_sumo(tmp_path, dx_m):
+    """Eq. (4) moves a car by its speed before the step, so there is no way out a step later."""
+    (tmp_path / "vut.py").write_text(ESCAPES)
+    case = MergeCase(level=0, x_pov0_m=-240.0, v_pov0_mps=30.0, scenario=US23)
+    first = run_cases(plan_for("level0"), [case])[0]
+    case = replace(case, x_pov0_m=-240.0 - first.measures.dx_m + dx_m)
+    measures = run_cases(plan_for("level0"), [case])[0].measures
+    assert measures.dx_m == pytest.approx(dx_m)
+    for late_s, avoids in ((0.0, True), (0.1, False), (0.2, False), (0.5, False)):
+        until_s = measures.last_avoidable_s + late_s
+        ends = [
+            run_cases(plan_for(f"{tmp_path}/vut.py:Escapes?until_s={until_s}&a_mps2={a}"), [case])
+            for a in (2, -4)
+        ]
+        assert any(not results[0].measures.is_close for results in ends) == avoids

@@ -377,7 +377,7 @@ def test_sentences_by_hand(made):
         "and 0.10 m/s slower.",
         "The very same start passes at level 1, and does not at level 0.",
         "The last way out closes at 5.2 s: after that neither full braking nor full acceleration "
-        "of the VUT keeps 6 m at M, with the POV moving as it did.",
+        "of the VUT keeps 6 m at M, with the POV moving as it did, and then at its last speed.",
         "The fuzzy safety model can take over until 4.9 s and avoid it.",
     ]
 
