@@ -52,7 +52,6 @@ from merge_sumo.api.results import (
     CaseRun,
     CertificateResult,
     CrosscheckResult,
-    ExplanationResult,
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
@@ -128,7 +127,6 @@ from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.entrants import LIMIT_S, check_spec
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
-from merge_sumo.studies.parameter_ranges import Range, default_ranges
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
 from merge_sumo.studies.truth import Repeats, Truth
@@ -157,6 +155,7 @@ from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.vuts.onnx_export import export_onnx
+from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.python import SeenBatch, installed_vuts
 from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS, PYTHON
 
@@ -318,7 +317,7 @@ def _write_findings(
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
         note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
-    explanation.note_explanations(done, plan, workers=opened, check=checks)
+    explanation.note_explanation(done, plan, workers=opened, check=checks)
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit. More workers than cores
     # would learn each surrogate more often than that saves time.
@@ -1207,18 +1206,17 @@ def _fresh_campaign(settings: CampaignSettings, folder: Path, runner: Runner) ->
 
 def explain(
     run: AnyRun,
-    indices: Iterable[int] | int = (),
+    case: int | None = None,
     *,
     params: Iterable[str] = (),
     **given: Unpack[RerunKeywords],
-) -> ExplanationResult:
-    """Find the smallest changes with which failures pass; the same as `merge-sumo explain`.
+) -> explanation.ExplanationResult:
+    """Find the smallest changes with which a failure passes; the same as `merge-sumo explain`.
 
     Args:
         run: the campaign, or its folder, into which `explanations.jsonl` is written.
-        indices: its failures; the ten that the report lists by default.
-        params: parameters of the controller with the ranges that are searched, "headway_s=0.5..3";
-            by default those of a VUT of this package, from half of today's value to double.
+        case: index of the failure; the worst by default.
+        params: parameters of the controller with the ranges that are searched, "headway_s=0.5..3".
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """
@@ -1226,12 +1224,10 @@ def explain(
     before = _opened(run).run
     target = before.folder / explanation.EXPLANATIONS
     check_own(target)
-    chosen = explanation.listed_failures(before, _listed(indices))
-    asked = tuple(map(Range.parsed, params))
-    with _study_of(before, given, "explained", len(chosen), "failures", engine=None) as study:
-        ranges = asked or default_ranges(study.plan.vut)
-        found = explanation.explain(study, chosen, ranges=ranges)
-    return ExplanationResult(before, tuple(found), target)
+    failure, ranges = explanation.failure_of(before, case), tuple(map(Range.parsed, params))
+    with _study_of(before, given, "explained", 1, "failures", engine=None) as study:
+        found = explanation.explain(study, failure, ranges)
+    return explanation.ExplanationResult(before, found, target)
 
 
 def reproduce(

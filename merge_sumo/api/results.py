@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from merge_sumo.analysis.chance import ChanceSummary, chance_in
-from merge_sumo.analysis.coordinates import coordinates, described
+from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
@@ -36,7 +36,6 @@ from merge_sumo.reports.version_pages import AGAINST_PAGE
 from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
-from merge_sumo.studies.explanation import Explanation, changed, in_sentences
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
 from merge_sumo.studies.stratified import Estimate
@@ -824,54 +823,6 @@ def _verification(found: Repair) -> list[str]:
         return []
     broke = [f"{counted(found.broke, 'case')} fail that passed"] if found.broke else []
     return [f"not verified: {sentence}" for sentence in (*broke, *compared.worse(0.0))]
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class ExplanationResult(Result):
-    """The smallest changes with which failures of a campaign pass.
-
-    Attributes:
-        run: the campaign.
-        found: an `Explanation` of each failure.
-        file: file that was written.
-    """
-
-    run: Run
-    found: tuple[Explanation, ...]
-    file: Path
-
-    def sentences(self) -> dict[int, list[str]]:
-        """Return what is said of each failure, by its index."""
-        avoidance = read_avoidance(self.run)
-        return {
-            one.index: in_sentences(one, self.run.outcome(one.index), avoidance.get(one.index))
-            for one in self.found
-        }
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        said = self.sentences()
-        failures = [{**to_plain(one), "sentences": said[one.index]} for one in self.found]
-        return {"failures": failures, "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return the sentences of each failure, and a command that runs the nearest start."""
-        lines, folder = [], quoted(self.run.folder)
-        said = self.sentences()
-        for one in self.found:
-            case = self.run.outcome(one.index).case
-            lines.append(f"case {one.index}, POV level {level_name(case.level)}: {described(case)}")
-            lines += [f"  {sentence}" for sentence in said[one.index]]
-            if one.together:
-                near = changed(case, one.together)
-                at = " ".join(f"--at {name}={getattr(near, name)!r}" for name in one.together)
-                lines.append(f"  look at it: merge-sumo run --case {folder} {one.index} {at}")
-        cases = counted(sum(one.cases for one in self.found), "case")
-        return [
-            *lines,
-            f"ran: {cases}; written: {self.file}",
-            f"in the report: merge-sumo report {folder}",
-        ]
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

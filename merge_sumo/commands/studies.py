@@ -324,8 +324,8 @@ def explain(
     given: Given,
     run: RunArgument,
     case: Annotated[
-        list[int] | None,
-        typer.Argument(help="Indices of failures in outcomes.jsonl; ten if left out."),
+        int | None,
+        typer.Argument(help="Index of the failure in outcomes.jsonl; the worst if left out."),
     ] = None,
     param: Annotated[
         list[str] | None,
@@ -333,22 +333,21 @@ def explain(
             metavar="NAME=LOW..HIGH",
             help="A parameter of the controller, and the range in which the nearest value that "
             "passes is searched. May be given several times.",
-            show_default="those of a VUT of this package, from half of today's value to double",
         ),
     ] = None,
 ) -> None:
-    """Say why failures fail: the smallest changes with which they pass.
+    """Say why a failure fails: the smallest change of one thing with which it passes.
 
-    Each coordinate of the start by itself, all of them together, other POVs in the very same start,
-    and each parameter of the controller: such cases run, and what is said of one runs twice. A
-    campaign does this, but for the parameters, for the ten failures that its report lists if the
-    VUT is of this package; `report` shows the others afterwards, too.
+    Each coordinate of the start, psi, the level of the POV, and each parameter that is named: cases
+    with other values run, and what is said of one runs twice. A campaign does this, but for the
+    parameters, for its worst failure if the VUT is of this package; `report` shows all that were
+    explained.
 
     Example:  merge-sumo explain runs/design1
     """
     from merge_sumo import api
 
-    given.print(api.explain(run, case or (), params=param or (), **given.written))
+    given.print(api.explain(run, case, params=param or (), **given.written))
 
 
 @app.verb(

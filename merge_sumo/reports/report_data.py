@@ -16,8 +16,7 @@ from merge_sumo.analysis.verdict import shortened
 from merge_sumo.reports.player import motion_row, packed, player_data
 from merge_sumo.reports.report_maps import maps_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
-from merge_sumo.studies.explanation import in_sentences
-from merge_sumo.studies.parameter_ranges import Range
+from merge_sumo.studies.explanation import in_words, name_and_unit
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import RunsOfCase
@@ -159,20 +158,22 @@ def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
 
 
 def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:
-    """Return by index the sentences on a failure, and its changes by coordinate and parameter."""
+    """Return by index the words on a failure, and its axes with a title each."""
     found = {}
     for o in facts.shown:
         known = facts.explanations.get(o.index)
         if known is not None:
+            titles = [
+                *(name_and_unit(o.case, axis.name) for axis in known.start),
+                *((f"vut: {axis.name}", "") for axis in known.parameters),
+            ]
             found[o.index] = {
-                "sentences": in_sentences(known, o, facts.avoidance.get(o.index)),
-                "alone": {
-                    one.field: [one.lowest, one.below, one.above, one.highest]
-                    for one in known.alone
-                },
-                "parameters": [
-                    {**to_plain(one), "digits": max(0, Range(one.name, one.low, one.high).digits)}
-                    for one in known.parameters
+                "words": list(in_words(known, o, facts.avoidance.get(o.index))),
+                "axes": [
+                    {**to_plain(axis), "name": name, "unit": unit}
+                    for (name, unit), axis in zip(
+                        titles, (*known.start, *known.parameters), strict=True
+                    )
                 ],
             }
     return found

@@ -1,18 +1,13 @@
-"""Why a case fails: the smallest changes of its start, and other POVs, with which it passes.
+"""Why a case fails: the smallest change of one thing with which it passes.
 
-Cases that differ from a failure in one thing run again. A change is a whole number of units of the
-last digit with which its coordinate is written, so that what a sentence says has run as it is said.
+One thing changes, all others stay: a coordinate of the start, psi, a parameter of the VUT that is
+named, or the level of the POV. Values are whole numbers of their last digit. From the value of the
+case on values of a grid run, to both sides, until one passes or the range ends; between that and
+the value before it the middle runs, and so on. Verdicts are not monotone: a pass between two values
+of the grid is missed, so the step of the grid is recorded.
 
-- *Alone*: one coordinate moves, to both sides, on a grid over the pool; between the last value of
-  the grid that does not pass and the first that does, every unit runs. Verdicts are not monotone:
-  a pass between two values of the grid is missed, so the step of the grid is recorded.
-- *Together*: all coordinates move. The nearest pass in the unit cube is searched for in balls that
-  shrink to it, and near what was found: no proof that nothing is nearer.
-- *Other POVs*: the same start with each other level, and at level 2 with values of psi.
-- *Parameters* of the controller, one at a time: see `parameter_changes`.
-
-A case passes where it has a verdict and does not fail. What is said of a case runs a second time,
-in SUMO.
+A case passes where it has a verdict and does not fail; a value that the controller refuses does not
+pass. What is said of a case runs a second time, in SUMO.
 
 explanations.jsonl      in the folder of a campaign: one line per explained failure, in the order of
                         cases
@@ -24,670 +19,424 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
-from typing import Annotated, Final
+from pathlib import Path
+from typing import Annotated, Any, Final
 
-import msgspec
-import numpy as np
 from msgspec import Meta
-from numpy.typing import NDArray
 
-from merge_sumo.analysis.coordinates import Coordinate, coordinates
-from merge_sumo.campaigns.store import Run, failures, spread_failures
-from merge_sumo.engine.evaluate import evaluate, workers_or_here
+from merge_sumo.analysis.coordinates import coordinates, described
+from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.studies.counterfactuals import Avoidance
-from merge_sumo.studies.parameter_changes import (
-    ParameterChange,
-    in_words,
-    parameter_changes,
-    pass_of,
-)
-from merge_sumo.studies.parameter_ranges import Range, check_names, todays_values
+from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import Record, read_indexed, to_plain
+from merge_sumo.system.printable import quoted
+from merge_sumo.system.records import Record, read_indexed, replaced, to_plain
 from merge_sumo.system.suggestions import either
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import OWN, SVO, level_name
+from merge_sumo.values.case import Case
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.vuts.parameters import Range, spec_with
+from merge_sumo.vuts.registry import VutFactory, values_of
 
 EXPLANATIONS: Final = "explanations.jsonl"
-LISTED: Final = 10
-"""Failures that are explained where nobody names any."""
-STEPS: Final = 160
-"""Values of the grid over the range of a coordinate: 1 m and .06 m/s in the pool of the paper."""
-PSI_DIGITS: Final = 1
-"""Digits of the values of psi with which a POV of level 2 takes the place of another."""
-FIRST_POINTS: Final = 128
-POINTS: Final = 48
-"""Points of the first ball and of each later one."""
-ROUNDS: Final = 6
-"""Balls at most. Chosen with `POINTS`, not tuned."""
-SHARES: Final = (0.3, 0.5, 0.65, 0.75, 0.85, 0.9, 0.95)
-"""Shares of a change that passes, of all coordinates and of each, that are tried in its place."""
-NEAR: Final = 0.15
-"""Standard deviation of points about a change that passes, as a share of its length."""
+START_STEPS: Final = 160
+"""Values of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
+PARAMETER_STEPS: Final = 40
+"""Values of the grid over the range of a parameter, each of which is another VUT."""
+BLOCK: Final = 8
+"""Values of a side of the grid that run at a time, so that workers have something to do."""
+ROUNDED: Final = 1e-6
+"""Units that a value is off at most where it is a whole number of them."""
+PSI: Final = 0.0
+"""Orientation of a POV that becomes one of level 2."""
 
-Nonnegative = Annotated[float, Meta(ge=0.0)]
-Nonpositive = Annotated[float, Meta(le=0.0)]
-Units = NDArray[np.int64]
-"""Changes of all coordinates, (d,), in units of their last digits."""
+Trial = tuple[str, Case]
+"""The spec of a VUT, and a case that it drives."""
 
 
-class Alone(Record, frozen=True):
-    """What one coordinate by itself does to a failure; values are changes of it.
+class Axis(Record, frozen=True):
+    """Values of one thing, and the nearest to that of a failure with which it passes.
 
     Attributes:
-        field: the coordinate, as a field of the case.
+        name: a coordinate, as a field of the case, or a parameter of the VUT.
+        value: its value in the failure.
+        low: the least value of the range.
+        high: the largest value.
         step: step of the grid.
-        lowest: the largest decrease that was tried: the pool ends there.
-        highest: the largest increase.
-        below: the smallest decrease that was found to pass; None without one.
-        above: the smallest increase.
+        digits: digits behind the point of the values that were tried.
+        below: the nearest value under the failure's that passes; None where none was found.
+        above: the nearest value over it.
     """
 
-    field: str
-    step: Nonnegative
-    lowest: Nonpositive
-    highest: Nonnegative
-    below: Nonpositive | None = None
-    above: Nonnegative | None = None
+    name: Annotated[str, Meta(min_length=1, max_length=100)]
+    value: float
+    low: float
+    high: float
+    step: float
+    digits: Annotated[int, Meta(ge=0, le=100)]
+    below: float | None = None
+    above: float | None = None
 
     @property
     def passing(self) -> tuple[float, ...]:
-        """The changes that pass."""
-        return tuple(change for change in (self.below, self.above) if change is not None)
+        """The nearest values that pass, the smallest change first."""
+        found = (value for value in (self.below, self.above) if value is not None)
+        return tuple(sorted(found, key=lambda value: abs(value - self.value)))
+
+    def share(self, value: float) -> float:
+        """Return the change to a value as a share of the range."""
+        return abs(value - self.value) / (self.high - self.low)
+
+    @property
+    def _scale(self) -> float:
+        """Units of the last digit in 1."""
+        return float(10.0**self.digits)
+
+    def nearer(self, value: float) -> float | None:
+        """Return the value before one, seen from the failure's; None where there is none."""
+        sign = 1 if value > self.value else -1
+        before = (round(value * self._scale) - sign) / self._scale
+        return before if (before - self.value) * sign > 0.0 else None
+
+    def side(self, sign: int) -> Side:
+        """Search one side of the failure's value for the first that passes."""
+        at, end = (v * self._scale for v in (self.value, self.high if sign > 0 else self.low))
+        if sign > 0:
+            first, last = math.floor(at + ROUNDED) + 1, math.floor(end + ROUNDED)
+        else:
+            first, last = math.ceil(at - ROUNDED) - 1, math.ceil(end - ROUNDED)
+        if (last - first) * sign < 0:
+            return None
+        stride = max(1, round(self.step * self._scale))
+        fails = first - sign
+        grid = [*range(fails + sign * stride, last, sign * stride), last]
+        for begin in range(0, len(grid), BLOCK):
+            block = grid[begin : begin + BLOCK]
+            for units, passes in zip(block, (yield [u / self._scale for u in block]), strict=True):
+                if passes:
+                    return (yield from self._between(fails, units))
+                fails = units
+        return None
+
+    def _between(self, fails: int, passes: int) -> Side:
+        while abs(passes - fails) > 1:
+            middle = (fails + passes) // 2
+            (passed,) = yield [middle / self._scale]
+            fails, passes = (fails, middle) if passed else (middle, passes)
+        return passes / self._scale
 
 
-class OtherPov(Record, frozen=True):
-    """What becomes of the same start with another POV.
-
-    Attributes:
-        level: its level.
-        svo_rad: its social value orientation, at level 2.
-        passes: whether the case passes.
-    """
-
-    level: Annotated[int, Meta(ge=0, le=OWN)]
-    svo_rad: Nonnegative | None
-    passes: bool
+Side = Generator[list[float], list[bool], float | None]
+"""Asks for values and is told whether each passes; returns the first that does."""
 
 
 class Explanation(Record, frozen=True):
-    """The smallest changes that were found to make a failure pass.
+    """The smallest changes of one thing that were found to make a failure pass.
 
     Attributes:
         index: of the case in its campaign.
-        alone: by coordinate, in the pool's order.
-        together: the nearest start that was found to pass, as changes by coordinate; distances are
-            those of the unit cube. None where no start passes that was tried.
-        povs: the POVs that were tried in the place of the case's.
-        cases: cases that ran for it.
-        parameters: by parameter of the controller, where these were searched.
+        start: its coordinates, with psi at level 2, in the pool's order.
+        levels: by name of another level of the POV, whether the case passes there.
+        parameters: the parameters of the VUT that were named.
     """
 
     index: Annotated[int, Meta(ge=0)]
-    alone: tuple[Alone, ...]
-    together: dict[str, float] | None
-    povs: tuple[OtherPov, ...]
-    cases: Annotated[int, Meta(ge=0)]
-    parameters: tuple[ParameterChange, ...] = ()
+    start: tuple[Axis, ...]
+    levels: dict[str, bool]
+    parameters: tuple[Axis, ...] = ()
+
+    @property
+    def nearest_start(self) -> tuple[str, float] | None:
+        """The coordinate and the value of the smallest change of the start that passes."""
+        found = [(axis.share(axis.passing[0]), axis) for axis in self.start if axis.passing]
+        axis = min(found, key=lambda pair: pair[0])[1] if found else None
+        return None if axis is None else (axis.name, axis.passing[0])
 
 
-def changed(case: Case, changes: Mapping[str, float]) -> Case:
-    """Return a case with some of its coordinates changed by as much as is said."""
-    return replace(case, **{name: getattr(case, name) + by for name, by in changes.items()})
+@dataclass(frozen=True, slots=True, repr=False)
+class ExplanationResult(Result):
+    """The smallest changes with which a failure of a campaign passes.
+
+    Attributes:
+        run: the campaign.
+        found: what was found.
+        file: file that was written.
+    """
+
+    run: Run
+    found: Explanation
+    file: Path
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {**to_plain(self.found), "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return the failure, its changes, and a command that runs the smallest."""
+        outcome, folder = self.run.outcome(self.found.index), quoted(self.run.folder)
+        avoidance = read_avoidance(self.run).get(self.found.index)
+        words = in_words(self.found, outcome, avoidance)
+        lines = [f"case {outcome.index}, POV level {level_name(outcome.case.level)}: "]
+        lines[0] += described(outcome.case)
+        lines += [f"  {sentence}" for sentence in words]
+        if self.found.nearest_start is not None:
+            name, value = self.found.nearest_start
+            at = f"--at {name}={value!r}"
+            lines.append(f"look at it: merge-sumo run --case {folder} {outcome.index} {at}")
+        return [*lines, f"written: {self.file}; in the report: merge-sumo report {folder}"]
 
 
 # The file of a campaign.
 
 
 def read_explanations(run: Run) -> dict[int, Explanation]:
-    """Return by index what the folder of a campaign says of its failures.
+    """Read what the folder of a campaign says of its failures, by index.
 
     Raises `UserError` for a line that is not of one of them.
     """
-    cases = {outcome.index: outcome.case for outcome in run.outcomes if outcome.failed}
-    path = run.folder / EXPLANATIONS
-    known = read_indexed(path, Explanation, cases)
-    for index, one in known.items():
-        case = cases[index]
-        fields = [d.field for d in case.scenario.dimensions(case.level)]
-        if [alone.field for alone in one.alone] != fields or not {*(one.together or ())} <= {
-            *fields
-        }:
-            raise UserError(f"{path} is not as it was written: case {index} has other coordinates")
-        if not all(change.low < change.high for change in one.parameters):
-            raise UserError(f"{path} is not as it was written: case {index} has an empty range")
-    return known
+    failing = {outcome.index for outcome in run.outcomes if outcome.failed}
+    return read_indexed(run.folder / EXPLANATIONS, Explanation, failing)
 
 
-def _write(run: Run, found: Iterable[Explanation]) -> None:
-    """Write explanations into the folder of a campaign, beside those of other cases."""
-    known = {**read_explanations(run), **{one.index: one for one in found}}
+def _write(run: Run, found: Explanation) -> None:
+    """Write an explanation into the folder of a campaign, beside those of other cases."""
+    known = {**read_explanations(run), found.index: found}
     lines = (json.dumps(to_plain(known[index]), allow_nan=False) for index in sorted(known))
     replace_own(run.folder / EXPLANATIONS, "".join(f"{line}\n" for line in lines).encode())
 
 
-def listed_failures(run: Run, indices: Sequence[int] = ()) -> list[Outcome]:
-    """Return failures of a run by their indices, by default ten: the worst of each region first.
+def failure_of(run: Run, index: int | None) -> Outcome:
+    """Find a failure of a run by its index, by default the worst.
 
     Raises `UserError` for a case that is there no more, or did not fail.
     """
-    if not indices:
-        return spread_failures(run.cases)[:LISTED]
-    chosen = [run.outcome(index) for index in dict.fromkeys(indices)]
-    for outcome in chosen:
+    worst = failures(run.cases)[:1]
+    if index is not None:
+        outcome = run.outcome(index)
         if not outcome.failed:
-            worst = [o.index for o in failures(run.cases)[:1]]
-            such = f", such as {worst[0]}" if worst else ", and this campaign has none"
-            raise UserError(f"case {outcome.index} did not fail: name a failure{such}")
-    return chosen
+            such = "".join(f", such as {o.index}" for o in worst)
+            raise UserError(f"case {index} did not fail: name a failure{such}")
+        return outcome
+    if not worst:
+        raise UserError(f"{run.folder} has no failure: nothing can be explained")
+    return worst[0]
 
 
-def note_explanations(
+# The search.
+
+
+def note_explanation(
     run: Run,
     plan: SimulationPlan,
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> None:
-    """Explain the listed failures of a campaign that has just ended, where that takes no SUMO.
+    """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
     Nothing is written for drivers that need SUMO, nor where the engines differ.
     """
-    if plan.needs_sumo is not None:
+    worst = failures(run.cases)[:1]
+    if plan.needs_sumo is not None or not worst:
         return
     try:
-        found = _found(plan.with_engine(None), listed_failures(run), workers, check)
+        found = _Search(plan.with_engine(None), worst[0], workers=workers).found(check)
     except UserError:
         return
-    if found:
-        _write(run, found)
+    _write(run, found)
 
 
-def explain(
-    study: RunStudy, chosen: Sequence[Outcome], *, ranges: Sequence[Range] = ()
-) -> list[Explanation]:
-    """Explain failures of a campaign, and write that into its folder.
+def explain(study: RunStudy, outcome: Outcome, ranges: Sequence[Range] = ()) -> Explanation:
+    """Explain a failure of a campaign, and write that into its folder.
 
     Args:
-        study: the campaign, and how its cases run; it is told how many failures have just been
-            explained, which are in the folder by then.
-        chosen: the failures.
-        ranges: parameters of the controller that are searched, too, with their ranges.
+        study: the campaign, and how its cases run.
+        outcome: the failure.
+        ranges: parameters of the VUT that are searched, too.
 
     Raises:
-        UserError: for a campaign with a net or policies of another day, without a failure, for a
-            parameter that the controller does not have, and where a case that is run a second time
-            ends otherwise.
+        UserError: for a campaign with a net or policies of another day, for a parameter that the
+            VUT does not have, and where a case that runs a second time ends otherwise.
     """
     study.check_same_system()
-    run, plan = study.run, study.plan
-    if not chosen:
-        raise UserError(f"{run.folder} has no failure: nothing can be explained")
-    check_names(ranges)
-    todays_values(plan.vut, ranges)
-    # Without SUMO many cases at a time cost little; with it, each failure is kept as it is done.
-    size = len(chosen) if plan.engine is Engine.KINEMATIC else 1
-    found: list[Explanation] = []
     with workers_or_here(study.workers) as opened:
-        for first in range(0, len(chosen), size):
-            part = chosen[first : first + size]
-            some = _with_parameters(plan, part, _found(plan, part, opened), ranges, opened)
-            _write(run, some)
-            found += some
-            study.on_cases(len(some))
+        found = _Search(study.plan, outcome, ranges, opened).found()
+    _write(study.run, found)
+    study.on_cases(1)
     return found
 
 
-def _found(
-    plan: SimulationPlan,
-    chosen: Sequence[Outcome],
-    workers: Workers | None,
-    check: Callable[[], None] = lambda: None,
-) -> list[Explanation]:
-    """Return the explanations of failures, each claim of which SUMO has confirmed."""
-    searches = {outcome.index: _search(outcome, plan.povs.levels) for outcome in chosen}
-    found: list[Explanation] = []
-    answers: dict[int, list[bool]] = {}
-    # All searches take a step at a time: so each step is one evaluation.
-    while searches:
-        asked: dict[int, list[Case]] = {}
-        for index, search in list(searches.items()):
-            try:
-                asked[index] = search.send(answers[index]) if answers else next(search)
-            except StopIteration as end:
-                found.append(end.value)
-                del searches[index]
-        answers = _by_index(
-            asked, _passes(plan, [c for some in asked.values() for c in some], workers)
-        )
-        check()
-    _confirm(plan, chosen, found, workers)
-    return found
+class _Search:
+    """Runs a failure with other values."""
 
-
-def _with_parameters(
-    plan: SimulationPlan,
-    chosen: Sequence[Outcome],
-    found: Sequence[Explanation],
-    ranges: Sequence[Range],
-    workers: Workers | None,
-) -> list[Explanation]:
-    """Return explanations with the smallest change of each parameter."""
-    if not ranges:
-        return list(found)
-    cases = {outcome.index: outcome.case for outcome in chosen}
-    changes, counts = parameter_changes(plan, cases, ranges, workers)
-    return [
-        msgspec.structs.replace(
-            one, parameters=changes[one.index], cases=one.cases + counts[one.index]
-        )
-        for one in found
-    ]
-
-
-def _by_index(asked: Mapping[int, Sequence[Case]], passes: Sequence[bool]) -> dict[int, list[bool]]:
-    answers, rest = {}, iter(passes)
-    for index, some in asked.items():
-        answers[index] = [next(rest) for _ in some]
-    return answers
-
-
-def _confirm(
-    plan: SimulationPlan,
-    chosen: Sequence[Outcome],
-    found: Sequence[Explanation],
-    workers: Workers | None,
-) -> None:
-    """Raise `UserError` where a case of which something is said ends otherwise in SUMO."""
-    cases = {outcome.index: outcome.case for outcome in chosen}
-    said = [(one.index, *claim) for one in found for claim in claims(one, cases[one.index])]
-    passes = _passes(replace(plan, engine=Engine.SUMO), [case for _, case, _ in said], workers)
-    for (index, case, expected), passed in zip(said, passes, strict=True):
-        if passed != expected:
-            if case == cases[index]:
-                raise _other_vut(index)
-            what = "passes" if passed else "does not pass"
-            raise UserError(
-                f"a case near case {index} {what} when it runs a second time: the VUT does not "
-                "repeat itself, and nothing can be said of its changes"
-            )
-
-
-def _other_vut(index: int) -> UserError:
-    return UserError(
-        f"case {index} passes now: the VUT is another than that of the campaign, or does not "
-        "repeat itself, and nothing can be said of its changes"
-    )
-
-
-def _passes(plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None) -> list[bool]:
-    """Return of each case whether it passes."""
-    if not cases:
-        return []
-    return [passed for _, passed in sorted(evaluate(plan, cases, workers, keep=pass_of))]
-
-
-def claims(explanation: Explanation, case: Case) -> Iterator[tuple[Case, bool]]:
-    """Yield the cases of which sentences say something, and whether they pass.
-
-    The case itself; each change that passes, and of one coordinate the change one unit smaller; the
-    other POVs, of those that differ in psi alone the ends of what passes and of what does not.
-    """
-    yield case, False
-    for alone, axis in zip(explanation.alone, _axes(case), strict=True):
-        for change in alone.passing:
-            yield changed(case, {alone.field: change}), True
-            nearer = axis.change(axis.units(change) - (1 if change > 0 else -1))
-            yield changed(case, {alone.field: nearer}), False
-    if explanation.together:
-        yield changed(case, explanation.together), True
-    for _, run in groupby(explanation.povs, key=lambda pov: (pov.level, pov.passes)):
-        same = list(run)
-        for pov in (same[0], same[-1])[: len(same)]:
-            yield replace(case, level=pov.level, svo_rad=pov.svo_rad), pov.passes
-
-
-# The search.
-
-
-@dataclass(frozen=True, slots=True)
-class _Axis:
-    """A coordinate of a failure, in units of the last digit with which it is written.
-
-    Attributes:
-        coordinate: the coordinate.
-        low: largest decrease within the pool, in units; 0 or less.
-        high: largest increase.
-    """
-
-    coordinate: Coordinate
-    low: int
-    high: int
-
-    @property
-    def unit(self) -> float:
-        return float(10.0**-self.coordinate.digits)
-
-    @property
-    def span(self) -> float:
-        """Width of the pool."""
-        return self.coordinate.dimension.high - self.coordinate.dimension.low
-
-    @property
-    def stride(self) -> int:
-        """Units from one value of the grid to the next."""
-        return max(1, round(self.span / self.unit / STEPS))
-
-    def change(self, units: float) -> float:
-        return round(units * self.unit, self.coordinate.digits) + 0.0
-
-    def units(self, change: float) -> int:
-        return round(change / self.unit)
-
-    def grid(self, sign: int) -> list[int]:
-        """Return the values of the grid on one side, from the case on."""
-        end = self.high if sign > 0 else -self.low
-        steps = [*range(self.stride, end + 1, self.stride)]
-        if end and (not steps or steps[-1] != end):
-            steps.append(end)
-        return [sign * step for step in steps]
-
-
-def _axes(case: Case) -> list[_Axis]:
-    axes = []
-    for one in coordinates(case.scenario, (case.level,)):
-        unit, value = 10.0**-one.digits, getattr(case, one.field)
-        high = one.dimension.high
-        if one.field == SVO.field:
-            high = math.nextafter(high, 0.0)
-        # A case beside the pool has no value on that side.
-        low_units = min(0, math.ceil((one.dimension.low - value) / unit))
-        axes.append(_Axis(one, low_units, max(0, math.floor((high - value) / unit))))
-    return axes
-
-
-Search = Generator[list[Case], list[bool], Explanation]
-"""Asks for cases, and is told of each whether it passes."""
-
-
-def _search(outcome: Outcome, levels: Sequence[int]) -> Search:
-    """Search for the changes with which a failure passes."""
-    case, axes = outcome.case, _axes(outcome.case)
-    known = _Known(case, axes)
-    povs = list(_other_povs(case.level, levels))
-    others = [replace(case, level=level, svo_rad=svo_rad) for level, svo_rad in povs]
-    sides = [(axis, sign) for axis in range(len(axes)) for sign in (-1, 1)]
-    grids = [known.along(axis, axes[axis].grid(sign)) for axis, sign in sides]
-    still, *passes = yield [case, *others, *known.cases(grids)]
-    if still:
-        raise _other_vut(outcome.index)
-    known.tell(grids, passes[len(others) :])
-    between = [known.along(axis, known.gap(axis, sign)) for axis, sign in sides]
-    wanted = [*between, known.ball(FIRST_POINTS)]
-    known.tell(wanted, (yield known.cases(wanted)))
-    for _ in range(ROUNDS):
-        before = known.nearest
-        near = [known.ball(POINTS), known.smaller()]
-        told = yield known.cases(near)
-        known.tell(near, told)
-        if known.nearest is None or (before is not None and (known.nearest == before).all()):
-            break
-    # A pass that a ball found on an axis may have neighbours that did not run.
-    while gaps := [known.along(axis, known.gap(axis, sign)) for axis, sign in sides]:
-        if not any(gaps):
-            break
-        known.tell(gaps, (yield known.cases(gaps)))
-    alone = tuple(_alone(known, axis) for axis in range(len(axes)))
-    together = known.nearest
-    return Explanation(
-        index=outcome.index,
-        alone=alone,
-        together=None if together is None else known.changes(together),
-        povs=tuple(
-            OtherPov(level, svo_rad, passed)
-            for (level, svo_rad), passed in zip(povs, passes, strict=False)
-        ),
-        cases=1 + len(known.verdicts) + len(others),
-    )
-
-
-def _other_povs(level: int, levels: Sequence[int]) -> Iterator[tuple[int, float | None]]:
-    """Yield level and psi of the POVs that take the place of one of a level."""
-    for other in levels:
-        if other == level:
-            continue
-        if other != 2:
-            yield other, None
-            continue
-        step = 10.0**-PSI_DIGITS
-        for number in range(math.ceil(SVO.high / step)):
-            yield other, round(number * step, PSI_DIGITS)
-
-
-def _alone(known: _Known, axis: int) -> Alone:
-    """Return what is known of one coordinate by itself."""
-    one = known.axes[axis]
-    below, above = (known.first_pass(axis, sign) for sign in (-1, 1))
-    return Alone(
-        field=one.coordinate.field,
-        step=one.change(one.stride),
-        lowest=one.change(one.low),
-        highest=one.change(one.high),
-        below=None if below is None else one.change(below),
-        above=None if above is None else one.change(above),
-    )
-
-
-class _Known:
-    """The changes of a failure that ran, and the nearest of those that pass."""
-
-    def __init__(self, case: Case, axes: Sequence[_Axis]) -> None:
-        """Take the failure and its coordinates."""
-        self.axes = axes
-        self.verdicts: dict[tuple[int, ...], bool] = {}
-        """Whether a change passes."""
-        self.nearest: Units | None = None
-        self._case = case
-        self._low = np.array([axis.low for axis in axes])
-        self._high = np.array([axis.high for axis in axes])
-        self._share = np.array([axis.unit / axis.span for axis in axes])
-        """Length of a unit in the unit cube, (d,)."""
-        self._rng = np.random.default_rng(case.seed)
-
-    def along(self, axis: int, values: Iterable[int]) -> list[Units]:
-        """Return changes of one coordinate."""
-        direction = np.eye(len(self.axes), dtype=np.int64)[axis]
-        return [direction * value for value in values]
-
-    def _on_axis(self, axis: int, sign: int) -> dict[int, bool]:
-        """Return by size, in units, whether changes of one coordinate to one side pass."""
-        return {
-            abs(units[axis]): passed
-            for units, passed in self.verdicts.items()
-            if units[axis] * sign > 0 and sum(map(bool, units)) == 1
-        }
-
-    def first_pass(self, axis: int, sign: int) -> int | None:
-        """Return the smallest change of one coordinate to one side that passes."""
-        on_axis = self._on_axis(axis, sign)
-        size = min((size for size, passed in on_axis.items() if passed), default=None)
-        return None if size is None else sign * size
-
-    def gap(self, axis: int, sign: int) -> list[int]:
-        """Return what did not run between the first pass on one side and the last failure."""
-        first = self.first_pass(axis, sign)
-        if first is None:
-            return []
-        before = max((size for size in self._on_axis(axis, sign) if size < abs(first)), default=0)
-        return [sign * size for size in range(before + 1, abs(first))]
-
-    def changes(self, units: Units) -> dict[str, float]:
-        """Return changes by coordinate, without those of none."""
-        pairs = zip(self.axes, units.tolist(), strict=True)
-        return {axis.coordinate.field: axis.change(by) for axis, by in pairs if by}
-
-    def cases(self, groups: Iterable[Sequence[Units]]) -> list[Case]:
-        """Return the cases of groups of changes, in their order."""
-        return [changed(self._case, self.changes(units)) for group in groups for units in group]
-
-    def tell(self, groups: Iterable[Sequence[Units]], passes: Sequence[bool]) -> None:
-        """Take what became of groups of changes."""
-        every = [units for group in groups for units in group]
-        for units, passed in zip(every, passes, strict=True):
-            self.verdicts[tuple(units.tolist())] = passed
-            if passed and self._length(units) < self.reach:
-                self.nearest = units
-
-    def _length(self, units: Units) -> float:
-        return float(np.linalg.norm(units * self._share))
-
-    @property
-    def reach(self) -> float:
-        """Distance in the unit cube up to which something nearer is looked for."""
-        if self.nearest is None:
-            return float(np.linalg.norm(np.maximum(-self._low, self._high) * self._share)) + 1e-9
-        return self._length(self.nearest)
-
-    def ball(self, count: int) -> list[Units]:
-        """Return new changes nearer than the nearest that passes: quasi-random in their ball."""
-        from scipy.special import ndtri
-        from scipy.stats.qmc import Halton
-
-        dims = len(self.axes)
-        draws = Halton(dims + 1, scramble=True, seed=self._rng).random(count)
-        directions = ndtri(np.clip(draws[:, 1:], 1e-9, 1.0 - 1e-9))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        radii = self.reach * draws[:, :1] ** (1.0 / dims)
-        return self._new(radii * directions / self._share)
-
-    def smaller(self) -> list[Units]:
-        """Return new changes near the nearest that passes, and parts of it."""
-        if self.nearest is None:
-            return []
-        dims, best = len(self.axes), self.nearest.astype(np.float64)
-        shares = np.array((0.0, *SHARES))
-        parts = [np.outer(shares, best)]
-        for axis in range(dims):
-            part = np.tile(best, (len(shares) + 1, 1))
-            part[:-1, axis] *= shares
-            part[-1, axis] -= np.sign(best[axis])
-            parts.append(part)
-        spread = NEAR * self.reach / self._share
-        parts.append(best + spread * self._rng.standard_normal((POINTS // 2, dims)))
-        return self._new(np.concatenate(parts))
-
-    def _new(self, wanted: FloatArray) -> list[Units]:
-        """Return whole units near those that are wanted: in the pool, new, and nearer than best."""
-        whole = np.unique(np.rint(wanted).astype(np.int64), axis=0)
-        inside = ((whole >= self._low) & (whole <= self._high)).all(axis=1) & whole.any(axis=1)
-        return [
-            units
-            for units in whole[inside]
-            if self._length(units) < self.reach and tuple(units.tolist()) not in self.verdicts
+    def __init__(
+        self,
+        plan: SimulationPlan,
+        outcome: Outcome,
+        ranges: Sequence[Range] = (),
+        workers: Workers | None = None,
+    ) -> None:
+        """Take the plan, the failure, the parameters that are searched, and where cases run."""
+        self._plan, self._outcome, self._workers = plan, outcome, workers
+        case, present = outcome.case, values_of(plan.vut, ranges)
+        self._axes = [
+            _axis(c.field, getattr(case, c.field), c.dimension.low, c.dimension.high, c.digits)
+            for c in coordinates(case.scenario, (case.level,))
         ]
+        self._coordinates = len(self._axes)
+        self._axes += [
+            _axis(r.name, present[r.name], r.low, r.high, r.digits, PARAMETER_STEPS) for r in ranges
+        ]
+        self._levels = [level for level in plan.povs.levels if level != case.level]
+
+    def found(self, check: Callable[[], None] = lambda: None) -> Explanation:
+        """Search, and confirm what was found; raises `UserError` where a case ends otherwise.
+
+        `check` is called after each step, and may raise to stop there.
+        """
+        itself = self._plan.vut.spec, self._outcome.case
+        fails, *at_levels = self._passes([itself, *map(self._at_level, self._levels)])
+        if fails:
+            raise self._other_now()
+        levels = dict(zip(map(level_name, self._levels), at_levels, strict=True))
+        nearest = self._nearest(check)
+        axes = tuple(
+            replaced(axis, below=nearest[place, -1], above=nearest[place, 1])
+            for place, axis in enumerate(self._axes)
+        )
+        self._confirm(axes, at_levels)
+        start, parameters = axes[: self._coordinates], axes[self._coordinates :]
+        return Explanation(self._outcome.index, start, levels, parameters)
+
+    def _nearest(self, check: Callable[[], None]) -> dict[tuple[int, int], float | None]:
+        """Search both sides of each axis, all at a time; return the nearest values that pass."""
+        every = [(place, sign) for place in range(len(self._axes)) for sign in (-1, 1)]
+        sides = {(place, sign): self._axes[place].side(sign) for place, sign in every}
+        nearest: dict[tuple[int, int], float | None] = dict.fromkeys(every)
+        answers: dict[tuple[int, int], Any] = dict.fromkeys(every)
+        while answers:
+            asked: dict[tuple[int, int], list[float]] = {}
+            for key, passes in answers.items():
+                try:
+                    asked[key] = sides[key].send(passes)
+                except StopIteration as end:
+                    nearest[key] = end.value
+            trials = [self._trial(key[0], v) for key, values in asked.items() for v in values]
+            passing = iter(self._passes(trials))
+            answers = {key: [next(passing) for _ in values] for key, values in asked.items()}
+            check()
+        return nearest
+
+    def _trial(self, place: int, value: float) -> Trial:
+        vut, case = self._plan.vut.spec, self._outcome.case
+        changed: dict[str, Any] = {self._axes[place].name: value}
+        if place < self._coordinates:
+            return vut, replace(case, **changed)
+        return spec_with(vut, changed), case
+
+    def _at_level(self, level: int) -> Trial:
+        case = replace(self._outcome.case, level=level, svo_rad=PSI if level == 2 else None)
+        return self._plan.vut.spec, case
+
+    def _passes(self, trials: Sequence[Trial], engine: Engine | None = None) -> list[bool]:
+        """Run trials, those of a VUT at a time; a spec that is refused does not pass."""
+        plan = self._plan if engine is None else replace(self._plan, engine=engine)
+        passes = [False] * len(trials)
+        for spec in dict.fromkeys(spec for spec, _ in trials):
+            places = [place for place, (of, _) in enumerate(trials) if of == spec]
+            cases = [trials[place][1] for place in places]
+            try:
+                if spec != plan.vut.spec:
+                    vut = VutFactory(spec, plan.vut.options)
+                    ran = list(evaluate(replace(plan, vut=vut), cases, self._workers, pass_of))
+                else:
+                    ran = list(evaluate(plan, cases, self._workers, pass_of))
+            except UserError:
+                if spec == plan.vut.spec:
+                    raise
+                continue
+            for place, passed in ran:
+                passes[places[place]] = passed
+        return passes
+
+    def _confirm(self, axes: Sequence[Axis], at_levels: Sequence[bool]) -> None:
+        """Run what is said a second time, in SUMO, and values that are a unit nearer."""
+        claims = [((self._plan.vut.spec, self._outcome.case), False)]
+        claims += zip(map(self._at_level, self._levels), at_levels, strict=True)
+        for place, axis in enumerate(axes):
+            for value in axis.passing:
+                claims.append((self._trial(place, value), True))
+                nearer = axis.nearer(value)
+                if nearer is not None:
+                    claims.append((self._trial(place, nearer), False))
+        trials, expected = zip(*claims, strict=True)
+        if self._passes(trials, Engine.SUMO) != list(expected):
+            raise self._other_now()
+
+    def _other_now(self) -> UserError:
+        return UserError(
+            f"case {self._outcome.index} ends otherwise when it runs again: the VUT is another "
+            "than that of the campaign, or does not repeat itself, and nothing can be said of its "
+            "changes"
+        )
 
 
-# Sentences.
-
-BY: Final[dict[str, tuple[str, str, str]]] = {
-    "x_pov0_m": ("the POV starts", "further back", "further ahead"),
-    "v_pov0_mps": ("the POV starts", "slower", "faster"),
-    "v_vut0_mps": ("the VUT starts", "slower", "faster"),
-}
-"""Subject, decrease and increase of a coordinate in words; of others their names are said."""
+def _axis(
+    name: str, value: float, low: float, high: float, digits: int, steps: int = START_STEPS
+) -> Axis:
+    unit = 10.0**-digits
+    step = max(1, round((high - low) / steps / unit)) * unit
+    return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def in_sentences(
-    explanation: Explanation, outcome: Outcome, avoidance: Avoidance | None = None
-) -> list[str]:
-    """Return what is known of a failure: changes, other POVs, and until when something helped.
+def pass_of(results: CaseResults) -> list[bool]:
+    """Return of each result whether the case has a verdict and does not fail."""
+    return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
 
-    Args:
-        explanation: of the failure.
-        outcome: the failure.
-        avoidance: which drivers would have avoided it, where that is known.
+
+# Words.
+
+
+def in_words(
+    found: Explanation, outcome: Outcome, avoidance: Avoidance | None = None
+) -> Iterator[str]:
+    """Yield what is known of a failure: axes, levels, and until when something helped.
+
+    `avoidance` says which drivers would have avoided it, where that is known.
     """
-    named = {c.field: c for c in coordinates(outcome.case.scenario, (outcome.case.level,))}
-    sentences = [*_alone_in_words(explanation, named), *_together_in_words(explanation, named)]
-    if explanation.povs:
-        sentences.append(_povs_in_words(explanation.povs))
-    return [*sentences, *in_words(explanation.parameters), *_last_moment(outcome, avoidance)]
+    for axis in found.start:
+        yield _axis_in_words(axis, *name_and_unit(outcome.case, axis.name))
+    for axis in found.parameters:
+        yield _axis_in_words(axis, f"the VUT's {axis.name}", "")
+    for level, passes in found.levels.items():
+        psi = f", psi {PSI:g}" if level == level_name(2) else ""
+        verb = "passes" if passes else "does not pass"
+        yield f"the same start {verb} at level {level}{psi}"
+    yield from _last_moment(outcome, avoidance)
 
 
-def amount(coordinate: Coordinate, change: float) -> str:
-    """Return the size of a change as it is written, as "3.1 m"."""
-    return f"{abs(change):.{coordinate.digits}f} {coordinate.unit}".rstrip()
+def name_and_unit(case: Case, field: str) -> tuple[str, str]:
+    """Return name and unit of a coordinate; of an unknown one its field."""
+    named = {c.field: (c.name, c.unit) for c in coordinates(case.scenario, (case.level,))}
+    return named.get(field, (field, ""))
 
 
-def _by_subject(changes: Iterable[tuple[Coordinate, float]]) -> list[tuple[str, list[str]]]:
-    """Return subjects with what is said of them: ("the POV starts", ["3.1 m further back"])."""
-    subjects: dict[str, list[str]] = {}
-    for one, change in changes:
-        subject, lower, higher = BY.get(one.field, (f"{one.name} is", "lower", "higher"))
-        way = lower if change < 0.0 else higher
-        subjects.setdefault(subject, []).append(f"{amount(one, change)} {way}")
-    return list(subjects.items())
+def _axis_in_words(axis: Axis, name: str, unit: str) -> str:
+    def text(value: float) -> str:
+        return f"{value:.{axis.digits}f} {unit}".rstrip()
 
-
-def _alone_in_words(one: Explanation, named: Mapping[str, Coordinate]) -> Iterator[str]:
-    """Yield which changes of one coordinate pass, the smallest first, and which have none."""
-    found = [(named[alone.field], change) for alone in one.alone for change in alone.passing]
-    if found:
-        found.sort(key=lambda pair: abs(pair[1]) / _span(pair[0]))
-        parts = [f"if {subject} {either(ways)}" for subject, ways in _by_subject(found)]
-        yield f"It passes {', or '.join(parts)}."
-    stuck = [(named[alone.field], alone) for alone in one.alone if not alone.passing]
-    if stuck:
-        tried = [f"{c.name} (tried every {amount(c, alone.step)})" for c, alone in stuck]
-        yield f"Within the pool no change of {either(tried)} alone makes it pass."
-
-
-def _span(coordinate: Coordinate) -> float:
-    return coordinate.dimension.high - coordinate.dimension.low
-
-
-def _together_in_words(one: Explanation, named: Mapping[str, Coordinate]) -> Iterator[str]:
-    if one.together is None:
-        yield "No start that was tried passes with this POV."
-    elif len(one.together) > 1:
-        said = _by_subject((named[name], by) for name, by in one.together.items())
-        parts = [f"{subject} {' and '.join(ways)}" for subject, ways in said]
-        yield f"Of all starts that were tried, the nearest that passes: {', and '.join(parts)}."
-
-
-def _povs_in_words(povs: Sequence[OtherPov]) -> str:
-    """Return with which other POVs the same start passes, and with which not."""
-    said: dict[bool, list[str]] = {True: [], False: []}
-    for level, same in groupby(povs, key=lambda pov: pov.level):
-        for passes, which in _psi_in_words(list(same)).items():
-            said[passes].append(f"level {level_name(level)}{which}")
-    places = {passes: " and ".join(names) for passes, names in said.items()}
-    if not said[True]:
-        return f"The very same start does not pass at {places[False].replace(' and ', ' or ')}."
-    text = f"The very same start passes at {places[True]}"
-    return f"{text}, and does not at {places[False]}." if said[False] else f"{text}."
-
-
-def _psi_in_words(same: Sequence[OtherPov]) -> dict[bool, str]:
-    """Return of the POVs of one level which pass and which do not, by what differs: psi."""
-    if same[0].svo_rad is None:
-        return {same[0].passes: ""}
-    runs: dict[bool, list[str]] = {}
-    for passes, run in groupby(same, key=lambda pov: pov.passes):
-        tried = [f"{pov.svo_rad:.{PSI_DIGITS}f}" for pov in run]
-        ends = tried[0] if len(tried) == 1 else f"{tried[0]} to {tried[-1]}"
-        runs.setdefault(passes, []).append(ends)
-    if len(runs) == 1:
-        return dict.fromkeys(runs, f" with any psi (tried every {10.0 ** (-PSI_DIGITS):g})")
-    return {passes: f" with psi {', '.join(ends)}" for passes, ends in runs.items()}
+    passing = either(map(text, axis.passing)) if axis.passing else "no other value"
+    return (
+        f"{name} is {text(axis.value)}; passes at {passing} (tried from {text(axis.low)} to "
+        f"{text(axis.high)}, every {text(axis.step)})"
+    )
 
 
 def _last_moment(outcome: Outcome, avoidance: Avoidance | None) -> Iterator[str]:
@@ -696,12 +445,12 @@ def _last_moment(outcome: Outcome, avoidance: Avoidance | None) -> Iterator[str]
     kept = f"{scenario.dx_crash_m:g} m at {'M' if scenario.place == 'M' else 'this place'}"
     if measures.last_avoidable_s is not None:
         yield (
-            f"The last way out closes at {measures.last_avoidable_s:.1f} s: after that neither "
+            f"the last way out closes at {measures.last_avoidable_s:.1f} s: after that neither "
             f"full braking nor full acceleration of the VUT keeps {kept}, with the POV moving as "
-            "it did, and then at its last speed."
+            "it did, and then at its last speed"
         )
     elif measures.avoidable is False:
-        yield f"At no time would full braking or full acceleration of the VUT have kept {kept}."
+        yield f"at no time would full braking or full acceleration of the VUT have kept {kept}"
     if avoidance is not None and avoidance.latest_takeover_s is not None:
         until_s = avoidance.latest_takeover_s
-        yield f"The fuzzy safety model can take over until {until_s:.1f} s and avoid it."
+        yield f"the fuzzy safety model can take over until {until_s:.1f} s and avoid it"

@@ -45,7 +45,6 @@ from merge_sumo.campaigns.store import OUTCOMES, Run, spread_failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.studies.parameter_ranges import Range, check_names, spec_with, todays_values
 from merge_sumo.studies.versions import Change, RunComparison
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import add_to, make_folder, replace_own
@@ -54,7 +53,8 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.score import Outcome
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.parameters import Range, spec_with
+from merge_sumo.vuts.registry import VutFactory, values_of
 
 if TYPE_CHECKING:
     import optuna
@@ -155,7 +155,6 @@ class RepairSettings:
         """Raise `UserError` for values that make no search."""
         if not self.ranges:
             raise UserError("name what may change: --param NAME=LOW..HIGH")
-        check_names(self.ranges)
         least = 1 + 2 * len(self.ranges)
         for option, number, lowest in (
             ("trials", self.trials, least),
@@ -412,7 +411,7 @@ class Search:
         self._open, self._check, self._on_trial = open_workers, check, on_trial
         self._workers: Workers | None = None
         self._ranges = {one.name: one for one in settings.ranges}
-        self.today = todays_values(plan.vut, settings.ranges)
+        self.today = values_of(plan.vut, settings.ranges)
         self.cases: list[Case] = [outcome.case for outcome in run.outcomes]
         self._own = len(self.cases)
         self._before: list[Outcome] = []

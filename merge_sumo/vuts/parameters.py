@@ -1,7 +1,8 @@
-"""Parameters of a Python controller: the numbers that a spec sets, as in `my_vut.py:MyVut?gain=2`.
+"""Parameters of a controller: the numbers that a spec sets, as in `my_vut.py:MyVut?gain=2`.
 
-A parameter is a keyword of the constructor, or of the function, that is the controller. One that
-the constructor does not have is an attribute, with a number, that the object has once it is made.
+A parameter of a controller in Python is a keyword of the constructor, or of the function, that is
+the controller. One that the constructor does not have is an attribute, with a number, that the
+object has once it is made.
 """
 
 from __future__ import annotations
@@ -12,11 +13,16 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from inspect import Parameter
 from types import MemberDescriptorType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 
 from merge_sumo.errors import UserError
+from merge_sumo.vuts.base import with_options
+
+DIGITS: Final = 3
+"""A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
+MOST_DIGITS: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,3 +131,50 @@ def unknown_parameter(spec: str, name: str, known: Iterable[str]) -> UserError:
         f"--vut {spec}: it has no parameter {name!r}: "
         + (f"choose from {names}" if names else "it has none")
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The values that a parameter may take.
+
+    Attributes:
+        name: the parameter.
+        low: its least value.
+        high: its largest value.
+    """
+
+    name: str
+    low: float
+    high: float
+
+    @classmethod
+    def parsed(cls, text: str) -> Range:
+        """Read a range, NAME=LOW..HIGH; raises `UserError` for what is none."""
+        name, _, bounds = text.partition("=")
+        try:
+            low, high = map(float, bounds.split("..", 1))
+        except ValueError:
+            low = high = math.nan
+        if not name.strip() or not (math.isfinite(low) and math.isfinite(high)):
+            raise UserError(f"--param {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
+        if not low < high:
+            raise UserError(f"--param {text}: the range is empty: give the lower end first")
+        return cls(name.strip(), low, high)
+
+    @property
+    def digits(self) -> int:
+        """Digits behind the point of a rounded value."""
+        return min(max(0, DIGITS - math.floor(math.log10(self.high - self.low))), MOST_DIGITS)
+
+    def rounded(self, value: float) -> float:
+        """Round a value of the range to few digits."""
+        return min(max(round(value, self.digits), self.low), self.high)
+
+
+def spec_with(
+    vut: str, values: Mapping[str, float], today: Mapping[str, float] | None = None
+) -> str:
+    """Return the spec of a controller with values of its parameters, but not with `today`'s."""
+    known = today or {}
+    changed = {name: f"{v:.12g}" for name, v in values.items() if known.get(name) != v}
+    return with_options(vut, changed) if changed else vut

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
@@ -19,6 +19,7 @@ from merge_sumo.drivers.rule_based import DESIGNS, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files, hashed
+from merge_sumo.system.printable import quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
@@ -28,7 +29,7 @@ from merge_sumo.vuts.frozen import FROZEN, frozen_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
 from merge_sumo.vuts.onnx import onnx_vut
-from merge_sumo.vuts.parameters import unknown_parameter
+from merge_sumo.vuts.parameters import Range, spec_with, unknown_parameter
 from merge_sumo.vuts.python import installed_vut, installed_vuts, python_vut
 from merge_sumo.vuts.sumo_model import sumo_vut
 from merge_sumo.vuts.traci.vut import traci_vut
@@ -296,6 +297,33 @@ def parameters_of(factory: VutFactory) -> dict[str, float]:
         return dict(factory.vut.parameters)
     with closing(factory(1)) as driver:
         return dict(driver.parameters())
+
+
+def values_of(factory: VutFactory, ranges: Sequence[Range]) -> dict[str, float]:
+    """Return the present values of the parameters of some ranges, by name.
+
+    Raises `UserError` where one is unknown, named twice, or out of its range.
+    """
+    known = parameters_of(factory) if ranges else {}
+    names = [each.name for each in ranges]
+    for each in ranges:
+        if names.count(each.name) > 1:
+            raise UserError(f"--param {each.name} is given twice: give each parameter once")
+        if each.name not in known and factory.vut.vut_type is not None:
+            raise UserError(
+                f"--param {each.name}: its value today is not known; name it, as in "
+                f"--vut {quoted(spec_with(factory.spec, {each.name: each.low}))}"
+            )
+        if each.name not in known:
+            hint = meant(each.name, known)
+            choice = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
+            raise UserError(f"--param {each.name}: {factory.spec} has no such parameter: {choice}")
+        if not each.low <= known[each.name] <= each.high:
+            raise UserError(
+                f"--param {each.name}={each.low:g}..{each.high:g}: it is {known[each.name]:g} "
+                "today, which is not in that range: give a range around it"
+            )
+    return {name: float(known[name]) for name in names}
 
 
 def _argument(spec: str) -> str:

@@ -30,14 +30,7 @@ from merge_sumo.reports.running_page import running_page
 from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
-from merge_sumo.studies.explanation import (
-    EXPLANATIONS,
-    Alone,
-    Explanation,
-    OtherPov,
-    in_sentences,
-)
-from merge_sumo.studies.parameter_changes import ParameterChange
+from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.studies.versions import compare_runs
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.scenario import POV, US23
@@ -796,31 +789,32 @@ def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
 def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     run = write_run(tmp_path / "run", error=None)
     first, second = [o for o in failures(run.outcomes) if o.case.level == 1][:2]
-    alone = (
-        Alone("x_pov0_m", 1.0, -100.0, 60.0, -3.1, 12.0),
-        Alone("v_pov0_mps", 0.06, -5.0, 5.0, -0.4, None),
+    x_m, v_mps = first.case.x_pov0_m, first.case.v_pov0_mps
+    below_m, above_m = round(x_m - 3.1, 1), round(x_m + 12.0, 1)
+    start = (
+        Axis("x_pov0_m", x_m, -340.0, -180.0, 1.0, 1, below_m, above_m),
+        Axis("v_pov0_mps", v_mps, 25.0, 35.0, 0.06, 2, 25.5),
     )
-    povs = (OtherPov(0, None, True), OtherPov(2, 0.3, False))
-    gap = ParameterChange("gap_m", 16.2, 8.1, 32.4, below=14.1)
-    known = Explanation(first.index, alone, {"x_pov0_m": -3.1}, povs, 400, (gap,))
+    gap = Axis("gap_m", 16.2, 8.1, 32.4, 0.6, 2, below=14.1)
+    known = Explanation(first.index, start, {"0": True, "2": False}, (gap,))
     line = json.dumps(to_plain(known))
     (run.folder / EXPLANATIONS).write_text(f"{line}\n", encoding="utf-8")
-    sentences = in_sentences(known, first)
+    words = list(in_words(known, first))
     moments = [
         t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None
     ]
     with shown(browser, report.write_report(run)) as page:
         page.evaluate(f"location.hash = '#case-{first.index}'")
         page.locator("#why-known").wait_for()
-        assert page.inner_text("#why-words") == " ".join(sentences)
-        assert "It passes if the POV starts 3.1 m further back, 0.40 m/s slower" in sentences[0]
+        assert page.locator("#why-words li").all_text_contents() == words
         texts = page.locator("#why-changes text:not(.edge)").all_text_contents()
-        x, v = (f"{first.case.x_pov0_m:.1f}".replace("-", "\u2212"), first.case.v_pov0_mps)
-        of_start = [f"x_POV0 {x} m", "\u22123.1", "+12.0", f"v_POV0 {v:.2f} m/s", "\u22120.40"]
-        assert texts == [*of_start, "vut: gap_m 16.2", "\u22122.10"]
-        # What fails is between the two changes that pass: 15.1 m of the 36 m that are drawn.
+        signed = [f"{value:.1f}".replace("-", "\u2212") for value in (x_m, below_m, above_m)]
+        of_start = [f"x_POV0 {signed[0]} m", *signed[1:], f"v_POV0 {v_mps:.2f} m/s", "25.50"]
+        assert texts == [*of_start, "vut: gap_m 16.20", "14.10"]
+        # What fails is between the two values that pass: 15.1 m of the 36 m that are drawn.
         stuck, track = (page.locator(f"#why-changes .{name}").first for name in ("stuck", "track"))
-        assert _box(stuck)["width"] / _box(track)["width"] == pytest.approx(15.1 / 36.0, abs=0.01)
+        share = (above_m - below_m) / (2 * 1.5 * (above_m - x_m))
+        assert _box(stuck)["width"] / _box(track)["width"] == pytest.approx(share, abs=0.01)
         drawn = page.locator("#why-time text.named").all_text_contents()
         assert [float(text.split()[-2]) for text in drawn] == [round(t, 1) for t in moments]
         before = _box(page.locator("#why-time .now"))["x"]

@@ -1,4 +1,4 @@
-"""Why a case fails: each sentence is true of the simulation, and the smallest change by hand."""
+"""Why a case fails: what is said is true of the simulation, and the smallest change by hand."""
 
 # mypy: no-strict-optional
 
@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import shutil
 from dataclasses import replace
 from typing import Any
@@ -15,109 +14,19 @@ import pytest
 from plans import plan_for
 
 import merge_sumo as ms
-from merge_sumo.campaigns.store import Run, spread_failures
+from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import Avoidance
 from merge_sumo.studies.explanation import (
     EXPLANATIONS,
-    Alone,
+    Axis,
     Explanation,
-    OtherPov,
-    in_sentences,
+    in_words,
     read_explanations,
 )
-from merge_sumo.studies.parameter_changes import ParameterChange
-from merge_sumo.studies.parameter_ranges import Range, default_ranges
-from merge_sumo.values.case import MergeCase
 from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.scenario import US23
-
-WAYS = {
-    "further back": ("x_pov0_m", -1, 0.1),
-    "further ahead": ("x_pov0_m", 1, 0.1),
-    "slower": ("v_pov0_mps", -1, 0.01),
-    "faster": ("v_pov0_mps", 1, 0.01),
-    "psi lower": ("svo_rad", -1, 0.01),
-    "psi higher": ("svo_rad", 1, 0.01),
-    "headway ahead lower": ("headway_ahead_s", -1, 0.01),
-    "headway ahead higher": ("headway_ahead_s", 1, 0.01),
-    "headway behind lower": ("headway_behind_s", -1, 0.01),
-    "headway behind higher": ("headway_behind_s", 1, 0.01),
-}
-"""Words of a change: its coordinate, its sign, and the unit of its last digit."""
-CHANGE = re.compile(
-    r"(\d+\.\d+) (?:m/s|m|rad|s) (further back|further ahead|slower|faster|lower|higher)"
-)
-SUBJECT = re.compile(r"(the POV starts|psi is|headway ahead is|headway behind is)")
-
-
-def said(text: str) -> list[tuple[str, float, float]]:
-    """Return (field, change, unit) of each change in a sentence."""
-    changes, subject = [], ""
-    for part in SUBJECT.split(text):
-        if SUBJECT.fullmatch(part):
-            subject = "" if part == "the POV starts" else part.removesuffix("is")
-            continue
-        for size, way in CHANGE.findall(part):
-            field, sign, unit = WAYS[subject + way]
-            changes.append((field, sign * float(size), unit))
-    return changes
-
-
-def moved(case, *changes):
-    values = {field: getattr(case, field) + change for field, change in changes}
-    return replace(case, **values)
-
-
-def claimed(case, sentence):
-    """Return the cases of which a sentence says something, each with whether it passes."""
-    if sentence.startswith("It passes if"):
-        for field, change, unit in said(sentence):
-            yield moved(case, (field, change)), True
-            nearer = change - math.copysign(unit, change)
-            yield moved(case, (field, nearer)), False
-    elif sentence.startswith("Of all starts"):
-        yield moved(case, *((field, change) for field, change, _ in said(sentence))), True
-    elif sentence.startswith("The very same start"):
-        passing, _, others = sentence.partition(", and does not at ")
-        if sentence.startswith("The very same start does not"):
-            passing, others = "", sentence
-        for text, passes in ((passing, True), (others, False)):
-            for level, psis in re.findall(
-                r"level ([012])(?: with (any psi|psi [\d., to]+\d))?", text
-            ):
-                for psi in psi_of(psis):
-                    yield replace(case, level=int(level), svo_rad=psi), passes
-
-
-def psi_of(text):
-    if not text:
-        return [None]
-    if text == "any psi":
-        return [number / 10.0 for number in range(16)]
-    values: list[int] = []
-    for run in text.removeprefix("psi ").split(", "):
-        first, _, last = run.partition(" to ")
-        values += range(round(10 * float(first)), round(10 * float(last or first)) + 1)
-    return [value / 10.0 for value in values]
-
-
-def sentences_that_are_false(run, found, plan):
-    """Return the sentences that are not true in SUMO, and how many cases were checked."""
-    claims = []
-    for one in found:
-        outcome = run.outcome(one.index)
-        for sentence in in_sentences(one, outcome):
-            claims += [(sentence, *claim) for claim in claimed(outcome.case, sentence)]
-    verdicts = run_cases(plan, [case for _, case, _ in claims]).verdicts()
-    wrong = [
-        (sentence, case)
-        for (sentence, case, passes), verdict in zip(claims, verdicts, strict=True)
-        if passes != (verdict.is_tested and not verdict.failed)
-    ]
-    return wrong, len(claims)
 
 
 @pytest.fixture(scope="module")
@@ -126,23 +35,45 @@ def made(tmp_path_factory):
     return ms.campaign("design2", cases=72, level="all", seed=1, out=folder, workers=1).run
 
 
+@pytest.fixture
+def folder(made, tmp_path):
+    return shutil.copytree(made.folder, tmp_path / "run")
+
+
 def uniform(vut, folder, cases, **keywords: Any):
     """Return a campaign of uniform cases, which takes the least time."""
     keywords = {"sampler": "uniform", "seed": 1, "workers": 1, **keywords}
     return ms.campaign(vut, cases=cases, out=folder, **keywords)
 
 
-class TestACampaign:
-    def test_explains_its_ten_listed_failures(self, made):
-        listed = sorted(o.index for o in spread_failures(made.outcomes)[:10])
-        assert list(read_explanations(made)) == listed
-        assert {made.outcome(index).case.level for index in listed} >= {1, 2}
+def passes(plan, case):
+    (verdict,) = run_cases(plan, [case]).verdicts()
+    return verdict.is_tested and not verdict.failed
 
-    def test_says_nothing_that_is_not_so(self, made):
-        found = read_explanations(made).values()
-        wrong, checked = sentences_that_are_false(made, found, plan_for("design2"))
-        assert wrong == []
-        assert checked > 100
+
+def check_axes(found: Explanation, case, plan):
+    """Check values that pass, and those a unit nearer, in SUMO; return how many there were."""
+    checked = 0
+    for axis in found.start:
+        for value in (v for v in (axis.below, axis.above) if v is not None):
+            sign = math.copysign(1.0, value - axis.value)
+            nearer = round(value - sign * 10.0**-axis.digits, axis.digits)
+            assert axis.low <= value <= axis.high
+            assert passes(plan, replace(case, **{axis.name: value})), axis
+            if (nearer - axis.value) * sign > 0.0:
+                assert not passes(plan, replace(case, **{axis.name: nearer})), axis
+            checked += 1
+    return checked
+
+
+class TestACampaign:
+    def test_explains_its_worst_failure_alone(self, made):
+        worst = failures(made.cases)[0]
+        ((index, found),) = read_explanations(made).items()
+        assert index == worst.index
+        assert [axis.name for axis in found.start[:2]] == ["x_pov0_m", "v_pov0_mps"]
+        assert found.parameters == ()
+        assert check_axes(found, worst.case, plan_for("design2"))
 
     def test_of_ones_own_controller_explains_none_by_itself(self, tmp_path):
         (tmp_path / "mine.py").write_text("def drive(seen):\n    return 1.0\n")
@@ -150,14 +81,14 @@ class TestACampaign:
         assert own.failures
         assert not (own.folder / EXPLANATIONS).exists()
 
-    def test_is_not_explained_where_the_engines_differ(self, made, tmp_path, monkeypatch):
+    def test_is_not_explained_where_the_engines_differ(self, tmp_path, monkeypatch):
         monkeypatch.setattr(
             "merge_sumo.studies.explanation.pass_of", lambda results: [True] * len(results)
         )
         run = uniform("level0", tmp_path / "run", 60, level=0)
         assert run.failures
         assert not (run.folder / EXPLANATIONS).exists()
-        with pytest.raises(UserError, match=r"case \d+ passes now: the VUT is another"):
+        with pytest.raises(UserError, match=r"case \d+ ends otherwise .* the VUT is another"):
             ms.explain(run)
 
 
@@ -169,247 +100,201 @@ class TestACampaign:
         pytest.param("sumo:Krauss", "us23", 0, "contact", marks=pytest.mark.slow),
     ],
 )
-def test_sentences_are_true_on_other_roads_too(tmp_path, vut, scenario, level, fail_when):
+def test_what_is_said_is_true_in_sumo(tmp_path, vut, scenario, level, fail_when):
     keywords: dict[str, Any] = {"scenario": scenario, "level": level, "fail_when": fail_when}
     run = uniform(vut, tmp_path / "run", 60, **keywords).run
-    some = [o.index for o in spread_failures(run.outcomes)[:2]]
-    assert some
-    found = ms.explain(run.folder, some).found
-    road = named_scenario(scenario)
-    plan = plan_for(vut, scenario=road, criterion=Criterion(fail_when))
-    wrong, checked = sentences_that_are_false(run, found, plan)
-    assert wrong == []
-    assert checked > 8
-
-
-def arrival(case):
-    """Return dx and the time at M of a level-0 VUT and a level-0 POV: eq. (4) worked out here."""
-    x, v, t = -182.0, 18.0, 0
-    while x < 0.0:
-        x, v, t = x + 0.1 * v, min(v + 0.1, 28.0), t + 1
-    return case.x_pov0_m + case.v_pov0_mps * 0.1 * t - x, 0.1 * t
+    case = failures(run.cases)[0].case
+    found = ms.explain(run.folder).found
+    plan = plan_for(vut, scenario=named_scenario(scenario), criterion=Criterion(fail_when))
+    assert check_axes(found, case, plan)
+    assert ("svo_rad" in [axis.name for axis in found.start]) == (level == 2)
+    for name, passed in found.levels.items():
+        psi = 0.0 if name == "2" else None
+        assert passes(plan, replace(case, level=int(name), svo_rad=psi)) == passed
 
 
 def test_the_smallest_change_by_hand(tmp_path):
+    """Level 0 against level 0: dx at M is that of eq. (4), worked out here."""
     run = uniform("level0", tmp_path / "run", 120, level=0).run
-    for index, one in read_explanations(run).items():
-        case = run.outcome(index).case
-        dx_m, t_s = arrival(case)
-        assert abs(dx_m) < 6.0
-        x, v = one.alone
-        back, ahead = (
-            -math.ceil(round((dx_m + 6.0) / 0.1, 6)),
-            math.ceil(round((6.0 - dx_m) / 0.1, 6)),
-        )
-        assert (x.below, x.above) == pytest.approx((back / 10.0, ahead / 10.0))
-        slower, faster = (math.ceil(gap / t_s / 0.01) / 100.0 for gap in (dx_m + 6.0, 6.0 - dx_m))
-        assert v.below == (pytest.approx(-slower) if case.v_pov0_mps - slower >= 25.0 else None)
-        assert v.above == (pytest.approx(faster) if case.v_pov0_mps + faster <= 35.0 else None)
-        # The nearest point of the two lines dx = 6 and dx = -6 in the unit cube, 160 m by 10 m/s.
-        together = [one.together.get(name, 0.0) for name in ("x_pov0_m", "v_pov0_mps")]
-        length = math.hypot(together[0] / 160.0, together[1] / 10.0)
-        nearest = min(6.0 - dx_m, dx_m + 6.0) / math.hypot(160.0, 10.0 * t_s)
-        assert nearest - 1e-9 <= length <= 1.1 * nearest + 0.0015
-    assert len(read_explanations(run)) > 4
+    for outcome in failures(run.cases)[:3]:
+        case, (x_m, v_mps, t) = outcome.case, (-182.0, 18.0, 0)
+        while x_m < 0.0:
+            x_m, v_mps, t = x_m + 0.1 * v_mps, min(v_mps + 0.1, 28.0), t + 1
+        of_x, of_v = ms.explain(run, outcome.index).found.start
+        # dx is to be 6 or -6: of the start of the POV, then of its speed.
+        x_at = [x_m + dx_m - case.v_pov0_mps * 0.1 * t for dx_m in (-6.0, 6.0)]
+        assert of_x.below == pytest.approx(math.floor(x_at[0] * 10.0) / 10.0)
+        assert of_x.above == pytest.approx(math.ceil(x_at[1] * 10.0) / 10.0)
+        v_at = [(x_m + dx_m - case.x_pov0_m) / (0.1 * t) for dx_m in (-6.0, 6.0)]
+        slower, faster = math.floor(v_at[0] * 100.0) / 100.0, math.ceil(v_at[1] * 100.0) / 100.0
+        assert of_v.below == (pytest.approx(slower) if slower >= 25.0 else None)
+        assert of_v.above == (pytest.approx(faster) if faster <= 35.0 else None)
 
 
-VALUES = re.compile(r"(\w+) is ([\d., or-]+) \((\S+) today, searched from (\S+) to (\S+)\)")
+class TestASide:
+    def find(self, axis, sign, passing):
+        """Return what a side finds, and all that it asks for."""
+        side, answers = axis.side(sign), None
+        asked: list[float] = []
+        while True:
+            try:
+                values = side.send(answers)
+            except StopIteration as end:
+                return end.value, asked
+            asked += values
+            answers = [passing(value) for value in values]
+
+    @pytest.mark.parametrize("value", [8.05, 8.1, 20.0])
+    def test_ends_at_the_first_unit_that_passes(self, value):
+        axis = Axis("x", value, 0.0, 30.0, step=1.0, digits=1)
+        assert self.find(axis, 1, lambda v: v > 23.4)[0] == 23.5
+        assert self.find(axis, -1, lambda v: v < 3.3)[0] == 3.2
+        assert self.find(axis, 1, lambda v: True)[0] == pytest.approx(value + 0.1, abs=0.0501)
+
+    def test_tries_both_ends_and_nothing_beyond(self):
+        axis = Axis("x", 1.0, 0.3, 2.3, step=0.7, digits=3)
+        for sign, end in ((-1, 0.3), (1, 2.3)):
+            found, asked = self.find(axis, sign, lambda v: False)
+            assert found is None
+            assert asked[-1] == end
+            assert all((v - 1.0) * sign > 0.0 and 0.3 <= v <= 2.3 for v in asked)
+        assert self.find(replaced_value(axis, 0.1), -1, lambda v: True) == (None, [])
+
+    def test_misses_a_pass_between_two_values_of_its_grid(self):
+        axis = Axis("x", 0.0, -10.0, 10.0, step=1.0, digits=1)
+        assert self.find(axis, 1, lambda v: 2.2 < v < 2.8 or v > 5.05)[0] == 5.1
 
 
-def claimed_of_parameters(sentences):
-    """Return (name, value, passes) of what sentences say: values that pass, a unit nearer not."""
-    found = []
-    for sentence in sentences:
-        if not sentence.startswith("The same start passes if the VUT's"):
-            continue
-        for name, values, *numbers in VALUES.findall(sentence):
-            today, low, high = map(float, numbers)
-            for text in values.split(" or "):
-                value = float(text)
-                nearer = value + math.copysign((high - low) / 320.0, today - value)
-                found += [(name, value, True), (name, nearer, False)]
-    return found
+def replaced_value(axis: Axis, value: float) -> Axis:
+    return Axis(axis.name, value, axis.low, axis.high, axis.step, axis.digits)
 
 
 class TestParameters:
-    def test_of_a_built_in_vut_are_changed_as_said(self, made, tmp_path):
-        again = shutil.copytree(made.folder, tmp_path / "run")
-        case = next(o.case for o in made.outcomes if o.failed)
-        index = next(o.index for o in made.outcomes if o.failed)
-        result = ms.explain(again, index, params=["gap_m=8..32", "kp=1..2"])
-        claims = claimed_of_parameters(result.sentences()[index])
-        assert {name for name, _, _ in claims} == {"gap_m"}
-        for name, value, passes in claims:
-            (verdict,) = run_cases(plan_for(f"design2?{name}={value!r}"), [case]).verdicts()
-            assert passes == (verdict.is_tested and not verdict.failed), (name, value)
-        none = "No value of the VUT's kp (searched from 1 to 2) was found with which this start"
-        assert f"{none} passes." in result.sentences()[index]
-        # What the file says is what the report says.
-        assert read_explanations(Run(again))[index] == result.found[0]
-        assert "The same start passes if the VUT" in ms.report(again).read_text(encoding="utf-8")
+    def test_of_a_built_in_vut_are_said_in_the_report(self, made, folder):
+        worst = failures(made.cases)[0]
+        result = ms.explain(folder, params=["gap_m=8..32", "kp=1..1.41"])
+        of_gap, of_kp = result.found.parameters
+        for value in of_gap.passing:
+            nearer = value - math.copysign(0.01, value - 16.2)
+            assert passes(plan_for(f"design2?gap_m={value}"), worst.case)
+            assert not passes(plan_for(f"design2?gap_m={nearer:.2f}"), worst.case)
+        assert of_gap.passing
+        assert (of_kp.value, of_kp.low, of_kp.high) == (1.4, 1.0, 1.41)
+        assert read_explanations(Run(folder))[worst.index] == result.found
+        assert "the VUT's gap_m is 16.20; passes at" in ms.report(folder).read_text("utf-8")
 
     def test_of_ones_own_controller_by_hand(self, tmp_path):
         mine = tmp_path / "mine.py"
         mine.write_text(
             "class Brakes:\n"
             "    def __init__(self, brake_mps2=3.0):\n"
+            "        if brake_mps2 == 1.9:\n"
+            "            raise ValueError\n"
             "        self.brake_mps2 = brake_mps2\n"
             "    def act(self, seen):\n"
             "        return -self.brake_mps2 if seen.t_s < 0.05 else 1.0\n"
         )
-        keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.001"}
+        keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.0015"}
         run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, **keywords)
-        (one,) = ms.explain(run, 0, params=["brake_mps2=0..4"]).found
-        # In steps of .1 from 3 on, then in eighths of that: it fails above 2.001.
-        assert one.parameters == (ParameterChange("brake_mps2", 3.0, 0.0, 4.0, below=2.0),)
-        (plain,) = ms.explain(run, 0).found
-        assert plain.parameters == ()
+        (of_brake,) = ms.explain(run, 0, params=["brake_mps2=0..4"]).found.parameters
+        # It fails above 2.0015, and thousandths of the range's digits are tried.
+        assert of_brake == Axis("brake_mps2", 3.0, 0.0, 4.0, 0.1, 3, below=2.001)
+        (refused,) = ms.explain(run, 0, params=["brake_mps2=1.9..4"]).found.parameters
+        assert refused.below == 2.001
 
-    def test_ends_of_a_range_are_values(self):
-        change = ParameterChange("gap_m", 16.2, 8.1, 32.4, below=8.1, above=32.4)
-        assert [value for value, passes in change.claims() if passes] == [8.1, 32.4]
-        nearer = [value for value, passes in change.claims() if not passes]
-        assert nearer == pytest.approx([8.1 + 0.076, 32.4 - 0.076], abs=0.05)
 
-    def test_ranges_by_default_are_from_half_to_double(self):
-        ranges = default_ranges(plan_for("design2?gap_m=20").vut)
-        assert ranges[2] == Range("gap_m", 10.0, 40.0)
-        assert [one.name for one in ranges] == ["x1_m", "x2_m", "gap_m", "target_m", "kp", "lag_s"]
-        assert default_ranges(plan_for("sumo:IDM?tau=1").vut) == ()
+@pytest.mark.parametrize(
+    ("case", "params", "words"),
+    [
+        (None, ["gap=1..2"], "has no such parameter: did you mean gap_m"),
+        (None, ["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
+        (None, ["gap_m=8..32", "gap_m=8..32"], "--param gap_m is given twice"),
+        (None, ["gap_m=8"], "write NAME=LOW..HIGH"),
+        ("passed", [], "did not fail: name a failure, such as"),
+        (10**6, [], "no case 1000000"),
+    ],
+)
+def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, words):
+    index = next(o.index for o in made.outcomes if not o.failed) if case == "passed" else case
+    with pytest.raises(UserError, match=words):
+        ms.explain(made.folder, index, params=params)
 
-    @pytest.mark.parametrize(
-        ("params", "words"),
-        [
-            (["gap=1..2"], "has no such parameter: did you mean gap_m"),
-            (["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
-            (["gap_m=8..32", "gap_m=8..32"], "--param gap_m is given twice"),
-            (["gap_m=8"], "write NAME=LOW..HIGH"),
-        ],
-    )
-    def test_that_cannot_be_searched_are_refused_in_a_sentence(self, made, params, words):
-        with pytest.raises(UserError, match=words):
-            ms.explain(made.folder, params=params)
+
+def test_a_campaign_without_failures_is_refused(tmp_path):
+    own = uniform("design2", tmp_path / "run", 5, level=0)
+    with pytest.raises(UserError, match="has no failure: nothing can be explained"):
+        ms.explain(own)
+
+
+@pytest.mark.parametrize(
+    "now",
+    [
+        "return -0.5 if seen.t_s < 4.0 else 0.5",
+        pytest.param("return next(TURNS)", marks=pytest.mark.slow),
+    ],
+)
+def test_a_controller_that_is_another_now_or_decides_by_chance_is_refused(tmp_path, now):
+    mine = tmp_path / "mine.py"
+    mine.write_text("def drive(seen):\n    return 1.0\n")
+    own = uniform(f"{mine}:drive", tmp_path / "run", 60, level=0)
+    turns = "import itertools\nTURNS = itertools.cycle([1.0] * 997 + [-2.0] * 991)\n"
+    mine.write_text(f"{turns}def drive(seen):\n    {now}\n")
+    with pytest.raises(UserError, match="nothing can be said of its changes"):
+        ms.explain(own)
 
 
 class TestTheFile:
     @pytest.mark.slow
-    def test_is_the_same_wherever_its_cases_ran(self, made, tmp_path):
-        again = shutil.copytree(made.folder, tmp_path / "run")
-        lines = (again / EXPLANATIONS).read_bytes().splitlines()
-        by_campaign = {record["index"]: record for record in map(json.loads, lines)}
-        first, second = list(by_campaign)[:2]
-        (again / EXPLANATIONS).unlink()
-        ms.explain(again, [first, second], workers=2)
-        together = (again / EXPLANATIONS).read_bytes()
-        (again / EXPLANATIONS).unlink()
-        ms.explain(again, second)
-        ms.explain(again, first)
-        assert (again / EXPLANATIONS).read_bytes() == together
-        # A campaign leaves the parameters of its controller to the command.
-        for record in map(json.loads, together.splitlines()):
-            known = by_campaign[record["index"]]
-            assert record.pop("cases") > known.pop("cases")
-            assert record.pop("parameters")
-            assert known.pop("parameters") == []
-            assert record == known
+    def test_is_the_same_wherever_its_cases_ran(self, made, folder):
+        first, second = (o.index for o in failures(made.cases)[:2])
+        (folder / EXPLANATIONS).unlink()
+        ms.explain(folder, second, workers=2)
+        ms.explain(folder, first)
+        together = (folder / EXPLANATIONS).read_bytes()
+        assert set(read_explanations(Run(folder))) == {first, second}
+        (folder / EXPLANATIONS).unlink()
+        ms.explain(folder, first)
+        assert (folder / EXPLANATIONS).read_bytes() == (made.folder / EXPLANATIONS).read_bytes()
+        ms.explain(folder, second)
+        assert (folder / EXPLANATIONS).read_bytes() == together
 
     @pytest.mark.parametrize(
         "changes",
         [
             {"index": 10**6},
-            {"alone": []},
-            {"together": {"level": 1.0}},
-            {"cases": -1},
-            {"parameters": [{"name": "kp", "today": 1.0, "low": 1.0, "high": 1.0}]},
+            {"start": [{"name": "kp"}]},
+            {"levels": {"1": 2}},
+            {"parameters": [{"name": "k" * 101}]},
         ],
     )
-    def test_of_somebody_else_is_refused_in_a_sentence(self, made, tmp_path, changes):
-        folder = shutil.copytree(made.folder, tmp_path / "run")
-        lines = (folder / EXPLANATIONS).read_text().splitlines()
-        lines[0] = json.dumps({**json.loads(lines[0]), **changes})
-        (folder / EXPLANATIONS).write_text("\n".join(lines))
+    def test_of_somebody_else_is_refused_in_a_sentence(self, folder, changes):
+        record = json.loads((folder / EXPLANATIONS).read_text())
+        (folder / EXPLANATIONS).write_text(json.dumps({**record, **changes}))
         with pytest.raises(UserError, match=EXPLANATIONS):
             read_explanations(Run(folder))
 
 
-class TestWhatCannotBeExplained:
-    def test_is_a_case_that_did_not_fail(self, made):
-        passed = next(o.index for o in made.outcomes if not o.failed)
-        with pytest.raises(UserError, match=f"case {passed} did not fail: name a failure, such as"):
-            ms.explain(made.folder, passed)
-
-    def test_is_a_campaign_without_failures(self, tmp_path):
-        own = uniform("design2", tmp_path / "run", 5, level=0)
-        assert not own.failures
-        with pytest.raises(UserError, match="has no failure: nothing can be explained"):
-            ms.explain(own)
-
-    @pytest.mark.parametrize(
-        ("now", "words"),
-        [
-            ("return -0.5 if seen.t_s < 4.0 else 0.5", "the VUT is another than that"),
-            pytest.param("return next(TURNS)", "the VUT", marks=pytest.mark.slow),
-        ],
-    )
-    def test_is_a_controller_that_is_another_now_or_decides_by_chance(self, tmp_path, now, words):
-        mine = tmp_path / "mine.py"
-        mine.write_text("def drive(seen):\n    return 1.0\n")
-        own = uniform(f"{mine}:drive", tmp_path / "run", 60, level=0)
-        turns = "import itertools\nTURNS = itertools.cycle([1.0] * 997 + [-2.0] * 991)\n"
-        mine.write_text(f"{turns}def drive(seen):\n    {now}\n")
-        with pytest.raises(UserError, match=f"{words}.* nothing can be said of its changes"):
-            ms.explain(own, own.failures[0]["index"])
-
-
-def test_sentences_by_hand(made):
-    outcome = next(o for o in made.outcomes if o.failed and o.case.level == 2)
+def test_words_by_hand(made):
+    outcome = next(o for o in made.outcomes if o.failed and o.case.level == 1)
     measures = replace(outcome.measures, last_avoidable_s=5.2, avoidable=True)
     outcome = replace(outcome, measures=measures)
-    x = Alone("x_pov0_m", 1.0, -100.0, 60.0, -3.1, 12.0)
-    v = Alone("v_pov0_mps", 0.06, -5.0, 5.0, -0.4, None)
-    psi = Alone("svo_rad", 0.01, -0.3, 1.27)
-    povs = (OtherPov(0, None, False), OtherPov(1, None, True))
-    found = Explanation(outcome.index, (x, v, psi), {"x_pov0_m": -2.0, "v_pov0_mps": -0.1}, povs, 9)
-    assert in_sentences(found, outcome, Avoidance(outcome.index, ("fsm",), 4.9, False)) == [
-        "It passes if the POV starts 3.1 m further back, 0.40 m/s slower or 12.0 m further ahead.",
-        "Within the pool no change of psi (tried every 0.01 rad) alone makes it pass.",
-        "Of all starts that were tried, the nearest that passes: the POV starts 2.0 m further back "
-        "and 0.10 m/s slower.",
-        "The very same start passes at level 1, and does not at level 0.",
-        "The last way out closes at 5.2 s: after that neither full braking nor full acceleration "
-        "of the VUT keeps 6 m at M, with the POV moving as it did, and then at its last speed.",
-        "The fuzzy safety model can take over until 4.9 s and avoid it.",
+    x = Axis("x_pov0_m", -200.04, -340.0, -180.0, 1.0, 1, below=-203.1, above=-199.0)
+    v = Axis("v_pov0_mps", 30.0, 25.0, 35.0, 0.06, 2)
+    found = Explanation(outcome.index, (x, v), {"0": True, "2": False})
+    avoidance = Avoidance(outcome.index, ("fsm",), 4.9, False)
+    assert list(in_words(found, outcome, avoidance)) == [
+        "x_POV0 is -200.0 m; passes at -199.0 m or -203.1 m (tried from -340.0 m to -180.0 m, "
+        "every 1.0 m)",
+        "v_POV0 is 30.00 m/s; passes at no other value (tried from 25.00 m/s to 35.00 m/s, "
+        "every 0.06 m/s)",
+        "the same start passes at level 0",
+        "the same start does not pass at level 2, psi 0",
+        "the last way out closes at 5.2 s: after that neither full braking nor full acceleration "
+        "of the VUT keeps 6 m at M, with the POV moving as it did, and then at its last speed",
+        "the fuzzy safety model can take over until 4.9 s and avoid it",
     ]
-
-
-def test_psi_in_words(made):
-    outcome = next(o for o in made.outcomes if o.failed and o.case.level == 1)
-    measures = replace(outcome.measures, last_avoidable_s=None, avoidable=False)
-    by_psi = [OtherPov(2, psi, psi in (0.1, 0.3)) for psi in (0.0, 0.1, 0.2, 0.3)]
-    stuck = tuple(Alone(name, 0.1, -1.0, 1.0) for name in ("x_pov0_m", "v_pov0_mps"))
-    found = Explanation(outcome.index, stuck, None, (OtherPov(0, None, False), *by_psi), 9)
-    assert in_sentences(found, replace(outcome, measures=measures))[1:] == [
-        "No start that was tried passes with this POV.",
-        "The very same start passes at level 2 with psi 0.1, 0.3, and does not at level 0 and "
-        "level 2 with psi 0.0, 0.2.",
-        "At no time would full braking or full acceleration of the VUT have kept 6 m at M.",
-    ]
-
-
-def test_a_case_at_the_edge_of_the_pool_moves_to_one_side_only(tmp_path):
-    edge = MergeCase(level=0, x_pov0_m=-180.0, v_pov0_mps=25.0, scenario=US23)
-    dx_m, _ = arrival(edge)
-    scenario = replace(US23, name="edge", x_pov0_m=(-181.0, -180.0), v_pov0_mps=(25.0, 25.1))
-    keywords: dict[str, Any] = {
-        "scenario": scenario,
-        "level": 0,
-        "fail_when": f"dx_m < {dx_m + 99}",
-    }
-    run = uniform("level0", tmp_path / "run", 4, **keywords).run
-    for one in read_explanations(run).values():
-        assert one.together is None
-        for alone in one.alone:
-            value = getattr(run.outcome(one.index).case, alone.field)
-            low, high = scenario.bounds(alone.field)
-            assert low <= value + alone.lowest <= value + alone.highest <= high
-            assert alone.passing == ()
+    measures = replace(measures, last_avoidable_s=None, avoidable=False)
+    assert list(in_words(found, replace(outcome, measures=measures)))[-1] == (
+        "at no time would full braking or full acceleration of the VUT have kept 6 m at M"
+    )
+    assert found.nearest_start == ("x_pov0_m", -199.0)

@@ -16,11 +16,12 @@ import pytest
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.studies import repair as mending
-from merge_sumo.studies.parameter_ranges import Range, todays_values
 from merge_sumo.studies.repair import BISECTIONS, RESERVE, Round, Trial
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import US23
+from merge_sumo.vuts.parameters import Range
+from merge_sumo.vuts.registry import values_of
 
 pytest.importorskip("optuna")
 
@@ -206,7 +207,7 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
     with pytest.raises(UserError, match="--cost is 'money': choose time or braking"):
         api.repair(run, ["brake=0..4"], cost="money", **given)
     with pytest.raises(UserError, match="the parameters of a network are its weights"):
-        todays_values(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
+        values_of(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
     assert not (tmp_path / "out").exists()
 
 

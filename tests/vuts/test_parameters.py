@@ -163,8 +163,8 @@ def test_a_vut_that_is_registered_as_contributing_says_has_parameters(tmp_path, 
         out=tmp_path / "run",
         **here,
     )
-    (explained,) = api.explain(run, 0, params=["brake_mps2=0..4"]).found
-    assert explained.parameters[0].below == 2.0
+    (of_brake,) = api.explain(run, 0, params=["brake_mps2=0..4"]).found.parameters
+    assert of_brake.below == 2.001
     few: dict[str, Any] = {"trials": 6, "rounds": 1, **here}
     repaired = api.repair(run, ["brake_mps2=0..4"], out=tmp_path / "out", **few)
     assert 0.0 <= repaired.repair.chosen.values["brake_mps2"] <= 2.001  # type: ignore[union-attr]

@@ -427,8 +427,8 @@ function whyCharts(i) { // why it failed: until when something could be done, an
   byId("why-ask").hidden = Boolean(found);
   byId("why-command").textContent = `${data.explain} ${cases.index[i]} && ${data.report}`;
   if (!found) return [];
-  byId("why-words").textContent = found.sentences.join(" ");
-  drawChanges(byId("why-changes"), [...changesOfStart(i, found.alone), ...found.parameters.map(changesOfParameter)]);
+  byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  drawAxes(byId("why-changes"), found.axes);
   return [moments(byId("why-time"), i)];
 }
 function moments(svg, i) { // both distances to M, and the last moments at which something helps
@@ -449,36 +449,24 @@ function moments(svg, i) { // both distances to M, and the last moments at which
   }
   return chart;
 }
-function changesOfStart(i, alone) { // a row for each coordinate: the changes that were tried, and the nearest that pass
-  return coordinates.filter(({ field }) => field in alone).map((c) => {
-    const [lowest, below, above, highest] = alone[c.field], value = cases[c.field][i];
-    return { title: `${c.name} ${valueText(c, value)}`, value, digits: c.digits, lowest, below, above, highest };
-  });
-}
-function changesOfParameter({ name, today, low, high, below, above, digits }) {
-  const change = (value) => (value === null || value === undefined ? null : value - today);
-  return { title: `vut: ${name} ${Number(today.toPrecision(12))}`, value: today, digits, lowest: low - today, below: change(below), above: change(above), highest: high - today };
-}
-function drawChanges(svg, rows) { // a bar for each row: what fails around the case, and the nearest passes
+function drawAxes(svg, axes) { // a bar for each thing: what fails around the case, and the nearest values that pass
   const height = 56, [left, right] = [62, 298];
-  svg.setAttribute("viewBox", `0 0 360 ${rows.length * height}`);
+  svg.setAttribute("viewBox", `0 0 360 ${axes.length * height}`);
   svg.replaceChildren();
-  for (const [row, { title, value, digits, lowest, below, above, highest }] of rows.entries()) {
-    const y = row * height;
-    const reach = 1.5 * Math.max(-(below ?? lowest), above ?? highest) || 1; // as far as needed
-    const low = Math.max(lowest, -reach), high = Math.max(Math.min(highest, reach), low + 1e-9);
-    const X = (change) => left + (change - low) / (high - low) * (right - left);
-    draw(svg, "text", { x: left, y: y + 13 }, title);
+  for (const [row, { name, unit, value, digits, low, below, above, high }] of axes.entries()) {
+    const y = row * height, reach = 1.5 * Math.max(value - (below ?? low), (above ?? high) - value) || 1; // as far as needed
+    const from = Math.max(low, value - reach), to = Math.max(Math.min(high, value + reach), from + 1e-9);
+    const X = (at) => left + (at - from) / (to - from) * (right - left);
+    draw(svg, "text", { x: left, y: y + 13 }, `${name} ${fixed(value, digits)} ${unit}`.trim());
     draw(svg, "rect", { class: "track", x: left, y: y + 20, width: right - left, height: 12 });
-    const [from, to] = [below ?? low, above ?? high];
-    draw(svg, "rect", { class: "stuck", x: X(from), y: y + 20, width: X(to) - X(from), height: 12 });
-    draw(svg, "line", { class: "now", x1: X(0), x2: X(0), y1: y + 17, y2: y + 35 });
-    for (const [change, anchor, aside] of [[below, "end", -8], [above, "start", 8]]) {
-      if (change === null) continue;
-      draw(svg, "circle", { class: "passes", cx: X(change), cy: y + 26, r: 4 });
-      draw(svg, "text", { x: X(change) + aside, y: y + 30, "text-anchor": anchor }, `${change < 0 ? "\u2212" : "+"}${fixed(Math.abs(change), digits)}`);
+    draw(svg, "rect", { class: "stuck", x: X(below ?? from), y: y + 20, width: X(above ?? to) - X(below ?? from), height: 12 });
+    draw(svg, "line", { class: "now", x1: X(value), x2: X(value), y1: y + 17, y2: y + 35 });
+    for (const [at, anchor, aside] of [[below, "end", -8], [above, "start", 8]]) {
+      if (at === null) continue;
+      draw(svg, "circle", { class: "passes", cx: X(at), cy: y + 26, r: 4 });
+      draw(svg, "text", { x: X(at) + aside, y: y + 30, "text-anchor": anchor }, fixed(at, digits));
     }
-    for (const change of [low, high]) draw(svg, "text", { class: "edge", x: X(change), y: y + 45, "text-anchor": "middle" }, fixed(value + change, digits));
+    for (const end of [from, to]) draw(svg, "text", { class: "edge", x: X(end), y: y + 45, "text-anchor": "middle" }, fixed(end, digits));
   }
 }
 function signalCharts(i, end) { // what the VUT has left for each step: numbers as a line, words as bars
