@@ -235,4 +235,4 @@ def test_the_result_counts_cases_without_a_verdict(command_line):
 
 def test_a_parameter_that_the_old_version_lacks_is_said_of_it(command_line):
     asked = ("--vut", "design1", "--against", "design1?gap=2", "--cases", 5, "--out", "run")
-    assert_refused(command_line("campaign", *asked), "--against design1?gap=2: design1 has no")
+    assert_refused(command_line("campaign", *asked), "--against design1?gap=2: it has no parameter")
