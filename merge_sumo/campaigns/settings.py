@@ -74,6 +74,8 @@ class CampaignSettings:
             if level not in self.scenario.levels:
                 levels = ", ".join(map(level_name, self.scenario.levels))
                 raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
+        if OWN in self.levels and self.pov is None:
+            raise UserError("level own is that of a POV of your own: name one as pov")
         self._check_sampler()
         for name in ("cases", "batch", "in_flight", "audit", "repeat"):
             number = getattr(self, name)
