@@ -5,14 +5,10 @@
 from __future__ import annotations
 
 import gc
-import importlib.util
-import os
 import random
 import re
-import shutil
 import socket
 import struct
-import subprocess
 import sys
 import threading
 import time
@@ -23,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import traci
-from conftest import require, some
+from conftest import some
 from controllers import RAW_CLIENT, assert_drives_as_level0, free_port, program, raw_client
 from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
 from vut_contract import cases_of, factory, run_cases
@@ -31,7 +27,6 @@ from vut_contract import cases_of, factory, run_cases
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
-from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.trajectory import End
@@ -224,107 +219,6 @@ def test_the_controller_of_the_tutorial_drives_like_the_same_law_in_process(tmp_
     assert_drives_as_level0(factory("traci", command=command), cases_of(20))
 
 
-CPP = r"""
-#include <libsumo/libtraci.h>
-#include <algorithm>
-#include <cstdlib>
-#include <iostream>
-using namespace libtraci;
-int main(int, char** argv) {
-    Simulation::init(std::atoi(argv[1]), 100, "localhost");
-    while (Simulation::getMinExpectedNumber() > 0) {
-        Simulation::step();
-        for (const std::string& id : Simulation::getDepartedIDList()) {
-            if (id == "vut") {
-                Vehicle::subscribe("vut", {libsumo::VAR_SPEED, libsumo::VAR_LANEPOSITION});
-                Vehicle::subscribeContext("vut", libsumo::CMD_GET_VEHICLE_VARIABLE, 300,
-                                          {libsumo::VAR_SPEED, libsumo::VAR_POSITION});
-                Junction::subscribeContext("M", libsumo::CMD_GET_VEHICLE_VARIABLE, 2000,
-                                           {libsumo::VAR_SPEED});
-                if (Junction::getContextSubscriptionResults("M").count("vut") != 1) return 8;
-                Vehicle::setSpeedMode("vut", 6);
-                Vehicle::setMaxSpeed("vut", 45.0);
-                if (Vehicle::getMaxSpeed("vut") != 45.0) return 9;
-                try {
-                    Vehicle::moveTo("vut", "main_out_0", 1.0);
-                    return 10;
-                } catch (const libsumo::TraCIException&) {
-                }
-            }
-        }
-        const auto ids = Vehicle::getIDList();
-        if (std::find(ids.begin(), ids.end(), "vut") == ids.end()) continue;
-        const double v = Vehicle::getSpeed("vut");
-        const double a = std::min(std::max((28.0 - v) / 0.1, 0.0), 1.0);
-        Vehicle::setSpeed("vut", v + a * 0.1);
-        try {
-            Vehicle::setSpeed("pov", 5.0);
-            return 7;
-        } catch (const libsumo::TraCIException&) {
-        }
-    }
-    Simulation::close();
-    return 0;
-}
-"""
-
-
-@pytest.fixture(scope="module")
-def cpp_client(tmp_path_factory) -> Path:
-    """Return a controller in C++, built on the libtraci of SUMO's wheel."""
-    compiler, home = shutil.which("g++"), Path(sumo_program("sumo")).parents[1]
-    require(compiler is not None, "g++ is not on the PATH")
-    folder = tmp_path_factory.mktemp("cpp")
-    (folder / "client.cpp").write_text(CPP)
-    library = next(home.glob("lib*/libtracicpp.so"), None)
-    require(library is not None, f"SUMO's wheel has no libtracicpp.so in {home}")
-    assert library is not None
-    subprocess.run(
-        [
-            *(compiler, "-std=c++17", "-O1", str(folder / "client.cpp")),
-            *("-I", str(home / "include"), "-o", str(folder / "client"), str(library)),
-            f"-Wl,-rpath,{library.parent}",
-        ],
-        check=True,
-    )
-    return folder / "client"
-
-
-@pytest.mark.slow
-def test_a_controller_in_cpp_on_libtraci_drives_like_the_same_law_in_process(cpp_client):
-    assert_drives_as_level0(factory("traci", command=f"{cpp_client} {{port}}"), cases_of(20))
-
-
-LIBTRACI = CONTROLLER.replace("import sys, traci", "import sys\nimport libtraci as traci").replace(
-    "    traci.simulationStep()\n",
-    """    traci.simulationStep()
-    if "vut" in traci.simulation.getDepartedIDList():
-        traci.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
-        context = traci.constants.CMD_GET_VEHICLE_VARIABLE, 300.0, [traci.constants.VAR_SPEED]
-        traci.vehicle.subscribeContext("vut", *context)
-        seen = traci.vehicle.getContextSubscriptionResults("vut")["vut"]
-        assert seen == traci.vehicle.getSubscriptionResults("vut")
-        traci.vehicle.setMaxSpeed("vut", 45.0)
-        try:
-            traci.vehicle.moveTo("vut", "main_out_0", 1.0)
-            sys.exit(7)
-        except traci.TraCIException:
-            pass
-""",
-)
-
-
-def test_a_controller_on_the_package_libtraci_drives_like_the_same_law_in_process(tmp_path):
-    """Its wheels end at SUMO 1.18 and bring a libsumo of that, so it lives in another Python."""
-    interpreter = os.environ.get("LIBTRACI_PYTHON") or (
-        sys.executable if importlib.util.find_spec("libtraci") else None
-    )
-    if interpreter is None:
-        pytest.skip("libtraci is not here: set LIBTRACI_PYTHON to a Python that has it")
-    command = program(tmp_path, LIBTRACI).replace(sys.executable, interpreter)
-    assert_drives_as_level0(factory("traci", command=command), cases_of(20))
-
-
 def test_traci_start_with_our_port_connects_to_us_and_not_to_the_sumo_it_starts(tmp_path):
     head = 'import sys, traci\ntraci.start(["sumo", "-n", "no.net.xml"], port=int(sys.argv[1]))'
     source = CONTROLLER.replace("import sys, traci\ntraci.init(int(sys.argv[1]))", head)
@@ -506,92 +400,6 @@ def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count)
     assert descriptors() <= before
 
 
-class Recorder:
-    """A client's socket that remembers what was sent."""
-
-    def __init__(self, real: socket.socket) -> None:
-        self.real = real
-        self.sent: list[bytes] = []
-
-    def send(self, content: bytes) -> int:
-        self.sent.append(bytes(content))
-        return self.real.send(content)
-
-    def __getattr__(self, name: str):
-        return getattr(self.real, name)
-
-
-def recorded_session() -> list[bytes]:
-    """Return the messages of a stock client that reads, subscribes and drives."""
-
-    def drive(c):
-        c._socket = recorder = Recorder(c._socket)
-        c.simulation.subscribe([traci.constants.VAR_DEPARTED_VEHICLES_IDS])
-        c.simulationStep()
-        c.vehicle.subscribe("vut", [traci.constants.VAR_SPEED])
-        domain = traci.constants.CMD_GET_VEHICLE_VARIABLE
-        c.vehicle.subscribeContext("vut", domain, 300.0, [traci.constants.VAR_POSITION])
-        c.vehicle.setSpeedMode("vut", 0)
-        c.vehicle.getLeader("vut", 100.0)
-        c.lane.getShape("main_out_0")
-        c.vehicle.slowDown("vut", 19.0, 1.0)
-        c.vehicle.setAcceleration("vut", 1.0, 0.5)
-        c.vehicle.setSpeed("vut", 18.1)
-        c.vehicle.setColor("vut", (1, 2, 3, 4))
-        c.simulationStep(c.simulation.getTime() + 0.2)
-        return recorder.sent
-
-    return Played(stock(drive), steps=4).result
-
-
-def mutated(message: bytes, rng: random.Random) -> bytes:
-    """Return a message with bytes changed, taken out, put in, or with another length."""
-    content = bytearray(message)
-    for _ in range(rng.randint(1, 4)):
-        at = rng.randrange(len(content))
-        match rng.randrange(5):
-            case 0:
-                content[at] = rng.randrange(256)
-            case 1:
-                content[at] ^= 1 << rng.randrange(8)
-            case 2:
-                del content[at : at + rng.randint(1, 8)]
-                content = content or bytearray(b"\0")
-            case 3:
-                content[at:at] = rng.randbytes(rng.randint(1, 8))
-            case 4:
-                length = rng.choice((-1, 0, 3, 1 << 20, 1 << 24, 2**31 - 1, -(2**31)))
-                content[at : at + 4] = struct.pack("!i", length)
-    if rng.random() < 0.7:  # else the length is wrong, too, and nothing behind it is looked at
-        content[:4] = struct.pack("!i", max(len(content), 4))
-    return bytes(content)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [30, pytest.param(2000, marks=pytest.mark.long)])
-def test_of_mutated_messages_of_a_session_every_case_has_its_verdict_or_its_reason(count):
-    session = recorded_session()
-    assert len(session) > 10
-
-    def misbehave(client, rng):
-        client.socket.sendall(mutated(rng.choice(session), rng))
-        client.read(1)
-
-    before, port, ran = descriptors(), free_port(), 0
-    monkey = Monkey(port, count, {"mutated": misbehave})
-    cases = cases_of(50, seed=9)
-    try:
-        while len(monkey.done) < count:
-            vut = factory(f"traci:{port}", deadline_s=0.1, connect_s=5.0)
-            for trajectory in run_cases(vut, cases):
-                assert_has_verdict_or_reason(trajectory)
-                ran += 1
-    finally:
-        monkey.stop()
-    assert ran >= count // 2
-    assert descriptors() <= before
-
-
 def bytewise(pause_s: float):
     """Return a client that sends its messages byte by byte, and what it does at last."""
 
@@ -675,42 +483,3 @@ def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
         "the controller made no step within the deadline of 0.3 s; another client waits, but one "
         "at a time is served"
     )
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", some(range(3), 0))
-def test_a_storm_of_connections_ends_with_a_verdict_or_a_reason_for_every_case(seed):
-    before, port = descriptors(), free_port()
-    stopped = threading.Event()
-    rng = random.Random(seed)  # noqa: S311
-
-    def storm():
-        while not stopped.is_set():
-            crowd = []
-            for _ in range(200):
-                with suppress(OSError):
-                    one = socket.socket()
-                    crowd.append(one)
-                    one.setblocking(False)
-                    with suppress(BlockingIOError):
-                        one.connect(("127.0.0.1", port))
-            time.sleep(0.1)
-            rng.shuffle(crowd)
-            for one in crowd:
-                with suppress(OSError):
-                    one.send(rng.randbytes(20))
-                one.close()
-
-    storming = threading.Thread(target=storm)
-    monkey = Monkey(port, seed, {"none": lambda c, r: c.drive(10_000)})
-    storming.start()
-    try:
-        for trajectory in run_cases(
-            factory(f"traci:{port}", deadline_s=0.2, connect_s=5.0), cases_of(50)
-        ):
-            assert_has_verdict_or_reason(trajectory)
-    finally:
-        stopped.set()
-        storming.join()
-        monkey.stop()
-    assert descriptors() <= before
