@@ -37,7 +37,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.benchmark import greedy_cover
+from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 

@@ -46,7 +46,7 @@ from merge_sumo.engine.evaluate import CaseResult, run_cases
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.studies.benchmark import greedy_cover
+from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.studies.truth import DENSE_CASES, Truth, ground_truth
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, Pool, to_unit

@@ -87,7 +87,6 @@ from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
-from merge_sumo.reports.benchmark_page import benchmark_page
 from merge_sumo.reports.board import write_board
 from merge_sumo.reports.campaign_panel import CampaignPanel
 from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
@@ -106,7 +105,6 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies import benchmark as comparing
 from merge_sumo.studies import (
     certificate,
     explanation,
@@ -118,17 +116,13 @@ from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
-from merge_sumo.studies import sampler_benchmark as contest
 from merge_sumo.studies import stress as ladder
-from merge_sumo.studies.benchmark import Benchmark
-from merge_sumo.studies.benchmark_problems import named_problems
 from merge_sumo.studies.certificate import runs_points_on
 from merge_sumo.studies.counterfactuals import note_avoidance
-from merge_sumo.studies.entrants import LIMIT_S, check_spec
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.sampler_benchmark import SamplerBenchmark
+from merge_sumo.studies.sampler_study import SamplerStudy, Study
 from merge_sumo.studies.truth import Repeats, Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
 from merge_sumo.studies.vut_check import VutCheck
@@ -147,7 +141,7 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers, open_workers, workers_or_cores
+from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
@@ -164,7 +158,7 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
 __all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"]
-__all__ += ["check_scenario", "check_vut", "compare", "compare_runs", "crosscheck", "dated"]
+__all__ += ["check_scenario", "check_vut", "compare_runs", "crosscheck", "dated"]
 __all__ += ["benchmark", "export"]
 __all__ += [
     "explain",
@@ -788,7 +782,7 @@ def truths(
 @contextmanager
 def _study(
     settings: CampaignSettings, runner: Runner, engine: str | None = None
-) -> Iterator[comparing.Study]:
+) -> Iterator[Study]:
     """Open a study; the cache of objects of this process is a passing one.
 
     Raises `UserError` for an engine that a level does not allow.
@@ -803,10 +797,10 @@ def _study(
         Bars(shown=runner.progress) as bars,
     ):
         cache = Path(folder) if passing else None
-        yield comparing.Study(plan, opened, cache, bars.counted, engine)
+        yield Study(plan, opened, cache, bars.counted, engine)
 
 
-def compare(
+def benchmark(
     vut: AnyVut,
     level: int | str = "all",
     *,
@@ -818,8 +812,8 @@ def compare(
     dense: bool | None = None,
     figure: AnyPath | None = None,
     **given: Unpack[StudyKeywords],
-) -> Benchmark:
-    """Compare samplers with each other and with the ground truth; as `merge-sumo compare`.
+) -> SamplerStudy:
+    """Compare samplers with each other and with the ground truth; as `merge-sumo benchmark`.
 
     Args:
         vut: as of `campaign`.
@@ -833,7 +827,7 @@ def compare(
         figure: new file for FMC against cases: .png, .svg or .html.
         given: how a case is run and judged, and where: see `StudyKeywords`.
     """
-    check_keywords("compare", given, StudyKeywords)
+    check_keywords("benchmark", given, StudyKeywords)
     picture = _path(figure)
     if picture is not None:
         figures.check_figure(picture)
@@ -850,74 +844,13 @@ def compare(
         truths = {number: study.truth(number, truth_cases) for number in settings.levels}
         dense_truths = study.dense_truths(settings.levels, dense)
         searches = study.searches(settings.levels, names, seeds, cases, batch)
-    result = Benchmark.of(searches, truths, dense_truths, cases, batch)
+    result = SamplerStudy.of(searches, truths, dense_truths, cases, batch)
     if picture is None:
         return result
     curves = (result.samplers, result.truth_fmc, result.oracle_fmc, result.limit_fmc)
     drawn = figures.coverage_curves(f"{_title(settings)}, {seeds} seeds", *curves)
     figures.save(drawn, picture)
     return replace(result, figure=picture)
-
-
-def benchmark(
-    samplers: Iterable[str],
-    *,
-    seeds: int | None = None,
-    cases: int | None = None,
-    problems: Iterable[str] | None = None,
-    quick: bool = False,
-    limit_s: float = LIMIT_S,
-    out: AnyPath | None = None,
-    resume: bool = False,
-    check: Callable[[], None] = lambda: None,
-    workers: int | None = 1,
-    progress: bool | None = None,
-) -> SamplerBenchmark:
-    """Let samplers search frozen problems whose failures are known; as `merge-sumo benchmark`.
-
-    Args:
-        samplers: names of the registry, or "FILE.py:CLASS".
-        seeds: searches of each sampler on each problem: 3 by default, with the seeds 100 to 102.
-        cases: cases of a search, at most 400, which is the default.
-        problems: names of problems; all by default.
-        quick: two problems, one seed and 50 cases, unless others are given: a first look.
-        limit_s: seconds that a sampler may take in a search, without simulation.
-        out: new folder to write; `runs/benchmark-<date>` by default.
-        resume: go on in the folder `out`: searches that are there are not run again.
-        check: called after every search; may raise to stop there.
-        workers: processes that search; None is one a core.
-        progress: as of `Running`.
-
-    A sampler that raises something, takes too long or gives no cases keeps what it has found by
-    then; its fault is in the result.
-    """
-    names = [str(name) for name in samplers]
-    if not names:
-        raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}, or FILE.py:CLASS")
-    for name in names:
-        check_spec(name)
-    chosen = contest.QUICK_PROBLEMS if quick and problems is None else problems
-    settings = contest.BenchmarkSettings(
-        seeds=(1 if quick else 3) if seeds is None else seeds,
-        cases=(contest.QUICK_CASES if quick else max(contest.COUNTED)) if cases is None else cases,
-        problems=named_problems(None if chosen is None else tuple(chosen)),
-        limit_s=limit_s,
-    )
-    folder = dated("benchmark") if out is None else Path(out)
-    if not resume:
-        check_new(folder)
-    with (
-        open_workers(workers, preload=contest.__name__, apart=True) as opened,
-        Bars(shown=progress) as bars,
-    ):
-        result = contest.benchmark(
-            names, settings, folder, opened, on_step=bars.counted, check=check
-        )
-    record = json.dumps(result.to_record(), indent=1, allow_nan=False)
-    replace_own(folder / contest.RECORD, f"{record}\n".encode())
-    page = benchmark_page(result).encode(errors="backslashreplace")
-    replace_own(folder / contest.PAGE, page)
-    return result
 
 
 def certify(

@@ -67,7 +67,9 @@ class GroupedCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; `UserError` where an option is gone, or would win over itself."""
-        gone.check_options(args, {name for parameter in self.params for name in parameter.opts})
+        gone.check_options(
+            self.name or "", args, {name for parameter in self.params for name in parameter.opts}
+        )
         # Parsing empties the list.
         _, _, given = self.make_parser(ctx).parse_args(args=list(args))
         for option, times in Counter(given).items():

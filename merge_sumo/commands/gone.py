@@ -14,9 +14,18 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "
     "'clearance_m <= 0 and pov_sustained_brake_mps2 <= 2.06'",
+    "--limit": "`python tools/benchmark`, in a checkout, runs the frozen problems",
+    "--problems": "`python tools/benchmark`, in a checkout, runs the frozen problems",
+    "--samplers": "`merge-sumo benchmark` compares samplers on a VUT",
+    "--truth-cases": "`merge-sumo benchmark` compares samplers on a VUT",
     "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
+    "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
+    "compare --vut": "`merge-sumo benchmark` compares samplers on a VUT",
 }
-"""What replaces an option, by its name with dashes, in every command that does not have it."""
+"""What replaces an option, by its name with dashes, in every command that does not have it.
+
+A command before the name limits the sentence to this command.
+"""
 
 
 def check_command(arguments: Sequence[str]) -> None:
@@ -25,11 +34,12 @@ def check_command(arguments: Sequence[str]) -> None:
         raise UserError(f"the command {arguments[0]} is gone: {COMMANDS[arguments[0]]}")
 
 
-def check_options(arguments: Sequence[str], known: Container[str]) -> None:
+def check_options(command: str, arguments: Sequence[str], known: Container[str]) -> None:
     """Raise `UserError` where an argument is an option that is gone, and not a `known` one."""
     for argument in arguments:
         name = argument.partition("=")[0]
         if name == "--":
             return
-        if name in OPTIONS and name not in known:
-            raise UserError(f"the option {name} is gone: {OPTIONS[name]}")
+        successor = OPTIONS.get(f"{command} {name}") or OPTIONS.get(name)
+        if successor is not None and name not in known:
+            raise UserError(f"the option {name} is gone: {successor}")

@@ -36,7 +36,6 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "How many cases, and which": (
         *("samplers", "cases", "seed", "seeds", "radius"),
         *(
-            "problems",
             "truth_cases",
             "dense",
             "quick",
@@ -55,7 +54,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("out", "resume", "force", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
-    "Trust and limits": ("trust_vut", "limit", "vut_memory"),
+    "Trust and limits": ("trust_vut", "vut_memory"),
     "For experts": (
         *("require", "pov", "policies", "sampler", "batch", "in_flight", "learn_from"),
         *("engine", "deadline"),
@@ -67,7 +66,6 @@ GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in na
 KEYWORDS: Final = {
     "density": "density_veh_per_km",
     "deadline": "deadline_s",
-    "limit": "limit_s",
     "vut_memory": "vut_memory_gib",
     "follow_up": "follow_up_s",
     "tolerate": "tolerated",

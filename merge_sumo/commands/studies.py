@@ -86,7 +86,7 @@ def truth(given: Given, vut: VutOption) -> None:
         "workers": CORES,
     },
 )
-def compare(
+def benchmark(
     given: Given,
     vut: VutOption,
     samplers: Annotated[
@@ -104,84 +104,14 @@ def compare(
     The truth of the paper's size misses places that searches find, so coverage is also shown as a
     share of a limit: the coverage of 1,000,000 uniform cases, or of all that truth and searches
     found together, whichever is more. Such a dense truth takes minutes: --dense makes it, and as it
-    is kept, later comparisons use it.
+    is kept, later benchmarks use it.
 
-    Example:  merge-sumo compare --vut design1 --level 0 --samplers uniform,gpr --seeds 3
+    Example:  merge-sumo benchmark --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
     from merge_sumo import api
 
     names = None if samplers is None else samplers.split(",")
-    given.print(api.compare(vut, samplers=names, **given.keywords))
-
-
-@app.verb(
-    options=("quiet",),
-    own={
-        "seeds": optional(
-            int,
-            "Searches of each sampler on each problem, with the seeds 100, 101 and so on.",
-            show_default="3, with --quick 1",
-        ),
-        "cases": optional(
-            int, "Cases of a search, at most 400.", show_default="400, with --quick 50"
-        ),
-        "quick": flag("Two problems, one seed and 50 cases: a first look.", "--quick"),
-        "limit": option(
-            float,
-            1800.0,
-            "Time that a sampler may take in a search, without simulation.",
-            metavar="SECONDS",
-        ),
-        "workers": optional(
-            int, "Processes that search; the results are the same.", show_default="one a core"
-        ),
-    },
-)
-def benchmark(
-    given: Given,
-    samplers: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="SAMPLER...",
-            help="Names of samplers, of this package or of an installed one, or FILE.py:CLASS.",
-            autocompletion=complete.samplers,
-        ),
-    ],
-    problems: Annotated[
-        str | None,
-        typer.Option(help="Names of problems, separated by commas.", show_default="all"),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="New folder to write.", show_default="runs/benchmark-DATE")
-    ] = None,
-    resume: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Go on in this folder: what it has is not run again."),
-    ] = None,
-) -> None:
-    """Let samplers search frozen problems whose failures are known, and give each one number.
-
-    The number is the share of the failure mode coverage of a dense truth that was found: its median
-    over the seeds, as a mean over the problems and over 50, 100 and 400 cases. Samplers of your own
-    pass the contract of samplers first; the code of no other file runs. Writes benchmark.html and
-    benchmark.json. A sampler that fails in a search keeps what it found before.
-
-    Example:  merge-sumo benchmark uniform coverage --quick
-    """
-    from merge_sumo import api
-
-    folder = folder_of(out, resume, "benchmark")
-    names = None if problems is None else [name.strip() for name in problems.split(",")]
-    with stoppable("search", partial(same_command, folder)) as check:
-        result = api.benchmark(
-            samplers,
-            problems=names,
-            out=folder,
-            resume=resume is not None,
-            check=check,
-            **given.keywords,
-        )
-    given.print(result)
+    given.print(api.benchmark(vut, samplers=names, **given.keywords))
 
 
 @app.verb(

@@ -18,8 +18,8 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.benchmark import SamplerSummary
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
+from merge_sumo.studies.sampler_study import SamplerSummary
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS

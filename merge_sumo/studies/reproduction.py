@@ -27,7 +27,7 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.benchmark import Benchmark, OnPart, SamplerSummary, Search, Study
+from merge_sumo.studies.sampler_study import OnPart, SamplerStudy, SamplerSummary, Search, Study
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import make_folder, replace_own, write_new
@@ -237,7 +237,7 @@ def _column(column: Column, scale: Scale, study: Study) -> ColumnResult:
     dense = study.dense_truths((level,), scale.dense)
     # In batches of Table II's size; those of `coverage` are a part of it.
     searches = study.searches((level,), SAMPLERS, scale.seeds, cases, None)
-    found = Benchmark.of(searches, {level: truth}, dense, cases, scale.batch)
+    found = SamplerStudy.of(searches, {level: truth}, dense, cases, scale.batch)
     seeds = {name: _median_seed(of_name) for name, of_name in searches.items()}
     medians = {name: searches[name][seed].outcomes for name, seed in seeds.items()}
     panels = {name: _panel(medians[name], level) for name in reversed(SAMPLERS)}

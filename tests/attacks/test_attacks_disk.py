@@ -28,7 +28,7 @@ CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "unifor
 SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")
 TRUTH = ("truth", "--vut", "design1", "--level", "0", "--cases", "300", "--workers", "1")
 COMPARE = (
-    "compare",
+    "benchmark",
     *("--vut", "design1", "--level", "0", "--samplers", "uniform", "--seeds", "1"),
     *("--cases", "40", "--truth-cases", "300", "--workers", "1"),
 )
@@ -63,7 +63,7 @@ WRITERS = {
     "campaign": (*SMALL, "--out", "{disk}/new"),
     "resume": ("campaign", "--resume", "{disk}/stopped", "-q"),
     "truth": TRUTH,
-    "compare": (*COMPARE, "--figure", "{disk}/curves.png"),
+    "benchmark": (*COMPARE, "--figure", "{disk}/curves.png"),
     "reproduce": (
         "reproduce",
         "--quick",

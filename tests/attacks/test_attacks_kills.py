@@ -72,9 +72,9 @@ COMMANDS = {
         ),
         ROUNDS,
     ),
-    "compare": Command(
+    "benchmark": Command(
         (
-            *("compare", "--vut", "design1", "--level", "0", "--samplers", "uniform,gpr"),
+            *("benchmark", "--vut", "design1", "--level", "0", "--samplers", "uniform,gpr"),
             *(*SMALL_COMPARE, "--figure", "curves.svg", "--json"),
         ),
         2,

@@ -1,4 +1,4 @@
-"""The commands compare, reproduce and probability, and a campaign that stops early."""
+"""The commands benchmark, reproduce and probability, and a campaign that stops early."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def cache(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
 
 
-COMPARE = ("compare", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
+COMPARE = ("benchmark", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
 SMALL = ("--samplers", "uniform,gpr", "--seeds", 2, "--cases", 30, "--batch", 15)
 
 
@@ -53,7 +53,7 @@ class TestCompare:
 
     @pytest.mark.long
     def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.studies.benchmark.DENSE_CASES", 900)
+        monkeypatch.setattr("merge_sumo.studies.sampler_study.DENSE_CASES", 900)
         tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
         found: dict = {}
         for option in ("", "--dense", "--dense", "", "--no-dense"):

@@ -68,8 +68,8 @@ class TestOptions:
         }
         assert set(COMMANDS) == has["as_json"]
         again = {"crosscheck", "explain", "repair", "stress"}
-        fresh = {*again, "benchmark", "failures-per-merge", "probability"}
-        runs_cases = {"campaign", "certify", "compare", "rerun", "truth", *fresh}
+        fresh = {*again, "failures-per-merge", "probability"}
+        runs_cases = {"campaign", "certify", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}
         assert has["level"] == {*runs_cases, "run"} - fresh

@@ -154,7 +154,7 @@ def check_compare_and_truth(world: World, records: list[dict[str, Any]]) -> None
     assert truth["failures"] == failing.sum()
     sampler = ("--samplers", "uniform", "--seeds", 1, "--cases", CASES, "--batch", BATCH)
     (compared,) = world(
-        "compare", *world.tried.asked, *sampler, "--truth-cases", count, "--workers", 1
+        "benchmark", *world.tried.asked, *sampler, "--truth-cases", count, "--workers", 1
     )
     assert compared["truth_fmc"] == truth["fmc"] == fmc(points[failing])
     assert compared["uniform"]["failures_median"] == sum(map(fails, records))

@@ -19,7 +19,7 @@ from merge_sumo import cli
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"--cases": "20", "--seeds": "1", "--radius": "0.3"}
 MORE = {
-    "compare": ["--cases", "20", "--truth-cases", "100"],
+    "benchmark": ["--cases", "20", "--truth-cases", "100"],
     "repair": ["--trials", "8", "--rounds", "1", "--cases", "20"],
 }
 ELSEWHERE = {"train", "reproduce"}

@@ -211,7 +211,7 @@ class TestOtherCommands:
     def test_a_search_and_its_truth_take_them(self, call, swapped, monkeypatch, tmp_path):
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
         options = ("--vut", "design2", "--level", 1, "--workers", 1)
-        compare = ("compare", *options, "--seeds", 1, "--cases", 40, "--truth-cases", 200)
+        compare = ("benchmark", *options, "--seeds", 1, "--cases", 40, "--truth-cases", 200)
         found = [
             json.loads(call(*compare, "--samplers", "uniform", "--json", *named)[1])
             for named in ((), ("--policies", swapped))
@@ -256,7 +256,7 @@ class TestOtherCommands:
         [
             ("campaign", "--vut", "design1"),
             ("truth", "--vut", "design1", "--level", 0),
-            ("compare", "--vut", "design1", "--level", 0),
+            ("benchmark", "--vut", "design1", "--level", 0),
             ("reproduce", "--quick"),
             ("vuts",),
             ("check-vut", "design1"),

@@ -442,7 +442,7 @@ class TestACampaign:
     )
     def test_is_refused_in_one_sentence(self, call, arguments, said):
         pov(YIELDS)
-        for command in ("campaign", "compare") if "--level" in arguments else ("campaign",):
+        for command in ("campaign", "benchmark") if "--level" in arguments else ("campaign",):
             assert_refused(call(command, "--vut", "design1", *arguments), said)
         left = {path.name for path in Path().iterdir()} - {"__pycache__"}
         assert left == {"my_pov.py"}
@@ -544,7 +544,7 @@ class TestOtherCommands:
         pov(YIELDS)
         given = ("--vut", "design2", "--level", "own", "--pov", "my_pov.py:Pov", "--workers", 1)
         sizes = ("--seeds", 1, "--cases", 20, "--batch", 10, "--truth-cases", 60)
-        code, out, _ = call("compare", *given, *sizes, "--samplers", "uniform,gpr", "--json")
+        code, out, _ = call("benchmark", *given, *sizes, "--samplers", "uniform,gpr", "--json")
         assert code == 0
         assert list(json.loads(out)["uniform"]["levels"]) == ["3"]
 

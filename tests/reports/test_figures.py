@@ -14,8 +14,8 @@ from PIL import Image
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.benchmark import LevelShare, SamplerSummary
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
+from merge_sumo.studies.sampler_study import LevelShare, SamplerSummary
 from merge_sumo.values.fmc import RADIUS
 
 

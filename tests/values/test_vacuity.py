@@ -116,7 +116,7 @@ class TestACriterion:
         for command in (
             ("campaign", "--out", tmp_path / "run", "--gate", "failures"),
             ("truth", "--level", 0),
-            ("compare", "--level", 0),
+            ("benchmark", "--level", 0),
             ("certify", "--level", 0, "--out", tmp_path / "certificate"),
         ):
             assert_refused(

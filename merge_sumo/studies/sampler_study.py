@@ -510,7 +510,7 @@ class Study:
 
 
 @dataclass(frozen=True, repr=False)
-class Benchmark(Result):
+class SamplerStudy(Result):
     """Samplers beside each other, and beside the ground truth, over several seeds.
 
     Attributes:
@@ -549,7 +549,7 @@ class Benchmark(Result):
         dense: dict[int, Truth],
         cases: int,
         batch: int | None,
-    ) -> Benchmark:
+    ) -> SamplerStudy:
         """Compare searches of so many cases, by sampler, with the truths by level."""
         limit = limit_fmc(chain.from_iterable(searches.values()), truths, dense)
         summaries = {

@@ -19,22 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-
-from merge_sumo.analysis.result import Result
-from merge_sumo.campaigns.campaign import conduct
-from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate
-from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.studies.benchmark_problems import (
-    PROBLEMS,
-    Problem,
-    ProblemTruth,
-    check_truth,
-    manifest,
-    shipped_truth,
-)
-from merge_sumo.studies.entrants import (
+from entrants import (
     Entrant,
     SamplerFaultError,
     Watch,
@@ -43,6 +28,21 @@ from merge_sumo.studies.entrants import (
     lost_entrant,
     sampler_class,
 )
+from problems import (
+    PROBLEMS,
+    Problem,
+    ProblemTruth,
+    check_truth,
+    manifest,
+    shipped_truth,
+)
+
+from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.campaign import conduct
+from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.errors import UserError
+from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, make_place, replace_own
 from merge_sumo.system.printable import counted

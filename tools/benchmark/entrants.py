@@ -21,7 +21,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.contract import violation
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.benchmark import COMPARED_BATCH
+from merge_sumo.studies.sampler_study import COMPARED_BATCH
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.values.case import Case, FloatArray, Pool

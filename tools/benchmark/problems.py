@@ -1,8 +1,8 @@
-"""The problems of the benchmark of samplers, and their dense truths, which are shipped.
+"""The problems of the benchmark of samplers, and their dense truths, kept beside this file.
 
 A problem is a frozen VUT, a scenario and POV levels. Its truth is what so many uniform cases found:
 the failures alone, each coordinate in steps of 1 / 65,535 of its axis, in a file of
-`benchmark_truths/`, whose SHA-256 is in `manifest.json`. `tools/make_benchmark_truths.py` makes
+`truths/`, whose SHA-256 is in `manifest.json`. `make_truths.py` makes
 both. With the failures come probe cases and the verdicts on them: whatever has changed in the code,
 the benchmark goes on only where these verdicts are the same.
 """
@@ -27,7 +27,7 @@ from merge_sumo.engine.evaluate import THIS_PROCESS, CaseResults, CasesAt, evalu
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.benchmark import oracle
+from merge_sumo.studies.sampler_study import oracle
 from merge_sumo.studies.truth import Truth, ground_truth
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.hashing import sha256_of
@@ -40,7 +40,7 @@ from merge_sumo.values.imperfection import Actuation, Sensing
 from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.vuts import frozen
 
-TRUTHS: Final = Path(__file__).parent / "benchmark_truths"
+TRUTHS: Final = Path(__file__).parent / "truths"
 """The folder of the truths."""
 MANIFEST: Final = "manifest.json"
 ORACLE_CASES: Final = 400
@@ -294,7 +294,7 @@ def manifest(folder: Path = TRUTHS) -> Manifest:
     """Return the manifest of a folder of truths; `UserError` where there is none."""
     found = read_record(folder / MANIFEST, Manifest)
     if found is None:
-        raise UserError(f"there is no {folder / MANIFEST}: run tools/make_benchmark_truths.py")
+        raise UserError(f"there is no {folder / MANIFEST}: run tools/benchmark/make_truths.py")
     return found
 
 
@@ -308,7 +308,7 @@ def shipped_truth(problem: Problem, folder: Path = TRUTHS) -> ProblemTruth:
     if known is None or sha256_of(path) != known.sha256:
         raise UserError(
             f"{path} is not the truth that {MANIFEST} names: install merge-sumo again, or run "
-            "tools/make_benchmark_truths.py"
+            "tools/benchmark/make_truths.py"
         )
     try:
         arrays = read_arrays(io.BytesIO(path.read_bytes()))
@@ -349,7 +349,7 @@ def check_truth(problem: Problem, plan: SimulationPlan, truth: ProblemTruth) -> 
         raise UserError(
             f"the problem {problem.name} is not the one of its truth any more: {changed} of "
             f"{probes} probe cases have another verdict; use the version of merge-sumo that made "
-            "it, or run tools/make_benchmark_truths.py and compare with no earlier number"
+            "it, or run tools/benchmark/make_truths.py and compare with no earlier number"
         )
     if problem.inputs_sha256(plan) == truth.inputs_sha256:
         return None

@@ -1,9 +1,9 @@
 """Make the dense truths of the benchmark of samplers, and their manifest.
 
-    python tools/make_benchmark_truths.py
-    python tools/make_benchmark_truths.py --problems rules,table --workers 2
+    python tools/benchmark/make_truths.py
+    python tools/benchmark/make_truths.py --problems rules,table --workers 2
 
-It takes some minutes of CPU, and no network. The files go into the package: after a change that
+It takes some minutes of CPU, and no network. After a change that
 gives a case another verdict, the numbers of samplers are not comparable with earlier ones.
 """
 
@@ -15,9 +15,7 @@ import time
 from pathlib import Path
 
 import msgspec
-
-from merge_sumo.engine.evaluate import evaluation_workers
-from merge_sumo.studies.benchmark_problems import (
+from problems import (
     MANIFEST,
     PROBLEMS,
     TRUTHS,
@@ -25,6 +23,8 @@ from merge_sumo.studies.benchmark_problems import (
     make_truth,
     named_problems,
 )
+
+from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.system.records import read_record
 
 

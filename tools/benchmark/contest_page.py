@@ -8,17 +8,21 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
-from merge_sumo.reports.pages import page
-from merge_sumo.reports.version_pages import STYLES, Frame
-from merge_sumo.studies.benchmark_problems import Problem
-from merge_sumo.studies.sampler_benchmark import (
+from contest import (
     FIRST_SEED,
     SamplerBenchmark,
     ratio_text,
     truth_share,
 )
+from jinja2 import Environment, Template
+from markupsafe import Markup
+from problems import Problem
+
+from merge_sumo.reports.pages import source_of
+from merge_sumo.reports.version_pages import STYLES, Frame
 
 FRAME: Final = Frame(34.0, 352.0, 10.0, 150.0)
 PLAIN_COLOUR: Final = "#7B3294"
@@ -47,11 +51,10 @@ class ProblemChart:
     across: list[tuple[float, str]]
 
 
-def benchmark_page(result: SamplerBenchmark) -> str:
+def contest_page(result: SamplerBenchmark) -> str:
     """Return the page of a benchmark as HTML."""
-    return page(
-        "benchmark.html.jinja",
-        styles=STYLES,
+    return _template().render(
+        style=Markup("".join(map(source_of, STYLES))),  # noqa: S704 (our own files)
         result=result,
         scores=list(result.samplers.values()),
         first_seed=FIRST_SEED,
@@ -64,6 +67,13 @@ def benchmark_page(result: SamplerBenchmark) -> str:
             for name, one in score.problems.items()
             for seed, fault in one.faults.items()
         ],
+    )
+
+
+def _template() -> Template:
+    environment = Environment(autoescape=True, trim_blocks=True)
+    return environment.from_string(
+        Path(__file__).with_name("contest_page.html.jinja").read_text(encoding="utf-8")
     )
 
 

@@ -17,7 +17,14 @@ from plans import key_of, plan_for
 from vut_contract import factory
 
 from merge_sumo.errors import UserError
-from merge_sumo.studies.benchmark import Benchmark, Search, compare, limit_fmc, oracle, search
+from merge_sumo.studies.sampler_study import (
+    SamplerStudy,
+    Search,
+    compare,
+    limit_fmc,
+    oracle,
+    search,
+)
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
@@ -247,7 +254,7 @@ class TestTheCoveredShare:
         assert compare([self.half], {0: none}).covered_share_median is None
 
     def test_is_shown_in_place_of_shares_of_a_truth_that_is_too_small(self):
-        found = Benchmark.of({"uniform": [self.half]}, {0: self.small}, {}, 3, None)
+        found = SamplerStudy.of({"uniform": [self.half]}, {0: self.small}, {}, 3, None)
         text = "\n".join(found.lines())
         assert (
             "at level 0 it is too small to be divided by: as many cases again could add up to"
@@ -264,7 +271,7 @@ class TestTheCoveredShare:
 
     def test_is_shown_beside_those_of_a_large_one(self):
         truth = TestAComparisonByHand.truth
-        text = "\n".join(Benchmark.of({"uniform": [self.half]}, {0: truth}, {}, 3, None).lines())
+        text = "\n".join(SamplerStudy.of({"uniform": [self.half]}, {0: truth}, {}, 3, None).lines())
         assert "too small" not in text
         assert "FMC / truth" in text
         assert "covered share: of 4 failing" in text

@@ -1,0 +1,245 @@
+"""tools/benchmark: its number by hand, its truths, samplers that go wrong, guests, its page."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from math import pi
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ci_snippets import files
+from contest import BenchmarkSettings, Found, SamplerBenchmark, Task, cases_to, fmc_of
+from entrants import Entrant, sampler_class
+from problems import (
+    MANIFEST,
+    PROBLEMS,
+    TRUTHS,
+    ProblemTruth,
+    changed_verdicts,
+    check_truth,
+    manifest,
+    named_problems,
+    shipped_truth,
+)
+
+from merge_sumo.errors import UserError
+from merge_sumo.testing import SamplerContract
+from merge_sumo.values.fmc import RADIUS, fmc
+
+ROOT = Path(__file__).resolve().parents[2]
+GUESTS = ROOT / "tools" / "benchmark" / "guests"
+PAGE = (ROOT / "docs" / "explanations" / "benchmark.md").read_text(encoding="utf-8")
+DISC = pi * RADIUS**2
+FOUR = [(0.2, 0.2), (0.2, 0.8), (0.8, 0.2), (0.8, 0.8)]
+"""Failures whose discs do not overlap."""
+SETTINGS = BenchmarkSettings(
+    seeds=1, cases=400, problems=named_problems(("stateful", "planner")), limit_s=1.0
+)
+
+
+def found_at(*rows: tuple[int, tuple[float, float]]) -> Found:
+    """Return a search that found failures, (index, point)."""
+    words = dict.fromkeys(("problem", "sampler", "truth_sha256", "merge_sumo"), "")
+    task = Task(**words, seed=100, cases=400, sampler_sha256=None, limit_s=1.0)
+    failures = [[float(index), 0.0, *point] for index, point in rows]
+    return Found(
+        task=task,
+        ran=400,
+        failures=failures,
+        fmc=[(n, fmc_of(failures, n)) for n in SETTINGS.curve],
+        cases_to_most=cases_to(0.9 * 4 * DISC, failures),
+        sampler_s=0.0,
+    )
+
+
+def scored(stateful: list[Found], planner: list[Found]) -> SamplerBenchmark:
+    """Return the benchmark of a sampler's searches of two problems with four failures each."""
+    oracle = np.minimum(np.arange(401), 4) * DISC
+    truths = dict.fromkeys(
+        ("stateful", "planner"), ProblemTruth({0: np.array(FOUR)}, 4 * DISC, oracle, {}, "")
+    )
+    found = {"mine": {"stateful": stateful, "planner": planner}}
+    return SamplerBenchmark.of(SETTINGS, truths, [Entrant("mine")], found)
+
+
+def test_the_number_is_the_mean_of_medians_by_hand():
+    one, two, three, four = FOUR
+    stateful = [
+        found_at((0, one), (60, two), (399, three)),  # .25 .5 .75
+        found_at((49, one)),  # .25 .25 .25
+        found_at((50, one), (99, two), (100, four)),  # 0 .5 .75
+    ]
+    result = scored(stateful, [found_at(*enumerate(FOUR))] * 3)
+    score = result.samplers["mine"]
+    assert score.by_cases == pytest.approx({50: 0.625, 100: 0.75, 400: 0.875})
+    assert score.number == pytest.approx(0.75)
+    assert score.problems["planner"].cases_to_most == 4
+    assert result.oracle_number == score.problems["planner"].number == pytest.approx(1.0)
+    nothing = scored([found_at()], [found_at()]).samplers["mine"]
+    assert (nothing.number, nothing.over_oracle) == (0.0, None)
+
+
+def test_failures_beyond_the_truth_are_not_more_than_one():
+    beyond = found_at(*((k, (0.1 * (k % 10), 0.1 * (k // 10))) for k in range(100)))
+    assert scored([beyond], [beyond]).samplers["mine"].by_cases[400] == 1.0
+
+
+def test_the_truths_are_those_of_the_manifest():
+    assert {path.stem for path in TRUTHS.glob("*.npz")} == {problem.name for problem in PROBLEMS}
+    for problem in PROBLEMS:
+        truth, known = shipped_truth(problem), manifest().truths[problem.name]
+        assert known.failures == {str(k): len(points) for k, points in truth.failures.items()}
+        assert (np.diff(truth.oracle) >= -1e-3 * truth.fmc).all(), "to the error of fmc"
+    truth = shipped_truth(named_problems(("islands",))[0])
+    assert truth.fmc == pytest.approx(sum(map(fmc, truth.failures.values())), rel=1e-9)
+
+
+def test_a_truth_that_was_changed_is_refused(tmp_path):
+    shutil.copytree(TRUTHS, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "stateful.npz"
+    path.write_bytes(path.read_bytes() + b"\0")
+    with pytest.raises(UserError, match=f"is not the truth that {MANIFEST} names"):
+        shipped_truth(named_problems(("stateful",))[0], tmp_path)
+
+
+def test_a_truth_of_code_with_other_verdicts_is_refused():
+    (problem,) = named_problems(("stateful",))
+    plan, truth = problem.plan(), shipped_truth(problem)
+    assert check_truth(problem, plan, truth) is None
+    failed = truth.probes[0].failed.copy()
+    failed[3] ^= True
+    truth = replace(truth, probes={0: replace(truth.probes[0], failed=failed)})
+    with pytest.raises(UserError, match="1 of 96 probe cases have another verdict"):
+        check_truth(problem, plan, truth)
+
+
+@pytest.mark.long
+def test_cases_have_the_verdicts_of_every_truth():
+    for problem in PROBLEMS:
+        assert changed_verdicts(problem, problem.plan(), shipped_truth(problem)) == 0
+
+
+MINE = """
+import os
+import time
+
+from merge_sumo.samplers.uniform import UniformSampler
+
+
+class Raises(UniformSampler):
+    def ask(self, n):
+        # The contract of samplers, too, asks; its pools have more levels.
+        if self.proposed() and len(self.pool.levels) == 1:
+            self.goes_wrong()
+        return super().ask(n)
+
+    def goes_wrong(self):
+        raise ValueError("no idea")
+
+
+class Hangs(Raises):
+    def goes_wrong(self):
+        time.sleep(60.0)
+
+
+class Dies(Raises):
+    def goes_wrong(self):
+        os._exit(3)
+
+
+class Seedless(UniformSampler):
+    def __init__(self, pool, seed, predictor=None):
+        super().__init__(pool, 0, predictor)
+"""
+
+
+def contest(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(ROOT / "tools" / "benchmark"), *arguments, "--workers", "1"]
+    return subprocess.run(  # noqa: PLW1510 (the exit code is what is tested)
+        command, cwd=folder, capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.mark.slow
+def test_a_contest_keeps_what_was_found_before_a_fault_and_goes_on(tmp_path):
+    (tmp_path / "mine.py").write_text(MINE)
+    (tmp_path / "near_failures.py").write_text(files(PAGE)["near_failures.py"])
+    specs = ("near_failures.py:NearFailures", "mine.py:Raises", "mine.py:Hangs", "mine.py:Dies")
+    sizes = ("--problems", "stateful", "--seeds", "1", "--cases", "60", "--limit", "3")
+    done = contest(tmp_path, *specs, *sizes)
+    assert done.returncode == 0, done.stderr
+    record = (tmp_path / "benchmark" / "benchmark.json").read_bytes()
+    samplers = json.loads(record)["samplers"]
+    faults = {name: one["problems"]["stateful"]["faults"] for name, one in samplers.items()}
+    assert faults[specs[0]] == {}
+    assert samplers[specs[0]]["number"] > 0.0
+    assert faults[specs[1]]["100"].startswith("ValueError: no idea (mine.py")
+    assert faults[specs[2]]["100"] == "it took longer than 3 s"
+    assert faults[specs[3]]["100"].startswith("it ended its process each time")
+    ran = {path: json.loads(path.read_text())["ran"] for path in tmp_path.glob("*/searches/*")}
+    assert sorted(ran.values()) == [0, 20, 20, 60]
+    assert contest(tmp_path, *specs, *sizes).returncode == 0
+    assert (tmp_path / "benchmark" / "benchmark.json").read_bytes() == record
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("unifrom",), "there is no sampler 'unifrom': did you mean uniform"),
+        (("mine.py",), "mine.py is a file: name a class of it"),
+        (("uniform", "--problems", "tabel"), "there is no problem 'tabel': did you mean table"),
+        (("uniform", "--cases", "500"), "--cases is 500: choose 1 to 400"),
+        (("uniform", "--out", "."), "is no folder of searches: name a new one"),
+        pytest.param(
+            ("mine.py:Seedless", "--quick"),
+            "breaks the contract of samplers: not so: proposes",
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_a_contest_refuses(tmp_path, arguments, sentence):
+    (tmp_path / "mine.py").write_text(MINE)
+    done = contest(tmp_path, *arguments)
+    assert done.returncode == 1
+    assert sentence in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "benchmark").exists()
+
+
+def needs(library):
+    return pytest.mark.skipif(find_spec(library) is None, reason=f"{library} is not installed")
+
+
+class TestSobol(SamplerContract):
+    sampler = sampler_class(f"{GUESTS / 'sobol.py'}:SobolSampler")
+
+
+@needs("openturns")
+class TestAkMcs(SamplerContract):
+    sampler = sampler_class(f"{GUESTS / 'ak_mcs.py'}:AkMcsSampler")
+
+
+@needs("ribs")
+class TestCmaMe(SamplerContract):
+    sampler = sampler_class(f"{GUESTS / 'cma_me.py'}:CmaMeSampler")
+
+
+@needs("botorch")
+class TestStraddle(SamplerContract):
+    sampler = sampler_class(f"{GUESTS / 'straddle.py'}:StraddleSampler")
+
+
+def test_the_table_of_the_page_has_a_row_for_each_problem():
+    rows = {line.split("`")[1]: line for line in PAGE.splitlines() if line.startswith("| `")}
+    for problem in PROBLEMS:
+        row = rows[problem.name]
+        assert f"`{problem.vut}`" in row
+        assert f"| {problem.scenario} |" in row
+        assert not problem.sense or f"--sense {problem.sense}" in row
+        assert not problem.act or f"--act {problem.act}" in row
