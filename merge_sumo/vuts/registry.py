@@ -25,7 +25,6 @@ from merge_sumo.system.suggestions import meant
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Vut, VutOptions, numbers_of, split_options
 from merge_sumo.vuts.fmu import fmu_vut
-from merge_sumo.vuts.frozen import FROZEN, frozen_vut
 from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
 from merge_sumo.vuts.in_memory import HERE, here_vut, keep, object_of
 from merge_sumo.vuts.onnx import onnx_vut
@@ -177,15 +176,6 @@ KINDS: Final[Registry[VutKind]] = Registry(
             prepare=fmu_vut,
             hosted=True,
             file_of=_before_options,
-        ),
-        FROZEN: VutKind(
-            form="frozen:NAME",
-            what="a VUT of the benchmark of samplers, with failures that are known",
-            example="--vut frozen:table",
-            own_code=False,
-            no_pov="that is a VUT for the ramp",
-            no_parameters="the VUTs of the benchmark stay as they are",
-            prepare=frozen_vut,
         ),
         HERE: VutKind(prepare=here_vut),
     },

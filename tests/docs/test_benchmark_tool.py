@@ -62,7 +62,7 @@ def scored(stateful: list[Found], planner: list[Found]) -> SamplerBenchmark:
     """Return the benchmark of a sampler's searches of two problems with four failures each."""
     oracle = np.minimum(np.arange(401), 4) * DISC
     truths = dict.fromkeys(
-        ("stateful", "planner"), ProblemTruth({0: np.array(FOUR)}, 4 * DISC, oracle, {}, "")
+        ("stateful", "planner"), ProblemTruth({0: np.array(FOUR)}, 4 * DISC, oracle, {})
     )
     found = {"mine": {"stateful": stateful, "planner": planner}}
     return SamplerBenchmark.of(SETTINGS, truths, [Entrant("mine")], found)
@@ -111,7 +111,7 @@ def test_a_truth_that_was_changed_is_refused(tmp_path):
 def test_a_truth_of_code_with_other_verdicts_is_refused():
     (problem,) = named_problems(("stateful",))
     plan, truth = problem.plan(), shipped_truth(problem)
-    assert check_truth(problem, plan, truth) is None
+    check_truth(problem, plan, truth)
     failed = truth.probes[0].failed.copy()
     failed[3] ^= True
     truth = replace(truth, probes={0: replace(truth.probes[0], failed=failed)})

@@ -433,14 +433,12 @@ class SamplerBenchmark(Result):
         settings: what was run.
         truths: the truth of each problem by its name.
         samplers: the scores by spec, in the order of the numbers.
-        remarks: what a reader of the numbers has to know, in sentences.
         folder: folder that was written; None for none.
     """
 
     settings: BenchmarkSettings
     truths: dict[str, ProblemTruth]
     samplers: dict[str, SamplerScore]
-    remarks: tuple[str, ...] = ()
     folder: Path | None = None
 
     @classmethod
@@ -450,7 +448,6 @@ class SamplerBenchmark(Result):
         truths: dict[str, ProblemTruth],
         entered: Sequence[Entrant],
         found: Mapping[str, Mapping[str, Sequence[Found]]],
-        remarks: Sequence[str] = (),
     ) -> SamplerBenchmark:
         """Compare searches by sampler and problem, one a seed."""
         scores = [
@@ -465,7 +462,7 @@ class SamplerBenchmark(Result):
         ]
         ranked = sorted(scores, key=lambda score: -score.number)
         samplers = {score.entrant.spec: score for score in ranked}
-        return cls(settings, truths, samplers, tuple(remarks))
+        return cls(settings, truths, samplers)
 
     def oracle(self, n: int) -> float:
         """Return the mean over the problems of the oracle's share after n cases."""
@@ -510,7 +507,6 @@ class SamplerBenchmark(Result):
                 }
                 for problem in settings.problems
             },
-            "remarks": list(self.remarks),
         }
 
     def lines(self) -> list[str]:
@@ -544,7 +540,6 @@ class SamplerBenchmark(Result):
             f"{settings.cases} cases; .9 / oracle: cases to .9 of the dense FMC as a ratio to "
             "those of the oracle, median over the problems (problems on which it is reached)",
             *faults,
-            *self.remarks,
             *([] if self.folder is None else [f"page: {self.folder / PAGE}"]),
         ]
 
@@ -572,9 +567,7 @@ def benchmark(
     settings: BenchmarkSettings,
     folder: Path,
     workers: Workers,
-    *,
     on_step: OnStep = lambda *_: None,
-    check: Callable[[], None] = lambda: None,
 ) -> SamplerBenchmark:
     """Let samplers search the problems, and return what they found.
 
@@ -588,10 +581,9 @@ def benchmark(
         folder: where each search is written as it ends.
         workers: processes, in which the samplers run: one that ends its process ends no other.
         on_step: told how far it is.
-        check: called after every search; may raise to stop there.
     """
     entered = _entered(samplers, settings.limit_s, workers)
-    truths, remarks = _checked_truths(settings, on_step)
+    truths = _checked_truths(settings, on_step)
     tasks = _tasks(entered, settings)
     place = folder / SEARCHES
     check_own(folder, place)
@@ -604,11 +596,10 @@ def benchmark(
         write_found(place, one)
         found[missing[number]] = one
         on_step(title, ended, len(missing), "searches")
-        check()
     by_sampler: dict[str, dict[str, list[Found]]] = {one.spec: {} for one in entered}
     for task in tasks:
         by_sampler[task.sampler].setdefault(task.problem, []).append(found[task])
-    result = SamplerBenchmark.of(settings, truths, entered, by_sampler, remarks)
+    result = SamplerBenchmark.of(settings, truths, entered, by_sampler)
     return replace(result, folder=folder)
 
 
@@ -622,18 +613,13 @@ def _entered(samplers: Sequence[str], limit_s: float, workers: Workers) -> list[
     return [entered[place] for place in range(len(specs))]
 
 
-def _checked_truths(
-    settings: BenchmarkSettings, on_step: OnStep
-) -> tuple[dict[str, ProblemTruth], list[str]]:
-    """Return the truths by problem, and remarks; `UserError` where one is not to be used."""
-    truths, remarks = {}, list[str]()
+def _checked_truths(settings: BenchmarkSettings, on_step: OnStep) -> dict[str, ProblemTruth]:
+    """Return the truths by problem; `UserError` where one is not to be used."""
     shipped = {problem.name: shipped_truth(problem) for problem in settings.problems}
     for number, problem in enumerate(settings.problems, start=1):
-        truth = truths[problem.name] = shipped[problem.name]
-        remark = check_truth(problem, problem.plan(), truth)
-        remarks += [] if remark is None else [remark]
+        check_truth(problem, problem.plan(), shipped[problem.name])
         on_step("truths checked", number, len(settings.problems), "problems")
-    return truths, remarks
+    return shipped
 
 
 def _tasks(entered: Sequence[Entrant], settings: BenchmarkSettings) -> list[Task]:

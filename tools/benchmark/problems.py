@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+import frozen  # noqa: F401 (registers the VUTs)
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -33,12 +33,10 @@ from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.records import Record, read_record
 from merge_sumo.system.suggestions import meant
-from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import fmc, growth_bound, radius_for
 from merge_sumo.values.imperfection import Actuation, Sensing
 from merge_sumo.values.score import FAILURE_SCORE
-from merge_sumo.vuts import frozen
 
 TRUTHS: Final = Path(__file__).parent / "truths"
 """The folder of the truths."""
@@ -90,19 +88,6 @@ class Problem:
         """Return how its cases run: by the kinematic engine where VUT and POVs need no SUMO."""
         return resolve(self.settings()).with_engine(None)
 
-    def inputs_sha256(self, plan: SimulationPlan) -> str:
-        """Return a hash of what decides its cases: scenario, road, policies, frozen code.
-
-        The rest of the code is not in it; the probe cases are run for that.
-        """
-        inputs = plan.key(self.levels[0])
-        code = sha256_of(Path(frozen.__file__)) if self.vut.startswith(frozen.FROZEN) else None
-        decisive = {name: inputs[name] for name in DECISIVE} | {"code": code}
-        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
-
-
-DECISIVE: Final = ("vut", "policies_sha256", "road_sha256", "scenario", "criterion")
-"""Keys of `SimulationPlan.key` that decide a verdict, besides versions of the software."""
 
 PROBLEMS: Final = (
     Problem(
@@ -204,7 +189,6 @@ class KnownTruth(Record, frozen=True):
 
     Attributes:
         sha256: of its file.
-        inputs_sha256: `Problem.inputs_sha256` as it was made.
         engine: what moved the vehicles.
         cases: uniform cases of each level.
         failures: failures that the file has, by level.
@@ -214,7 +198,6 @@ class KnownTruth(Record, frozen=True):
     """
 
     sha256: str
-    inputs_sha256: str
     engine: str
     cases: int
     failures: dict[str, int]
@@ -251,14 +234,12 @@ class ProblemTruth:
         fmc: FMC of all failures, summed over the levels.
         oracle: FMC of an oracle after 0 to `ORACLE_CASES` cases, (401,): see `benchmark.oracle`.
         probes: probe cases by level.
-        inputs_sha256: hash of what decided its cases (`Problem.inputs_sha256`).
     """
 
     failures: dict[int, FloatArray]
     fmc: float
     oracle: FloatArray
     probes: dict[int, ProbeCases]
-    inputs_sha256: str
 
     def share(self, found_fmc: float) -> float:
         """Return the share of the FMC that was found, 1 at most.
@@ -323,7 +304,6 @@ def shipped_truth(problem: Problem, folder: Path = TRUTHS) -> ProblemTruth:
             level: ProbeCases(arrays[f"probes_{level}"], arrays[f"probes_failed_{level}"])
             for level in levels
         },
-        inputs_sha256=known.inputs_sha256,
     )
 
 
@@ -339,28 +319,16 @@ def changed_verdicts(problem: Problem, plan: SimulationPlan, truth: ProblemTruth
     return changed
 
 
-def check_truth(problem: Problem, plan: SimulationPlan, truth: ProblemTruth) -> str | None:
-    """Return a remark where what decides a problem's cases has changed, and no verdict has.
-
-    Raises `UserError` where a verdict has: a share of such a truth would mean nothing.
-    """
-    changed, probes = changed_verdicts(problem, plan, truth), _count(truth)
+def check_truth(problem: Problem, plan: SimulationPlan, truth: ProblemTruth) -> None:
+    """Raise `UserError` where a probe case has another verdict: a share would mean nothing."""
+    changed = changed_verdicts(problem, plan, truth)
     if changed:
         raise UserError(
             f"the problem {problem.name} is not the one of its truth any more: {changed} of "
-            f"{probes} probe cases have another verdict; use the version of merge-sumo that made "
-            "it, or run tools/benchmark/make_truths.py and compare with no earlier number"
+            f"{sum(len(probes.failed) for probes in truth.probes.values())} probe cases have "
+            "another verdict; use the version of merge-sumo that made it, or run "
+            "tools/benchmark/make_truths.py and compare with no earlier number"
         )
-    if problem.inputs_sha256(plan) == truth.inputs_sha256:
-        return None
-    return (
-        f"{problem.name}: its VUT, scenario or policies have changed since the truth was made; all "
-        f"{probes} probe cases have the same verdicts"
-    )
-
-
-def _count(truth: ProblemTruth) -> int:
-    return sum(len(probes.failed) for probes in truth.probes.values())
 
 
 def _scores_at(
@@ -378,22 +346,19 @@ def _verdicts(results: CaseResults) -> list[float]:
     return [np.nan if one.score is None else one.score for one in results.verdicts()]
 
 
-def make_truth(
-    problem: Problem, folder: Path, *, workers: Workers | None = None, cases: int | None = None
-) -> KnownTruth:
+def make_truth(problem: Problem, folder: Path, cases: int | None = None) -> KnownTruth:
     """Run the uniform cases of a problem, write its truth into a folder, and return its entry.
 
     Args:
         problem: the problem.
         folder: where the file goes; one of the same name is replaced.
-        workers: where cases run, by default in this process.
         cases: cases of a level, by default those of the problem.
     """
     plan, count = problem.plan(), cases or problem.cases
     arrays: dict[str, NDArray[Any]] = {}
     kept: dict[int, Truth] = {}
     for level in problem.levels:
-        found = ground_truth(plan.at_level(level), level, count, workers=workers)
+        found = ground_truth(plan.at_level(level), level, count)
         failing = np.round(found.failures[:MOST_FAILURES] * STEPS).astype(np.uint16)
         arrays[f"failures_{level}"] = failing
         kept[level] = Truth(failing / STEPS, np.full(len(failing), -np.inf))
@@ -407,7 +372,6 @@ def make_truth(
     (folder / f"{problem.name}.npz").write_bytes(content.getvalue())
     return KnownTruth(
         sha256=hashlib.sha256(content.getvalue()).hexdigest(),
-        inputs_sha256=problem.inputs_sha256(plan),
         engine=str(plan.engine),
         cases=count,
         failures={str(level): len(truth.points) for level, truth in kept.items()},

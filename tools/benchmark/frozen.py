@@ -2,7 +2,7 @@
 
 They are of families that real controllers are of, and each fails somewhere; none is good. Their
 constants are in this file and are never tuned: a change of a verdict ends the benchmark
-(`studies/benchmark_problems.py`). All are for the merges of US-23.
+(`problems.py`). All are for the merges of US-23. The kind is registered as this module is imported.
 """
 
 from __future__ import annotations
@@ -17,10 +17,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import Vut, VutOptions, split_options
+from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.registry import KINDS, VutKind
 
-FROZEN: Final = "frozen"
-"""The part of their specs before the colon."""
 CRUISE_MPS: Final = 28.0
 
 
@@ -102,33 +101,6 @@ class Planner(Driver):
         return np.where(away_m < 60.0, chosen, _profile(scene.v_vut_mps))
 
 
-class Follower(Driver):
-    """Car following: the Intelligent Driver Model behind the POV, once that is ahead.
-
-    Source: Treiber, Hennecke, Helbing (2000), with the POV projected onto the ramp.
-    """
-
-    def act(self, scene: Scene) -> FloatArray:
-        """Return accelerations, (K,)."""
-        v_mps, gap_m = scene.v_vut_mps, scene.x_pov_m - scene.x_vut_m - 5.0
-        free = 1.5 * (1.0 - (v_mps / CRUISE_MPS) ** 4)
-        closing = v_mps * (v_mps - scene.v_pov_mps) / (2.0 * np.sqrt(1.5 * 2.0))
-        wanted_m = 2.0 + np.maximum(1.2 * v_mps + closing, 0.0)
-        brake = 1.5 * (wanted_m / np.maximum(gap_m, 0.5)) ** 2
-        return np.where((gap_m > 0.0) & (scene.x_vut_m > -120.0), free - brake, free)
-
-
-class Courteous(Driver):
-    """Rules: lets a near POV pass, early and softly, and hurries where it is first itself."""
-
-    def act(self, scene: Scene) -> FloatArray:
-        """Return accelerations, (K,)."""
-        gap_m, v_mps = _gap_at_merge_m(scene), scene.v_vut_mps
-        lets = (gap_m > -12.0) & (gap_m < 12.0) & (v_mps > 12.0)
-        hurries = (gap_m <= -12.0) & (gap_m > -40.0)
-        return np.where(lets, -1.2, np.where(hurries, 2.0, _profile(v_mps)))
-
-
 class Islands(Driver):
     """Errs on islands of what it sees first, which nothing foretells.
 
@@ -168,8 +140,6 @@ class Islands(Driver):
 
 
 FROZEN_VUTS: Final[dict[str, Callable[[int], Driver]]] = {
-    "courteous": Courteous,
-    "follower": Follower,
     "hysteresis": Hysteresis,
     "islands": Islands,
     "planner": Planner,
@@ -178,15 +148,11 @@ FROZEN_VUTS: Final[dict[str, Callable[[int], Driver]]] = {
 """The frozen VUTs by name."""
 
 
-def frozen_vut(argument: str, _options: VutOptions) -> Vut:
-    """Return the VUT of `frozen:NAME`; `UserError` for another name, and for an option."""
-    spec = f"{FROZEN}:{argument}"
-    name, given = split_options(argument, spec)
+def _frozen_vut(name: str, _options: VutOptions) -> Vut:
+    """Return the VUT of `frozen:NAME`; `UserError` for another name."""
     if name not in FROZEN_VUTS:
-        raise UserError(
-            f"there is no VUT {spec!r}: {meant(name, FROZEN_VUTS)}choose one of "
-            f"{', '.join(f'{FROZEN}:{one}' for one in FROZEN_VUTS)}"
-        )
-    if given:
-        raise UserError(f"--vut {spec}: a frozen VUT has no options")
+        raise UserError(f"there is no VUT frozen:{name}: {meant(name, FROZEN_VUTS)}")
     return Vut(make=lambda corridors, _world: FROZEN_VUTS[name](corridors), by_arrays=True)
+
+
+KINDS.register("frozen", VutKind(prepare=_frozen_vut, own_code=False))
