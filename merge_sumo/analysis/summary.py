@@ -6,10 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from merge_sumo.analysis.audit import MissedShare, audit_cases, missed_share, missed_shares
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.chance import one_per_case
-from merge_sumo.values.empty_ball import EmptyBall, largest_empty_ball
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
@@ -28,10 +26,6 @@ class LevelSummary:
         fmc: failure mode coverage in the level's unit cube; M(s, 0.05, -500) under the paper's
             criterion and in up to three coordinates.
         regions: groups of failures that are linked at the radius of FMC.
-        unseen: the largest ball of the level's unit cube that no case has entered, but for those
-            that ended in an error; None without cases.
-        missed: bound on the share of the level that fails far from all failures found; None without
-            audit cases.
     """
 
     cases: int
@@ -40,23 +34,17 @@ class LevelSummary:
     severities: dict[str, int]
     fmc: float
     regions: int
-    unseen: EmptyBall | None = None
-    missed: MissedShare | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What was found in all: totals, ends and severities of episodes by name, and each level.
-
-    `missed` is the bound for the pool as a whole; None without audit cases.
-    """
+    """What was found in all: totals, ends and severities of episodes by name, and each level."""
 
     cases: int
     failures: int
     ends: dict[str, int]
     severities: dict[str, int]
     levels: dict[int, LevelSummary]
-    missed: MissedShare | None = None
 
 
 def summarise(
@@ -67,8 +55,6 @@ def summarise(
     A case counts once, by the run that stands for it where a share of its runs is `tolerated`.
     """
     every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
-    audited = audit_cases(outcomes)
-    missed = missed_shares(audited, every)
     outcomes = one_per_case(outcomes, tolerated)
     ends = Counter(outcome.measures.end for outcome in outcomes)
     return Summary(
@@ -76,8 +62,7 @@ def summarise(
         failures=sum(outcome.failed for outcome in outcomes),
         ends={end.value: ends[end] for end in End if ends[end]},
         severities=severities_of(outcomes),
-        levels={level: _level(outcomes, level, missed.get(level)) for level in every},
-        missed=missed_share(audited, levels),
+        levels={level: _level(outcomes, level) for level in every},
     )
 
 
@@ -87,9 +72,8 @@ def severities_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
     return {severity.value: counts[severity] for severity in Severity if counts[severity]}
 
 
-def _level(outcomes: Sequence[Outcome], level: int, missed: MissedShare | None) -> LevelSummary:
+def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
-    seen = to_unit((o.case for o in at_level if not o.measures.end.is_error), level)
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
     return LevelSummary(
         cases=len(at_level),
@@ -98,6 +82,4 @@ def _level(outcomes: Sequence[Outcome], level: int, missed: MissedShare | None) 
         severities=severities_of(at_level),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
-        unseen=largest_empty_ball(seen),
-        missed=missed,
     )

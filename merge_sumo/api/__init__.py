@@ -50,7 +50,6 @@ from merge_sumo.api.keywords import (
 from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
-    CertificateResult,
     CrosscheckResult,
     PerMergeResult,
     PolicyChecks,
@@ -105,19 +104,17 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import (
-    certificate,
     explanation,
     reproduction,
     versions,
     vut_check,
 )
-from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
-from merge_sumo.studies.certificate import runs_points_on
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
@@ -157,7 +154,7 @@ if TYPE_CHECKING:
     from merge_sumo.values.case import Case
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
-__all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign", "certify"]
+__all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign"]
 __all__ += ["check_scenario", "check_vut", "compare_runs", "crosscheck", "dated"]
 __all__ += ["benchmark", "export"]
 __all__ += [
@@ -192,7 +189,7 @@ def campaign(
         vut: vehicle under test: a spec, a class, a function, or an object.
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
-            `seed`, `stop_after_converged`, `audit`, `learn_from`), how a case is run
+            `seed`, `stop_after_converged`, `learn_from`), how a case is run
             and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
             `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
@@ -595,14 +592,13 @@ def report(run: AnyRun) -> Path:
     return _opened(run).report()
 
 
-def board(run: AnyRun, *, certificate: AnyPath | None = None) -> Shown:
+def board(run: AnyRun) -> Shown:
     """Write the page of a campaign for a safety board, and its JSON; as `merge-sumo board`.
 
     Args:
         run: the campaign, or its folder.
-        certificate: folder of a certificate of the same VUT, as `certify` writes it.
     """
-    html, record = write_board(_opened(run).run, _path(certificate))
+    html, record = write_board(_opened(run).run)
     return Shown({"board": str(html), "record": str(record)}, [str(html), str(record)])
 
 
@@ -851,56 +847,6 @@ def benchmark(
     drawn = figures.coverage_curves(f"{_title(settings)}, {seeds} seeds", *curves)
     figures.save(drawn, picture)
     return replace(result, figure=picture)
-
-
-def certify(
-    vut: AnyVut,
-    level: int | str = "all",
-    *,
-    radius: float = 0.01,
-    out: AnyPath | None = None,
-    resume: bool = False,
-    engine: str = Engine.SUMO,
-    check: Callable[[], None] = lambda: None,
-    **given: Unpack[StudyKeywords],
-) -> CertificateResult:
-    """Certify that no ball of a radius in the pool fails throughout; as `merge-sumo certify`.
-
-    Args:
-        vut: as of `campaign`.
-        level: POV level 0, 1 or 2, "own" for a `pov`, or "all".
-        radius: radius of the balls, as a share of the axes of the pool.
-        out: new folder to write; `runs/certify-<vut>-<date>` by default.
-        resume: go on with the certificate in `out`.
-        engine: "sumo", or "kinematic": see `truths`.
-        check: called after every block of cases; may raise to stop there.
-        given: how a case is run and judged, and where: see `StudyKeywords`.
-    """
-    check_keywords("certify", given, StudyKeywords)
-    settings, runner = settings_for(vut, {**given, "level": level})
-    lattices = certificate.lattices_of(settings, radius)
-    if resume and out is None:
-        raise UserError("say with out= which folder is resumed")
-    folder = dated(f"certify-{settings.vut}") if out is None else Path(out)
-    if not resume:
-        check_new(folder)
-    plan = resolve(settings).with_engine(engine)
-    total = sum(map(len, lattices.values()))
-    with (
-        runner.open(plan, at_once=True) as opened,
-        runner.counter(_title(settings), total) as counter,
-    ):
-        done = certificate.certify(
-            settings,
-            radius,
-            folder,
-            plan,
-            runs_points_on(opened, settings, plan, folder),
-            resume=resume,
-            on_cases=counter.ended,
-            check=check,
-        )
-    return CertificateResult(done, folder / certificate.CERTIFICATE)
 
 
 def probability(

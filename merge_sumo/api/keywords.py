@@ -93,7 +93,6 @@ class Settings(Setup, total=False):
         in_flight: most cases that run or wait while the sampler is asked, instead of batches.
         seed: same seed, same outcomes.
         stop_after_converged: stop when less than this share of new coverage is expected.
-        audit: uniform cases among them, which bound what the campaign missed; none by default.
         repeat: how often each case runs, once by default, with another draw of what is random;
             "auto" repeats cases where chance decides. Runs count as cases.
         tolerated: share of its runs in which a case may fail, 0 by default: it fails where more do.
@@ -109,7 +108,6 @@ class Settings(Setup, total=False):
     in_flight: int | None
     seed: int
     stop_after_converged: float | None
-    audit: int | None
     repeat: int | Literal["auto"]
     tolerated: float
     learn_from: Sequence[Path | str] | None

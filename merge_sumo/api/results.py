@@ -33,7 +33,6 @@ from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.certificate import Certificate
 from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
@@ -248,9 +247,6 @@ class CampaignRun(Result):
         optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
         optional += [f"  note: {note}" for note in doubts(run.cases, run.criterion)]
         optional += [_level_line(level, summary) for level, summary in levels.items()]
-        optional += (
-            [] if self.summary.missed is None else [self.summary.missed.sentence("the pool")]
-        )
         optional += self._against_lines()
         optional += [self.careful, f"report: {self.report_file}"]
         worst = failures(run.cases)[:1]
@@ -288,8 +284,6 @@ class CampaignRun(Result):
     def _converged_line(self) -> str:
         cases, share = (self.settings[name] for name in ("cases", "stop_after_converged"))
         caveat = " (this says nothing of regions that no case has come near)"
-        if self.summary.missed is not None:
-            caveat = ", and audit cases bound what was missed by less than that"
         return (
             f"stopped after {len(self._run.outcomes)} of {cases} cases: three times in a row the "
             f"next batch was expected to add less than {share:.2%} to the coverage{caveat}"
@@ -319,13 +313,9 @@ def _level_line(level: int, summary: LevelSummary) -> str:
     title = f"  level {level_name(level)}"
     if summary.cases and not summary.tested:
         return f"{title}: nothing was tested in {summary.cases} cases"
-    ball = summary.unseen
-    empty = "" if ball is None else f"; largest ball without a case: {ball.radius:.0%} of the axes"
-    if summary.missed is not None:
-        empty += f"; {summary.missed.in_short}"
     return (
         f"{title}: {counted(summary.failures, 'failure')} in {counted(summary.cases, 'case')}, "
-        f"FMC {summary.fmc:.4f}, {counted(summary.regions, 'region')}{empty}"
+        f"FMC {summary.fmc:.4f}, {counted(summary.regions, 'region')}"
     )
 
 
@@ -366,10 +356,6 @@ class CaseRun(Result):
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
         return lines_of(self.outcome, self.trajectory)
-
-
-NAMED: Final = 5
-"""Failures of a level of a certificate that are printed; the certificate names more."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -479,45 +465,6 @@ def _engine_of(truth: Truth) -> str:
         return ""
     cases = counted(truth.in_sumo, "case")
     return f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-
-
-@dataclass(frozen=True, repr=False)
-class CertificateResult(Result):
-    """A certificate that is complete.
-
-    Attributes:
-        certificate: `levels` by level, `radius` and `sentence`.
-        file: `certificate.json` in its folder.
-    """
-
-    certificate: Certificate
-    file: Path
-
-    @property
-    def certain(self) -> bool:
-        """Whether no ball of the radius fails throughout."""
-        return self.certificate.certain
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        one = self.certificate
-        levels = {level: asdict(result) for level, result in one.levels.items()}
-        summary = {"certain": one.certain, "sentence": one.sentence, "radius": one.radius}
-        return {**summary, "levels": levels, "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return the sentence, and the worst failures by level."""
-        lines = [self.certificate.sentence]
-        for level, result in self.certificate.levels.items():
-            if result.failures or result.untold:
-                lines.append(
-                    f"  level {level_name(level)}: {result.failures:,} failures and "
-                    f"{result.untold:,} without a verdict in {result.cases:,} cases"
-                )
-            for case in result.worst[:NAMED]:
-                values = ", ".join(f"{name} {value:.4g}" for name, value in case.items())
-                lines.append(f"    {values}")
-        return [*lines, f"certificate: {self.file}"]
 
 
 @dataclass(frozen=True, repr=False)

@@ -220,15 +220,8 @@ def _compared(
     # What was loaded while it ran must be the same, too, although it is not loaded yet.
     for name in FILES:
         record[name] = _files_now(recorded, name, record[name] or {}) or None
-    cases, audit = recorded.get("cases"), recorded.get("audit")
-    if (cases, audit) != (settings.cases, settings.audit) and (audit or settings.audit):
-        # What was drawn for one plan would be drawn again for the other.
-        raise UserError(
-            f"{before.folder} was begun with {cases} cases, {audit or 0} of them audit cases, "
-            "which are spread over all: leave --cases and --audit as they were, or begin another "
-            "campaign"
-        )
     # Which cases come next does not depend on how many there are to be.
+    cases = recorded.get("cases")
     grown = isinstance(cases, int) and cases < settings.cases
     if grown:
         recorded["cases"] = settings.cases
@@ -355,12 +348,9 @@ def _run(
     check: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
-    settings, ended = campaign.settings, list(campaign.history)
-    audit = settings.audit_plan
+    ended = list(campaign.history)
     with closing(_search(campaign, against, workers, on_case)) as search:
         for together in search:
-            if audit is not None:
-                together = audit.mark_batches(together, ended)  # noqa: PLW2901
             campaign.append(*together)
             ended += [outcome for batch in together for outcome, _ in batch]
             check()
@@ -381,7 +371,7 @@ def _search(
     settings, plan, history = campaign.settings, campaign.plan, campaign.history
     picks = settings.new_sampler(twin_of(settings, plan))
     search_on_two_cores(picks, workers, settings.cases - len(history))
-    sampler = settings.audited(picks)
+    sampler = settings.with_repeats(picks)
     motions = None
     if campaign.before is not None and sampler.uses_predictions:
         motions = {o.index: t.motion for o, t in campaign.recorded()}
@@ -435,7 +425,7 @@ def _in_batches(
 ) -> Generator[list[Batch], None, None]:
     """Run batch by batch what is missing of a campaign; yield batches that ended together."""
     proposed = proposals(
-        settings.audited(settings.new_sampler()),
+        settings.with_repeats(settings.new_sampler()),
         *(history, settings.cases, settings.batch),
     )
     missing = settings.cases - len(history)

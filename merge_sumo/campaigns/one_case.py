@@ -24,7 +24,6 @@ ONE: Final[dict[str, Any]] = {
     "in_flight": None,
     "sampler": "uniform",
     "stop_after_converged": None,
-    "audit": None,
     "repeat": 1,
 }
 """Settings of a campaign that is one case."""

@@ -7,8 +7,6 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from merge_sumo.analysis.audit import CONFIDENCE, AuditCase, missed_share
-from merge_sumo.campaigns.audit import Audit, AuditedSampler
 from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.stopping import StoppingRule
@@ -44,7 +42,6 @@ class CampaignSettings:
     cases: int = DEFAULT_CASES
     batch: int | None = None
     in_flight: int | None = None
-    audit: int | None = None
     repeat: int | Literal["auto"] = 1
     tolerated: float = 0.0
     seed: int = 0
@@ -77,7 +74,7 @@ class CampaignSettings:
         if OWN in self.levels and self.pov is None:
             raise UserError("level own is that of a POV of your own: name one as pov")
         self._check_sampler()
-        for name in ("cases", "batch", "in_flight", "audit", "repeat"):
+        for name in ("cases", "batch", "in_flight", "repeat"):
             number = getattr(self, name)
             if isinstance(number, int) and number < 1:
                 option = name.replace("_", "-")
@@ -91,11 +88,6 @@ class CampaignSettings:
             self._check_in_flight(self.in_flight)
         if self.against is not None:
             self._check_against(self.against)
-        if self.audit is not None and self.audit > self.cases:
-            raise UserError(
-                f"--audit is {self.audit} and --cases is {self.cases}: audit cases are among the "
-                "cases of the campaign, and cannot be more"
-            )
         if self.seed < 0:
             raise UserError(f"--seed is {self.seed}: it must be 0 or more")
         check_tolerated(self.tolerated)
@@ -150,7 +142,6 @@ class CampaignSettings:
     def _check_against(self, against: str) -> None:
         for option, given in (
             ("--in-flight", self.in_flight),
-            ("--audit", self.audit),
             ("--learn-from", self.learn_from or None),
             ("--repeat", None if self.repeat == 1 else self.repeat),
             ("--tolerate", self.tolerated or None),
@@ -186,16 +177,9 @@ class CampaignSettings:
             self.stop_after_converged,
             self.batch or self.in_flight,
             self.new_sampler,
-            self._missed,
             tolerated=self.tolerated,
         )
-        self._check_audit_suffices(self.stop_after_converged)
         return rule
-
-    @property
-    def audit_plan(self) -> Audit | None:
-        """Which cases are audit cases; None without any."""
-        return None if self.audit is None else Audit(self.audit, self.cases, self.pool, self.seed)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
         """Return the sampler, which was told nothing; `predictor` as of `make_sampler`."""
@@ -217,39 +201,6 @@ class CampaignSettings:
         """Whether runs of a case may differ: not where the package brings all that drives."""
         own_pov = OWN in self.levels and self.pov is not None and not is_built_in(self.pov)
         return own_pov or self.scenario.sense.is_random or not is_built_in(self.vut)
-
-    def audited(self, sampler: Sampler) -> Sampler:
-        """Return a sampler that was told nothing, with repeats and audit cases among its picks."""
-        audit, repeating = self.audit_plan, self.with_repeats(sampler)
-        return repeating if audit is None else AuditedSampler(repeating, audit)
-
-    @property
-    def _missed(self) -> Callable[[Sequence[Outcome]], float] | None:
-        """What gives the share that audit cases leave open after outcomes."""
-        audit = self.audit_plan
-        if audit is None:
-            return None
-
-        def missed(outcomes: Sequence[Outcome]) -> float:
-            bound = audit.missed(outcomes)
-            return 1.0 if bound is None else bound.at_most
-
-        return missed
-
-    def _check_audit_suffices(self, share: float) -> None:
-        """Refuse audit cases that are too few for the search to end before its number of cases."""
-        audit = self.audit_plan
-        if audit is None:
-            return
-        indices = [index for index in range(self.cases) if index in audit]
-        clean = [AuditCase(index, audit.case(index).level, missed=False) for index in indices]
-        best = missed_share(clean, self.levels)
-        if best is not None and best.at_most >= share:
-            raise UserError(
-                f"--stop-after-converged is {share} and --audit is {self.audit}: at best, so many "
-                f"audit cases bound what was missed by {best.at_most:.2g} with {CONFIDENCE:.0%} "
-                "confidence; choose more audit cases, or a larger share"
-            )
 
     @property
     def criterion(self) -> Criterion:

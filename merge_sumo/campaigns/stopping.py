@@ -2,7 +2,7 @@
 
 Only a sampler that can say what it expects of its next batch can be asked. What it expects is what
 its surrogate knows: a region of failures that no case has come near is in no expectation. So the
-rule saves cases; it proves nothing. Audit cases bound what was missed.
+rule saves cases; it proves nothing.
 """
 
 from __future__ import annotations
@@ -40,9 +40,6 @@ class StoppingRule:
     bear it out: on average they added less than that, too. While no failure is known, the search
     goes on. A pure function of the outcomes, so that a resumed campaign ends where it would have
     ended; what was expected after a batch is worked out once and kept.
-
-    In a campaign with audit cases, the share of the pool that it may have missed must be below
-    `share`, too.
     """
 
     def __init__(
@@ -50,14 +47,12 @@ class StoppingRule:
         share: float,
         batch: int | None,
         fresh: Callable[[], Sampler],
-        missed: Callable[[Sequence[Outcome]], float] | None = None,
         *,
         tolerated: float = 0.0,
     ) -> None:
         """Stop below `share`; `fresh` makes a sampler that was told nothing.
 
-        `missed` gives the share that audit cases leave open after outcomes, and a case fails where
-        more than the `tolerated` share of its runs do.
+        A case fails where more than the `tolerated` share of its runs do.
 
         Raises `UserError` for a share that is no share, or a sampler that expects nothing.
         """
@@ -71,7 +66,7 @@ class StoppingRule:
                 "--stop-after-converged needs a sampler that says what it expects of its next "
                 f"batch: choose --sampler {' or '.join(able)}"
             )
-        self._share, self._batch, self._fresh, self._missed = share, batch, fresh, missed
+        self._share, self._batch, self._fresh = share, batch, fresh
         self._tolerated = tolerated
         self._expected: dict[int, float] = {}
 
@@ -79,8 +74,6 @@ class StoppingRule:
         """Return whether the search is over after these outcomes, which have a verdict."""
         last = max((outcome.batch for outcome in outcomes), default=-1)
         if last + 1 <= PATIENCE:
-            return False
-        if self._missed is not None and self._missed(outcomes) >= self._share:
             return False
         expected = (self.expected(outcomes, last - ago) for ago in range(PATIENCE))
         return all(gain < self._share for gain in expected) and (

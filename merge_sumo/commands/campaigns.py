@@ -42,7 +42,6 @@ def _vut_option(help: str, show_default: str) -> Shared:
         *(
             *SETTINGS,
             "stop_after_converged",
-            "audit",
             "repeat",
             "tolerate",
             *SETUP,
@@ -329,13 +328,7 @@ def _say_interruption(opened: CampaignRun) -> None:
         say(sentence)
 
 
-@app.verb(
-    own={
-        "certificate": optional(
-            Path, "Folder of a certificate of the same VUT, as `certify` writes it.", metavar="DIR"
-        )
-    }
-)
+@app.verb()
 def board(given: Given, run: RunArgument) -> None:
     """Write the page of a campaign for a safety board, and the same as JSON for a safety case.
 
@@ -347,7 +340,7 @@ def board(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
     opened = api.open_run(run)
-    given.print(api.board(opened, **given.keywords))
+    given.print(api.board(opened))
     _say_interruption(opened)
 
 

@@ -7,9 +7,15 @@ from typing import Final
 
 from merge_sumo.errors import UserError
 
-COMMANDS: Final[Mapping[str, str]] = {}
+COMMANDS: Final[Mapping[str, str]] = {
+    "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
+    "bounds how much of the pool can fail",
+}
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
+    "--audit": "`merge-sumo probability RUN` bounds, with fresh cases, how much fails where the "
+    "campaign expects no failure",
+    "--certificate": "`merge-sumo probability RUN --cases 100000` says more than a certificate",
     "--in-process": "`merge-sumo run --debug` runs one case within reach of a debugger",
     "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "

@@ -34,7 +34,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("headway_ahead", "headway_behind", "only", "a_min", "check"),
     ),
     "How many cases, and which": (
-        *("samplers", "cases", "seed", "seeds", "radius"),
+        *("samplers", "cases", "seed", "seeds"),
         *(
             "truth_cases",
             "dense",
@@ -44,12 +44,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "density",
         ),
         *("param", "cost", "trials", "rounds"),
-        *("draws", "stop_after_converged", "audit", "repeat"),
+        *("draws", "stop_after_converged", "repeat"),
     ),
-    "Verdict": (
-        *("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),
-        *("certificate",),
-    ),
+    "Verdict": (*("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),),
     "Where it runs, and what it writes": (
         *("out", "resume", "force", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
@@ -212,12 +209,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Stop early when, three batches in a row, the next batch is expected to add less than this "
         "share to the coverage. Needs a sampler that can tell: coverage.",
         metavar="SHARE",
-    ),
-    "audit": optional(
-        int,
-        "Of the cases, so many are uniform, whatever was found: they bound, with confidence, the "
-        "share of the pool where the campaign has missed failures.",
-        metavar="N",
     ),
     "repeat": option(
         str,

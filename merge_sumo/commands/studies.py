@@ -115,46 +115,6 @@ def benchmark(
 
 
 @app.verb(
-    options=("level", *SETUP, "engine", "dask", "quiet"),
-    own={
-        "radius": option(float, 0.01, "Radius of the balls, as a share of the axes of the pool."),
-        "workers": CORES,
-    },
-)
-def certify(
-    given: Given,
-    vut: VutOption,
-    out: Annotated[
-        Path | None, typer.Option(help="New folder to write.", show_default="runs/certify-VUT-DATE")
-    ] = None,
-    resume: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Go on with the certificate in this folder.")
-    ] = None,
-) -> None:
-    """Certify that no ball of a radius in the pool fails throughout, or find one that may.
-
-    Tests a lattice that covers the pool: every ball of that radius, in coordinates of the unit
-    cube, contains one of its cases. Where none of them fails, no such ball fails throughout. This
-    is certain, as the simulation is deterministic; some cases run twice to show that the VUT is,
-    too. A failing region that is thinner than the balls may lie between the cases.
-    `tools/check_certificate.py` checks the folder, and shares nothing with it.
-
-    Exit code 0 when it is certain, 1 when a case fails, gives no verdict or ends otherwise the
-    second time.
-
-    Example:  merge-sumo certify --vut design2 --radius 0.01
-    """
-    from merge_sumo import api
-
-    folder = folder_of(out, resume, f"certify-{vut}")
-    with stoppable("block", partial(same_command, folder)) as check:
-        again = resume is not None
-        result = api.certify(vut, out=folder, resume=again, check=check, **given.keywords)
-    given.print(result)
-    raise typer.Exit(0 if result.certain else 1)
-
-
-@app.verb(
     options=("engine", *OF_RECORDED),
     own={
         "cases": option(int, 4000, "Fresh cases to run."),

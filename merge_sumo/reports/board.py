@@ -30,17 +30,16 @@ IN_SHORT: Final = ("often", "simulators", "robust")
 """Topics whose first sentence stands at the top of the page."""
 
 
-def write_board(run: Run, certificate: Path | None = None) -> list[Path]:
+def write_board(run: Run) -> list[Path]:
     """Write `board.html` and `board.json` into the folder of a run, and return their paths.
 
-    `certificate` is the folder of a certificate of the same VUT. Raises `UserError` where a file
-    that is read is not as it was written or of another campaign, or one of the two is there and is
-    not ours.
+    Raises `UserError` where a file that is read is not as it was written or of another campaign, or
+    one of the two is there and is not ours.
     """
     html, record = run.folder / PAGE, run.folder / RECORD
     check_page(html)
     _check_record(record)
-    model = BoardModel(run, certificate)
+    model = BoardModel(run)
     if model.stress is not None:
         check_stress_of(run, model.stress)
     if model.crosscheck is not None:
@@ -83,13 +82,10 @@ def board_record(run: Run, topics: list[Topic], files: dict[str, str]) -> dict[s
 def _hashes(model: BoardModel, topics: list[Topic]) -> dict[str, str]:
     """Return the SHA-256 of each file that a sentence names, by its name."""
     named = {one.file for topic in topics for said in topic.statements for one in said.figures}
-    folders = [model.run.folder]
-    if model.certificate_folder is not None:
-        folders.append(model.certificate_folder)
     found: dict[str, str] = {}
     for name in sorted(named | {SETTINGS, OUTCOMES}):
-        paths = [folder / name for folder in folders]
-        for path in [*paths, model.kept.get(name, paths[0])]:
+        own = model.run.folder / name
+        for path in (own, model.kept.get(name, own)):
             if path.is_file():
                 found[name] = hashlib.sha256(regular(path).read_bytes()).hexdigest()
                 break

@@ -18,8 +18,6 @@ from merge_sumo.analysis.verdict import Verdict, judge
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report_model import kept_truth, road_of_run
-from merge_sumo.road.scenario_file import SUFFIX, shipped_scenarios
-from merge_sumo.studies.certificate import CERTIFICATE, certificate_of
 from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
 from merge_sumo.studies.crosscheck import CROSSCHECK, Verdicts, crosscheck_of
 from merge_sumo.studies.failures_per_merge import RESULT as PER_MERGE
@@ -30,7 +28,7 @@ from merge_sumo.studies.stress import STRESS, Stress, stress_of
 from merge_sumo.system.printable import printable, quoted, two_digits
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.scenario import OWN, US23, MergeScenario, lane_of, level_name
+from merge_sumo.values.scenario import OWN, MergeScenario, lane_of, level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.severity import Severity, meanings
 
@@ -139,11 +137,10 @@ class BoardModel:
     def __init__(
         self,
         run: Run,
-        certificate: Path | None = None,
         *,
         summary: Summary | None = None,
     ) -> None:
-        """Read the run, what studies left in its folder, and the folder of a certificate.
+        """Read the run and what studies left in its folder.
 
         `summary` is that of the run, where it is known.
         """
@@ -157,14 +154,10 @@ class BoardModel:
         self.probability = probability_of(run.folder)
         self.stress = stress_of(run.folder)
         self.crosscheck = crosscheck_of(run.folder)
-        self.certificate_folder = certificate
-        self.certificate = None if certificate is None else certificate_of(certificate)
         if self.per_merge is not None:
             self._check(self.per_merge.campaign, run.folder / PER_MERGE)
         if self.probability is not None:
             self._check(self.probability.campaign, run.folder / PROBABILITY)
-        if certificate is not None and self.certificate is not None:
-            self._check(self.certificate.settings, certificate / CERTIFICATE)
 
     def _check(self, settings: Mapping[str, Any], path: Path) -> None:
         for name in OF_A_CAMPAIGN:
@@ -369,65 +362,19 @@ class BoardModel:
     # What may remain.
 
     def _remains(self) -> Iterator[Statement]:
-        missed = self.summary.missed
-        if missed is None:
-            yield Statement(
-                "Not known: how much of the pool fails far from every failure that was found. A "
-                "campaign with audit cases bounds it.",
-                command=self._again_with_audit(100),
-            )
-        else:
-            yield say(
-                "At most {} of the pool fails far from every failure that was found, with {} "
-                "confidence: {} audit cases, chosen uniformly, showed {} such failures.",
-                share(missed.at_most, OUTCOMES, "bound by the lines with audit"),
-                share(missed.confidence, OUTCOMES, "confidence of the bound"),
-                self._lines(missed.cases, "audit"),
-                figure(missed.missed, OUTCOMES, "lines with audit, missed"),
-            )
         for level, found in self.summary.levels.items():
             yield from self._searched(level, found)
         yield from self._chance()
-        yield self._certified()
-
-    def _again_with_audit(self, audit: int) -> str:
-        """Return the command of the campaign with audit cases beside those that it has."""
-        cases = self.summary.cases + audit
-        seed = f"--seed {self._seed}"
-        return f"merge-sumo campaign {self._setup} --cases {cases} {seed} --audit {audit}"
-
-    @property
-    def _setup(self) -> str:
-        """What a command needs to test the same again."""
-        run, criterion = self.run, self.run.criterion
-        name, levels = run.scenario.name, run.levels
-        given: dict[str, Any] = {option: run.settings.get(option) for option in ("vut", "pov")}
-        if name != US23.name:
-            given["scenario"] = name if name in shipped_scenarios() else f"{name}{SUFFIX}"
-        if name in shipped_scenarios():
-            for option in ("sense", "act"):
-                given[option] = getattr(run.scenario, option).text or None
-        given["policies"] = run.settings.get("policies")
-        if criterion.require is not None:
-            given["require"] = criterion.require
-        elif not criterion.is_papers or "scenario" in given:
-            given["fail-when"] = criterion.text
-        if len(levels) == 1:
-            given["level"] = level_name(levels[0])
-        return " ".join(f"--{k} {quoted(str(one))}" for k, one in given.items() if one is not None)
 
     def _searched(self, level: int, found: LevelSummary) -> Iterator[Statement]:
         at, dims = f"level = {level}", len(self.run.scenario.dimensions(level))
-        text, figures = f"Level {level_name(level)}: ", []
-        if found.unseen is not None:
-            text += "the largest ball of starts without a case has a radius of {} of the axes"
-            figures.append(share(found.unseen.radius, OUTCOMES, f"lines with {at}: starts"))
-            if found.failures:
-                text += "; the volume within {} of a failure (FMC; the pool is 1) is {}"
-                key = f"failing lines with {at}: starts"
-                figures.append(figure(radius_for(dims), OUTCOMES, "radius of the FMC"))
-                figures.append(figure(found.fmc, OUTCOMES, key, ".4f"))
-            yield say(f"{text}.", *figures)
+        if found.failures:
+            yield say(
+                f"Level {level_name(level)}: the volume within {{}} of a failure (FMC; the pool is "
+                "1) is {}.",
+                figure(radius_for(dims), OUTCOMES, "radius of the FMC"),
+                figure(found.fmc, OUTCOMES, f"failing lines with {at}: starts", ".4f"),
+            )
         kept = kept_truth(self.run, road_of_run(self.run), level)
         if kept is None:
             return
@@ -461,24 +408,6 @@ class BoardModel:
             share(known.confidence, PROBABILITY, "confidence"),
             figure(known.cases, PROBABILITY, "cases"),
         )
-
-    def _certified(self) -> Statement:
-        known = self.certificate
-        if known is None:
-            return Statement(
-                "Not certified: that no region of failures of a stated size was missed.",
-                command=f"merge-sumo certify {self._setup}; "
-                + self._command("board", " --certificate DIR"),
-            )
-        if known.found is None:
-            return Statement("The certificate is not complete.")
-        return say(
-            "Certificate, ball radius {} of the axes: {}.",
-            share(known.radius, CERTIFICATE, "radius"),
-            figure(known.found.sentence, CERTIFICATE, "found.sentence"),
-        )
-
-    # How often, and by whose fault.
 
     def _often(self) -> Iterator[Statement]:
         known = self.per_merge

@@ -11,9 +11,8 @@ from merge_sumo.analysis.surface import FEWEST_FAILURES
 from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.studies.truth import Truth
-from merge_sumo.system.printable import counted, two_digits
+from merge_sumo.system.printable import counted
 from merge_sumo.values.case import to_unit
-from merge_sumo.values.empty_ball import EmptyBall
 from merge_sumo.values.fmc import covered, fmc, radius_for
 from merge_sumo.values.scenario import OWN
 
@@ -94,10 +93,6 @@ def _note(found: LevelSummary, axes: tuple[Coordinate, ...], *, learned: bool) -
         text += f", {counted(found.regions, 'region')}"
     if found.tested < found.cases:
         text += f"; {found.cases - found.tested} not tested"
-    if found.unseen is not None:
-        text += f". {_unseen(axes, found.unseen)}"
-    if found.missed is not None:
-        text += f". {found.missed.sentence('this level')}"
     if not learned:
         text += f". No surrogate: it takes {FEWEST_FAILURES} failures to learn one"
     return text + "."
@@ -113,18 +108,3 @@ def _of_truth(model: ReportModel, level: int, truth: Truth) -> str:
         f"{radius_for(failing.shape[1]):.2f} of a failure found ({near / len(failing):.0%})"
     )
     return ". The truth is ".join([text, *truth.remarks()]) + "."
-
-
-def _unseen(axes: tuple[Coordinate, ...], ball: EmptyBall) -> str:
-    """Return the largest ball that no case has entered, in a clause."""
-    spans = [(c, c.dimension.high - c.dimension.low) for c in axes]
-    radii = ", ".join(f"{two_digits(ball.radius * span)} {c.unit}" for c, span in spans)
-    centre = ", ".join(
-        f"{c.name} {c.dimension.low + share * span:.{c.digits}f}"
-        for (c, span), share in zip(spans, ball.centre, strict=True)
-    )
-    more = ball.at_most > 1.01 * ball.radius
-    return (
-        f"The largest ball that no case has entered has {'at least ' if more else ''}a radius of "
-        f"{ball.radius:.0%} of the axes ({radii}), around {centre}"
-    )

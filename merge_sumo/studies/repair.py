@@ -286,7 +286,7 @@ def fresh_settings(
     cases = today.cases if asked.cases is None else asked.cases
     few: dict[str, Any] = {
         name: None if (known := getattr(today, name)) is None or known > cases else known
-        for name in ("batch", "in_flight", "audit")
+        for name in ("batch", "in_flight")
     }
     repeat = today.repeat if isinstance(today.repeat, str) else min(today.repeat, cases)
     return replace(

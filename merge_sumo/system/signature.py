@@ -1,9 +1,8 @@
 """What this user wrote before: signatures (HMAC-SHA-256) with a key that nobody else can read.
 
 The key is in the cache folder, which must be the user's own: whoever can write there can put
-another key into its place. A signature says that this user wrote something, so that a truth or a
-block of a certificate that somebody planted is not believed. Users who share a cache folder do not
-believe each other.
+another key into its place. A signature says that this user wrote something, so that a truth that
+somebody planted is not believed. Users who share a cache folder do not believe each other.
 """
 
 from __future__ import annotations

@@ -18,7 +18,6 @@ import numpy as np
 
 from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.records import convert, decode, record_type, to_plain
-from merge_sumo.values.audit_mark import AuditMark
 from merge_sumo.values.avoidability import last_avoidable_s
 from merge_sumo.values.bodies import CentreLines, closest_before_m
 from merge_sumo.values.case import Case, FloatArray
@@ -190,7 +189,6 @@ class Outcome:
         prediction: what was predicted of it; None without a prediction.
         margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
             None under the paper's, which has the score P, and after an error.
-        audit: mark of an audit case; None for the picks of the sampler.
     """
 
     index: int
@@ -199,7 +197,6 @@ class Outcome:
     measures: Measures
     prediction: Prediction | None = None
     margin: float | None = None
-    audit: AuditMark | None = None
 
     @property
     def score(self) -> float | None:
@@ -247,8 +244,6 @@ class Outcome:
             record["margin"] = self.margin
         if self.prediction is not None:
             record["foretold"] = to_plain(self.prediction)
-        if self.audit is not None:
-            record["audit"] = to_plain(self.audit)
         return record
 
     @classmethod
@@ -265,8 +260,7 @@ class Outcome:
             **{name: getattr(known, name) for name in measure_names},
             further=with_values({name: getattr(known, name) for name in further_measures()}),
         )
-        told = known.foretold, known.margin, known.audit
-        return cls(known.index, known.batch, case, measures, *told)
+        return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 
 LATER: Final = ("pov_sustained_brake_mps2", "pov_slowdown_mps")
@@ -314,7 +308,6 @@ def _record_fields(
         ("draw", int, 0),
         ("margin", float | None, None),
         ("foretold", Prediction | None, None),
-        ("audit", AuditMark | None, None),
     ]
     return case_names, measure_names, record_type("outcome", [*required, *optional])
 

@@ -43,7 +43,6 @@ COMMANDS = {
     "rerun run --out new": 0,
     "check-vut --vut design1": 0,
     "probability --vut design1 --level 0 --cases 20 --out new": 0,
-    "certify --vut design1 --level 0 --radius 0.4 --out new": None,
     "history . --out new.html": None,
     "truth --vut design1 --level 0 --cases 100 --out new": None,
     "compare --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform --out new": None,

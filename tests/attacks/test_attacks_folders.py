@@ -26,7 +26,6 @@ from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import REPORT
 from merge_sumo.studies import probability
-from merge_sumo.studies.certificate import CERTIFICATE
 from merge_sumo.studies.probability import failure_probability
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.anchors import SUPPORTED
@@ -50,7 +49,7 @@ def private(tmp_path) -> Iterator[Path]:
     """Return a folder of the victim's with names that we write; it must stay as it is."""
     folder = tmp_path / "private"
     (folder / TRAJECTORIES).mkdir(parents=True)
-    names = (SETTINGS, OUTCOMES, REPORT, CERTIFICATE, "file", f"{TRAJECTORIES}/00001.npz")
+    names = (SETTINGS, OUTCOMES, REPORT, "file", f"{TRAJECTORIES}/00001.npz")
     for name in names:
         (folder / name).write_text("mine")
     folder.chmod(0o700)

@@ -25,7 +25,6 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.studies.certificate import certify, runs_points_on
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.versions import rerun, settings_today
 from merge_sumo.system.workers import open_workers
@@ -206,17 +205,6 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
     differing = [one for one in repeats if not one.same]
     assert {one.first for one in differing} == {"pov"}
     assert "the POV draws random numbers" in str(unrepeatable(repeats))
-
-
-def test_a_certificate_of_what_remembers_is_none(vut, tmp_path):
-    settings = campaign_settings(vut=vut(IN_ITS_CLASS))
-    plan = resolve(settings)
-    with open_workers(1) as there:
-        run = runs_points_on(there, settings, plan, tmp_path)
-        done = certify(settings, 0.08, tmp_path / "certificate", plan, run)
-    assert done.levels[0].otherwise > 0
-    assert not done.certain
-    assert "nothing is certain" in done.sentence
 
 
 def test_an_error_of_the_second_time_says_nothing(vut, tmp_path):

@@ -230,18 +230,6 @@ class TestACampaign:
             with pytest.raises(UserError, match=f"^{name} differs"):
                 resume_campaign(tmp_path / "run", {name: value, "cases": 40})
 
-    def test_has_its_audit_cases_in_their_places(self, tmp_path):
-        settings = self.settings(tmp_path, audit=12, batch=None)
-        run = run_campaign(settings, tmp_path / "run")
-        audit = settings.audit_plan
-        marked = [outcome for outcome in run.outcomes if outcome.audit is not None]
-        assert [outcome.case for outcome in marked] == [
-            audit.case(index) for index in range(60) if index in audit
-        ]
-        repeated = [outcome for outcome in run.outcomes if outcome.case.draw]
-        assert repeated
-        assert not [outcome for outcome in repeated if outcome.audit is not None]
-
     def test_counts_cases_and_not_runs_in_what_it_says(self, tmp_path):
         run_campaign(self.settings(tmp_path), tmp_path / "run")
         opened = api.results.CampaignRun(tmp_path / "run", gates=["failures"])

@@ -69,7 +69,7 @@ class TestOptions:
         assert set(COMMANDS) == has["as_json"]
         again = {"crosscheck", "explain", "repair", "stress"}
         fresh = {*again, "failures-per-merge", "probability"}
-        runs_cases = {"campaign", "certify", "benchmark", "rerun", "truth", *fresh}
+        runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}
         assert has["level"] == {*runs_cases, "run"} - fresh
@@ -129,7 +129,6 @@ class TestCompletion:
         [
             ("campaign --sampler co", "coverage"),
             ("campaign --level o", "own"),
-            ("certify --scenario us23-", "us23-traffic"),
             ("check-vut des", "design1"),
             ("policies export vu", "vut1"),
         ],

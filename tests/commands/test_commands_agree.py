@@ -189,18 +189,3 @@ def resume_goes_on_alike(world: World, records: list[dict[str, Any]]) -> None:
     whole = World.search(CASES + BATCH)
     world("campaign", *world.tried.asked, *whole, "--out", "whole")
     assert Path("whole", OUTCOMES).read_bytes() == Path("run", OUTCOMES).read_bytes()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in TRIED if name != "us23-traffic"])
-def test_a_certificate_judges_a_case_alike(name, monkeypatch, tmp_path, command_line):
-    monkeypatch.chdir(tmp_path)
-    world = World(TRIED[name], command_line)
-    wanted = (*world.tried.asked, "--radius", 0.2, "--workers", 1, "--out", "certificate")
-    (found,) = world("certify", *wanted, codes=(0, 1))
-    (of_level,) = found["levels"].values()
-    assert 0 < of_level["failures"] < of_level["cases"]
-    for values in of_level["worst"][:3]:
-        case = {name: value for name, value in values.items() if name in OF_A_CASE}
-        case["v_vut0_mps"] = world.scenario.bounds("v_vut0_mps")[0]
-        assert world.judged(MergeCase(level=world.tried.level, scenario=world.scenario, **case))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +17,9 @@ import merge_sumo as ms
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.reports.board import PAGE, RECORD, SCHEMA, write_board
 from merge_sumo.reports.board_statements import BoardModel, Statement
-from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.crosscheck import CROSSCHECK, Crosscheck, Motion, Verdicts
 from merge_sumo.studies.stress import STRESS, Flips, Rung, Stress
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.imperfection import Sensing
-from merge_sumo.values.scenario import US23
 
 
 def stressed(run: Run) -> Stress:
@@ -74,8 +70,8 @@ def record(made) -> dict[str, Any]:
     return known
 
 
-def sentences(run: Run, topic: str, certificate: Path | None = None) -> list[Statement]:
-    by_name = {t.name: t for t in BoardModel(run, certificate).topics()}
+def sentences(run: Run, topic: str) -> list[Statement]:
+    by_name = {t.name: t for t in BoardModel(run).topics()}
     return list(by_name[topic].statements)
 
 
@@ -197,8 +193,6 @@ class TestWhatWasNotRun:
         commands = [s.command for t in BoardModel(run).topics() for s in t.statements if s.command]
         for verb in ("failures-per-merge", "stress", "crosscheck", "replay"):
             assert any(c.startswith(f"merge-sumo {verb} '{folder}'") for c in commands), verb
-        assert any("--audit 100" in c for c in commands)
-        assert any(c.startswith("merge-sumo certify --vut handmade") for c in commands)
 
     def test_nor_found_is_said_as_such(self, tmp_path):
         quiet = write_run(tmp_path / "quiet", per_level=4, levels=(0,), errors={2: "a", 3: "a"})
@@ -266,7 +260,7 @@ class TestOfACampaign:
     def run(cls, tmp_path_factory) -> Run:
         folder = tmp_path_factory.mktemp("runs") / "design1"
         setup: dict[str, Any] = {"level": 0, "seed": 1, "progress": False}
-        found = ms.campaign("design1", cases=60, audit=12, out=folder, **setup)
+        found = ms.campaign("design1", cases=60, out=folder, **setup)
         ms.failures_per_merge(folder, "exid-5", cases=200, engine="kinematic", progress=False)
         ms.probability(folder, cases=200, engine="kinematic", progress=False)
         return found.run
@@ -295,21 +289,6 @@ class TestOfACampaign:
         ]
         assert "if all starts and levels were alike" in chance.text
 
-    def test_a_certificate_is_named_by_its_folder(self, run, tmp_path):
-        certificate = tmp_path / "certificate"
-        ms.certify("design1", level=0, radius=0.2, out=certificate, progress=False)
-        known = json.loads((certificate / "certificate.json").read_text())
-        (said,) = (s for s in sentences(run, "remains", certificate) if "Certificate" in s.text)
-        assert known["found"]["sentence"] in said.text
-        write_board(run, certificate)
-        files = json.loads((run.folder / RECORD).read_text())["files"]
-        content = (certificate / "certificate.json").read_bytes()
-        assert files["certificate.json"] == hashlib.sha256(content).hexdigest()
-        altered = content.replace(b'"block": 2000', b'"block": 2001')
-        (certificate / "certificate.json").write_bytes(altered)
-        with pytest.raises(ms.UserError, match="its hash is another one"):
-            write_board(run, certificate)
-
     def test_a_study_of_another_campaign_is_refused(self, run, tmp_path):
         other = write_run(tmp_path / "other", per_level=4)
         for name in ("failures-per-merge.json", "probability.json"):
@@ -317,25 +296,3 @@ class TestOfACampaign:
             with pytest.raises(ms.UserError, match=f"{name} is of another campaign: its vut"):
                 write_board(other)
             (other.folder / name).unlink()
-
-
-def test_commands_set_up_what_was_tested(tmp_path):
-    def command(**changed: Any) -> str:
-        folder = tmp_path / str(len([*tmp_path.iterdir()]))
-        statement = sentences(write_run(folder, 20, levels=(1,), **changed), "remains")[0]
-        return statement.command
-
-    assert command().endswith(" --vut handmade --level 1 --cases 120 --seed 1 --audit 100")
-    late = replace(US23, sense=Sensing.parsed("delay_s=0..1,dropout=0.05", "--sense"))
-    assert " --sense delay_s=0..1,dropout=0.05 --level 1 --cases 120 " in command(scenario=late)
-    (said,) = [
-        one.text
-        for one in sentences(write_run(tmp_path / "late", 2, levels=(1,), scenario=late), "tested")
-        if "imperfectly" in one.text
-    ]
-    assert said == (
-        "The VUT senses other cars imperfectly: delay_s 0 to 1, dropout 0.05; a range is part of "
-        "the pool."
-    )
-    on_lane = command(scenario=named_scenario("us23-lane"))
-    assert " --scenario us23-lane --fail-when paper --level 1 " in on_lane
