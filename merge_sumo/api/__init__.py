@@ -14,7 +14,6 @@ Results print as the command prints them, and `to_record()` is what the command'
 
 from __future__ import annotations
 
-import json
 import os
 import tempfile
 import warnings
@@ -95,7 +94,7 @@ from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
 from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
-from merge_sumo.reports.reproduction_page import write_reproduction_page
+from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.reports.running_page import RunningPage
 from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
 from merge_sumo.road.drawing import road_svg
@@ -133,6 +132,7 @@ from merge_sumo.system.folders import (
     check_own,
     dated,
     link_latest,
+    make_folder,
     replace_own,
     write_new,
 )
@@ -805,7 +805,6 @@ def benchmark(
     cases: int = 400,
     batch: int | None = None,
     truth_cases: int | None = None,
-    dense: bool | None = None,
     figure: AnyPath | None = None,
     **given: Unpack[StudyKeywords],
 ) -> SamplerStudy:
@@ -819,7 +818,6 @@ def benchmark(
         cases: cases of each run.
         batch: cases per batch; by default 20, and for `coverage` as many as it wants.
         truth_cases: cases of the truth at a level; by default 10,000, and 20,000 at level 2.
-        dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         figure: new file for FMC against cases: .png, .svg or .html.
         given: how a case is run and judged, and where: see `StudyKeywords`.
     """
@@ -837,15 +835,17 @@ def benchmark(
     if seeds < 1:
         raise UserError(f"--seeds is {seeds}: it must be 1 or more")
     with _study(settings, runner) as study:
-        truths = {number: study.truth(number, truth_cases) for number in settings.levels}
-        dense_truths = study.dense_truths(settings.levels, dense)
-        searches = study.searches(settings.levels, names, seeds, cases, batch)
-    result = SamplerStudy.of(searches, truths, dense_truths, cases, batch)
+        result = study.compare(
+            settings.levels,
+            names,
+            seeds=seeds,
+            cases=cases,
+            batch=batch,
+            truth_cases=truth_cases,
+        )
     if picture is None:
         return result
-    curves = (result.samplers, result.truth_fmc, result.oracle_fmc, result.limit_fmc)
-    drawn = figures.coverage_curves(f"{_title(settings)}, {seeds} seeds", *curves)
-    figures.save(drawn, picture)
+    figures.save(figures.coverage_curves(f"{_title(settings)}, {seeds} seeds", result), picture)
     return replace(result, figure=picture)
 
 
@@ -1114,17 +1114,15 @@ def reproduce(
     seeds: int | None = None,
     out: AnyPath | None = None,
     quick: bool = False,
-    dense: bool | None = None,
     policies: AnyPath | None = None,
     **given: Unpack[Running],
-) -> Shown:
+) -> reproduction.Reproduction:
     """Reproduce Table II and the figures of the paper; the same as `merge-sumo reproduce`.
 
     Args:
         seeds: runs of each sampler; by default 10, with `quick` 2.
         out: new folder to write; `runs/reproduce-<date>` by default.
         quick: few and short runs and a small truth: a first look.
-        dense: make the dense truths of 1,000,000 cases, or go without; by default those kept.
         policies: folder of learned drivers instead of the shipped ones.
         given: where the cases run: see `Running`.
     """
@@ -1132,8 +1130,6 @@ def reproduce(
     runner, _ = runner_of(given)
     count = (2 if quick else 10) if seeds is None else seeds
     scale = reproduction.quick(count) if quick else reproduction.Scale(seeds=count)
-    if dense is not None:
-        scale = replace(scale, dense=dense)
     trained = policies_folder(policies, US23)
     folder = dated("reproduce") if out is None else Path(out)
     figures.require_matplotlib()
@@ -1141,13 +1137,11 @@ def reproduce(
         evaluation_workers(runner.workers, runner.dask) as opened,
         Bars(shown=runner.progress) as bars,
     ):
-        reproduction.reproduce(
-            folder, scale, policies=trained, workers=opened, on_part=bars.counted
+        make_folder(folder)
+        result = reproduction.reproduce(
+            scale, policies=trained, workers=opened, on_part=bars.counted
         )
-    index = write_reproduction_page(folder)
-    record = json.loads((folder / reproduction.TABLE_JSON).read_text(encoding="utf-8"))
-    table = (folder / reproduction.TABLE_MARKDOWN).read_text(encoding="utf-8")
-    return Shown(record, [*table.splitlines(), f"all of it: {index}"])
+    return replace(result, page=write_reproduction(result, folder))
 
 
 # What a person brings: VUTs, scenarios, learned drivers

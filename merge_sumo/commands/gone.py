@@ -20,6 +20,8 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "
     "'clearance_m <= 0 and pov_sustained_brake_mps2 <= 2.06'",
+    "--dense": "`merge-sumo truth --cases 1000000` makes a dense truth, which is used from then on",
+    "--no-dense": "a dense truth is used where `merge-sumo truth --cases 1000000` has made one",
     "--limit": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--problems": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--samplers": "`merge-sumo benchmark` compares samplers on a VUT",

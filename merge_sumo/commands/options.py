@@ -37,7 +37,6 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
         *("samplers", "cases", "seed", "seeds"),
         *(
             "truth_cases",
-            "dense",
             "quick",
             "distribution",
             "traffic",
@@ -220,12 +219,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     ),
     "tolerate": option(
         float, 0.0, "A case fails where more than this share of its runs do.", metavar="SHARE"
-    ),
-    "dense": optional(
-        bool,
-        "Make the dense truths, of 1,000,000 cases, or go without.",
-        "--dense/--no-dense",
-        show_default="those kept",
     ),
     "fail_when": optional(
         str,

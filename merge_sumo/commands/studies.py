@@ -22,7 +22,7 @@ from merge_sumo.commands.options import (
     option,
     optional,
 )
-from merge_sumo.commands.printing import folder_of, same_command, say, stoppable
+from merge_sumo.commands.printing import folder_of, same_command, stoppable
 
 OF_RECORDED: Final = ("policies", "pov", *HOSTING, *RUNNING, "trust_vut")
 """Options of the studies that run cases of a recorded campaign."""
@@ -72,7 +72,7 @@ def truth(given: Given, vut: VutOption) -> None:
 
 
 @app.verb(
-    options=("level", "dense", *SETUP, "dask", "quiet"),
+    options=("level", *SETUP, "dask", "quiet"),
     own={
         "seeds": option(int, 10, "Runs of each sampler."),
         "cases": option(int, 400, "Cases of each run."),
@@ -102,9 +102,8 @@ def benchmark(
 
     With all levels, each run shares its cases out over them, and coverage is summed over them.
     The truth of the paper's size misses places that searches find, so coverage is also shown as a
-    share of a limit: the coverage of 1,000,000 uniform cases, or of all that truth and searches
-    found together, whichever is more. Such a dense truth takes minutes: --dense makes it, and as it
-    is kept, later benchmarks use it.
+    share of a limit: the coverage of all that truth and searches found together, or that of
+    1,000,000 uniform cases, if `truth --cases 1000000` has run, whichever is more.
 
     Example:  merge-sumo benchmark --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
@@ -345,7 +344,7 @@ def repair(
 
 
 @app.verb(
-    options=["dense", "policies", "dask", "quiet"],
+    options=["policies", "dask", "quiet"],
     own={
         "seeds": optional(int, "Runs of each sampler.", show_default="10, with --quick 2"),
         "out": optional(Path, "New folder to write.", show_default="runs/reproduce-DATE"),
@@ -362,7 +361,4 @@ def reproduce(given: Given) -> None:
     """
     from merge_sumo import api
 
-    result = api.reproduce(**given.keywords)
-    given.print(result)
-    if given.as_json:
-        say(result.text[-1])
+    given.print(api.reproduce(**given.keywords))

@@ -19,7 +19,7 @@ import numpy as np
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
-from merge_sumo.studies.sampler_study import SamplerSummary
+from merge_sumo.studies.sampler_study import SamplerStudy
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
@@ -114,32 +114,27 @@ def colour(name: str) -> str:
 
 def coverage_curves(
     title: str,
-    compared: Mapping[str, SamplerSummary],
-    truth_fmc: float,
-    oracle: Mapping[int, float],
-    limit_fmc: float,
+    study: SamplerStudy,
 ) -> Figure:
-    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle.
-
-    All samplers have the same batches; `oracle` is by number of cases.
-    """
+    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle."""
+    oracle = study.oracle_fmc
     with _drawing(7.5, 4.6) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
         axes = figure.subplots()
         ends = []
-        for name, result in compared.items():
+        for name, result in study.samplers.items():
             cases = [0, *result.cases_by_batch]
-            low, high = ([0.0, *band] for band in result.fmc_by_batch_quartiles)
+            low, median, high = ([0.0, *band] for band in result.fmc_by_batch)
             axes.fill_between(cases, low, high, color=colour(name), alpha=0.18, linewidth=0)
-            axes.plot(cases, [0.0, *result.fmc_by_batch_median], color=colour(name), lw=2)
-            ends.append((result.fmc_by_batch_median[-1], name, colour(name)))
+            axes.plot(cases, median, color=colour(name), lw=2)
+            ends.append((median[-1], name, colour(name)))
             axes.set_xlim(0, cases[-1])
         known = list(oracle)
         axes.plot(known, list(oracle.values()), color="black", lw=1.2, ls=(0, (4, 2)), zorder=1)
-        axes.axhline(truth_fmc, color="black", lw=1.2)
-        axes.axhline(limit_fmc, color="black", lw=1.2, ls=":")
-        ends.append((limit_fmc, "limit", "black"))
-        ends += [(truth_fmc, "truth", "black"), (oracle[known[-1]], "oracle", "black")]
+        axes.axhline(study.truth_fmc, color="black", lw=1.2)
+        axes.axhline(study.limit_fmc, color="black", lw=1.2, ls=":")
+        ends.append((study.limit_fmc, "limit", "black"))
+        ends += [(study.truth_fmc, "truth", "black"), (oracle[known[-1]], "oracle", "black")]
         axes.set_ylim(0.0)
         axes.set_xlabel("cases")
         axes.set_ylabel("failure mode coverage (FMC)")

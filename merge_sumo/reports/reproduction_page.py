@@ -1,40 +1,40 @@
-"""The page and the figures of a reproduction of the paper, from what the study left in a folder."""
+"""The page and the figures of a reproduction of the paper."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from merge_sumo.reports import figures
 from merge_sumo.reports.pages import page
-from merge_sumo.studies.reproduction import (
-    SAMPLERS,
-    ColumnResult,
-    Reproduction,
-    read_reproduction,
-    table_rows,
-)
+from merge_sumo.studies.reproduction import ColumnResult, Reproduction
 from merge_sumo.system.folders import write_new
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PAGE: Final = "index.html"
+TABLE_JSON: Final = "table2.json"
+TABLE_MARKDOWN: Final = "table2.md"
 
 
-def write_reproduction_page(folder: Path) -> Path:
-    """Draw the figures and the page of a reproduction into its folder; return the page's path.
+def write_reproduction(result: Reproduction, folder: Path) -> Path:
+    """Write the table, the figures and the page of a reproduction; return the page's path.
 
-    Raises `UserError` where it holds no reproduction, or figures already, or without matplotlib.
+    Raises `UserError` where a file is there already, or without matplotlib.
     """
-    result, captions = read_reproduction(folder), {}
+    record = json.dumps(result.to_record(), allow_nan=False)
+    write_new(folder / TABLE_JSON, f"{record}\n".encode())
+    write_new(folder / TABLE_MARKDOWN, ("\n".join(result.lines()) + "\n").encode())
+    captions = {}
     for name, figure, caption in _figures(result):
         figures.save(figure, folder / f"{name}.png")
         captions[f"{name}.png"] = caption
-    index = folder / PAGE
-    write_new(index, _page(result, captions).encode())
-    return index
+    text = page("reproduce.html.jinja", result=result, pictures=captions)
+    write_new(folder / PAGE, text.encode())
+    return folder / PAGE
 
 
 def _figures(result: Reproduction) -> Iterator[tuple[str, Figure, str]]:
@@ -57,10 +57,7 @@ def _column_figures(result: ColumnResult) -> Iterator[tuple[str, Figure, str]]:
     vut, level = result.column.vut, result.column.level
     yield (
         f"curves-level{level}",
-        figures.coverage_curves(
-            f"Coverage of {vut} against a level-{level} POV",
-            *(result.compared, result.truth_fmc, result.oracle, result.limit_fmc),
-        ),
+        figures.coverage_curves(f"Coverage of {vut} against a level-{level} POV", result.study),
         "FMC against cases: median over the seeds, band from the first to the third quartile. "
         "The oracle knows the failures of the truth and takes the most useful one each time. "
         "The limit is the coverage of all that is known to fail.",
@@ -71,27 +68,15 @@ def _column_figures(result: ColumnResult) -> Iterator[tuple[str, Figure, str]]:
         "Cases that fail, in colour, and cases that do not, in grey: the truth, and each "
         "sampler with the seed whose coverage is its median.",
     )
-    if result.predicted:
+    if level == 1:
         truth = result.panels["truth"]
         yield (
             f"gpr-surface-level{level}",
             figures.predicted_scores(
                 f"The surrogate of gpr on {vut} against a level-{level} POV",
-                *(result.predicted, level, truth.points[truth.failed]),
+                *(result.predicted(), level, truth.points[truth.failed]),
             ),
             "The score that the surrogate predicts, with the cases that it has learned from "
             "(white) and the failures of the truth (orange). Inside the white line it predicts a "
             "failure.",
         )
-
-
-def _page(result: Reproduction, captions: dict[str, str]) -> str:
-    return page(
-        "reproduce.html.jinja",
-        results=list(result.columns.values()),
-        rows=dict(table_rows(result.columns)),
-        samplers=SAMPLERS,
-        scale=result.scale,
-        pictures=captions,
-        versions=result.versions,
-    )

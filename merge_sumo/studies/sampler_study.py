@@ -1,21 +1,21 @@
-"""Experiments on samplers: searches with many seeds, and how near they come to the ground truth."""
+"""Samplers beside each other and beside the truth of a VUT: searches with many seeds."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
 from heapq import heappop, heapreplace
 from io import StringIO
 from itertools import accumulate, chain, count
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.campaign import conduct
@@ -41,6 +41,13 @@ from merge_sumo.values.fmc import covered, fmc
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 
+ORACLE_STEP: Final = 5
+"""Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""
+MOST_PROBES: Final = 10_000
+"""Failures of a truth of which a covered share is one, at most: its error is then below .01."""
+COMPARED_BATCH: Final = 20
+"""Cases of a batch by default, of samplers that choose none: that of Table II."""
+
 
 @dataclass(frozen=True, slots=True)
 class Search:
@@ -60,19 +67,23 @@ class Search:
         """Return the failing cases of a level as points, (m, d)."""
         return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
 
+    def covered_shares(self, level: int, points: FloatArray) -> FloatArray:
+        """Return the share of points, (m, d), that its failures cover after each batch."""
+        failed = [o.batch for o in self.outcomes if o.failed and o.case.level == level]
+        batches, places = np.array(failed, dtype=int), self.failures(level)
+        numbers = np.unique([outcome.batch for outcome in self.outcomes])
+        first = np.full(len(points), np.inf)
+        for number in numbers[::-1]:
+            first[covered(points, places[batches == number])] = number
+        return np.array([(first <= number).mean() for number in numbers])
 
-ORACLE_STEP: Final = 5
-"""Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""
-MOST_PROBES: Final = 10_000
-"""Failures of a truth of which a covered share is one, at most: its error is then below .01."""
-COMPARED_BATCH: Final = 20
-"""Cases of a batch by default, of samplers that choose none: that of Table II."""
 
 Task = tuple[str, tuple[int, ...], int, int | None, int]
 """A search: sampler, levels, cases, batch, seed."""
 
 
-def _searches(plan: SimulationPlan, tasks: Sequence[Task]) -> list[Search]:
+def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[Search]:
+    """Run searches of the pool of a plan's scenario in this process."""
     return [_search(plan, *task) for task in tasks]
 
 
@@ -88,126 +99,26 @@ def _search(
     lines = centre_lines(plan.road)
     twin = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
     sampler = make_sampler(name, pool, seed, twin)
-    spent = _Stopwatch()
-    sampler.ask = spent.timed(sampler.ask)  # type: ignore[method-assign]
-    sampler.tell = spent.timed(sampler.tell)  # type: ignore[method-assign]
-    search = Search([], [], 0.0)
-    batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-    run = partial(evaluate, plan, workers=THIS_PROCESS)
-    for ran in conduct(sampler, run, cases, batch):
-        search.outcomes.extend(outcome for outcome, _ in ran)
-        search.fmc.append(sum(fmc(search.failures(level)) for level in levels))
-    return replace(search, sampler_s=spent.seconds)
+    spent_s = [0.0]
 
-
-class _Stopwatch:
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def timed(self, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
         def wrapper(*arguments: Any) -> Any:
-            start = time.perf_counter()
+            start_s = time.perf_counter()
             try:
                 return function(*arguments)
             finally:
-                self.seconds += time.perf_counter() - start
+                spent_s[0] += time.perf_counter() - start_s
 
         return wrapper
 
-
-@dataclass(frozen=True, slots=True)
-class LevelShare:
-    """What one sampler did at one level, as medians over all seeds."""
-
-    cases_median: float
-    failures_median: float
-    fmc_median: float
-
-
-Quartiles = tuple[float | None, float | None]
-
-
-@dataclass(frozen=True, slots=True)
-class SamplerSummary:
-    """One sampler over all seeds, as medians and as quartiles (25 % and 75 %).
-
-    FMC is summed over the levels. `covered_share` is the share of the truth's failures that lie
-    within a radius of a failure found (`covered`), the mean over the levels with any; None without.
-    `cases_to_50_percent_covered` and `cases_to_90_percent_covered` are cases until that share.
-    `cases_to_50_percent` and `cases_to_90_percent` are cases until that share of the truth's FMC.
-    All four are None where too few seeds reach it. What is divided by the truth's FMC is None where
-    the truth has no failure or is too small (`Truth.is_small`), and `fmc_over_limit` where no limit
-    was given. `regions_found` and `seeds_with_all_regions` are None where the truth is too small to
-    tell regions.
-    """
-
-    fmc_median: float
-    fmc_quartiles: Quartiles
-    covered_share_median: float | None
-    covered_share_quartiles: Quartiles
-    fmc_over_truth_median: float | None
-    fmc_over_truth_quartiles: Quartiles
-    fmc_over_limit_median: float | None
-    fmc_over_limit_quartiles: Quartiles
-    failures_median: float
-    failures_quartiles: Quartiles
-    regions_found_median: float | None
-    regions_found_quartiles: Quartiles
-    seeds_with_all_regions: int | None
-    cases_to_50_percent_covered_median: float | None
-    cases_to_50_percent_covered_quartiles: Quartiles
-    cases_to_90_percent_covered_median: float | None
-    cases_to_90_percent_covered_quartiles: Quartiles
-    cases_to_50_percent_median: float | None
-    cases_to_50_percent_quartiles: Quartiles
-    cases_to_90_percent_median: float | None
-    cases_to_90_percent_quartiles: Quartiles
-    sampler_s_median: float
-    cases_by_batch: list[int]
-    fmc_by_batch_median: list[float]
-    fmc_by_batch_quartiles: tuple[list[float], list[float]]
-    covered_share_by_batch_median: list[float] | None
-    levels: dict[int, LevelShare]
-
-
-def search(
-    plan: SimulationPlan,
-    levels: tuple[int, ...],
-    samplers: Sequence[str],
-    *,
-    seeds: int = 10,
-    cases: int = 400,
-    batch: int | None = None,
-    workers: Workers | None = None,
-    on_search: Callable[[str, int], None] | None = None,
-) -> dict[str, list[Search]]:
-    """Let samplers search the pool of a plan's scenario; return the searches of each by seed.
-
-    Args:
-        plan: how cases run.
-        levels: POV levels.
-        samplers: their names.
-        seeds: number of searches of each sampler, with the seeds 0 to `seeds` - 1.
-        cases: cases of a search.
-        batch: cases of a batch; by default what a sampler wants, or `COMPARED_BATCH`.
-        workers: each search runs on one of them, by default in this process.
-        on_search: told sampler and seed of a search that has ended.
-    """
-    tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
-    for level in levels:
-        plan.povs.check_level(level)
-    plan = plan.for_cases(batch or COMPARED_BATCH)
-    by_place: dict[int, Search] = {}
-    with workers_or_here(workers) as processes:
-        for place, one in processes.run(partial(_searches, plan), tasks, _lost_search, chunk=1):
-            by_place[place] = one
-            if on_search is not None:
-                name, *_, seed = tasks[place]
-                on_search(name, seed)
-    searches: dict[str, list[Search]] = {name: [] for name in samplers}
-    for place, (name, *_) in enumerate(tasks):
-        searches[name].append(by_place[place])
-    return searches
+    sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
+    sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
+    found = Search([], [], 0.0)
+    batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
+    for ran in conduct(sampler, partial(evaluate, plan, workers=THIS_PROCESS), cases, batch):
+        found.outcomes.extend(outcome for outcome, _ in ran)
+        found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
+    return Search(found.outcomes, found.fmc, spent_s[0])
 
 
 def _lost_search(task: Task) -> Search:
@@ -215,173 +126,350 @@ def _lost_search(task: Task) -> Search:
     raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
 
 
-def limit_fmc(
-    searches: Iterable[Search], truths: Mapping[int, Truth], dense: Mapping[int, Truth]
-) -> float:
-    """Return the coverage of all that is known to fail, summed over the levels: no search has more.
+OnPart = Callable[[str, int, int, str, str], None]
+"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
 
-    A truth of a few thousand cases misses places that searches find. At each level this is the
-    coverage of what truth and searches found together, or of a `dense` truth, whichever is more.
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """A plan, and what truths and searches run it with.
+
+    Attributes:
+        plan: how cases run.
+        workers: where they run; by default in this process.
+        cache: folder of the truths, by default the user's.
+        on_part: told how far each truth is, and all searches together.
+        engine: what moves the vehicles of truths: see `SimulationPlan.with_engine`.
     """
-    known = list(searches)
-    total = 0.0
-    for level, truth in truths.items():
-        failing = [truth.failures, *(search.failures(level) for search in known)]
-        together = fmc(np.concatenate([points for points in failing if len(points)] or failing[:1]))
-        total += max(together, fmc(dense[level].failures) if level in dense else 0.0)
-    return total
+
+    plan: SimulationPlan
+    workers: Workers | None = None
+    cache: Path | None = None
+    on_part: OnPart = lambda *_: None
+    engine: str | None = None
+
+    def truth(
+        self, level: int, cases: int | None = None, seed: int = 0, repeats: Repeats | None = None
+    ) -> Truth:
+        """Return the truth at a level, from the cache where it is kept."""
+        total, ended = TRUTH_CASES[level] if cases is None else cases, 0
+        title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
+
+        def ran(more: int) -> None:
+            nonlocal ended
+            ended += more
+            self.on_part(title, ended, total, "cases", "")
+
+        plan = self.plan.at_level(level).with_engine(self.engine)
+        where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
+        return ground_truth(plan, level, total, seed, repeats=repeats, **where)
+
+    def compare(
+        self,
+        levels: tuple[int, ...],
+        samplers: Sequence[str],
+        *,
+        seeds: int = 10,
+        cases: int = 400,
+        batch: int | None = None,
+        truth_cases: int | None = None,
+    ) -> SamplerStudy:
+        """Let each sampler search with the seeds 0 to `seeds` - 1, beside the truth of each level.
+
+        A batch has by default as many cases as a sampler wants, or `COMPARED_BATCH`. A dense truth
+        is used where the cache has one.
+        """
+        truths = {level: self.truth(level, truth_cases) for level in levels}
+        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
+        dense = {level: truth for level, truth in kept.items() if truth is not None}
+        searches = self.searches(levels, samplers, seeds, cases, batch)
+        return SamplerStudy(searches, truths, dense, cases, batch)
+
+    def searches(
+        self,
+        levels: tuple[int, ...],
+        samplers: Sequence[str],
+        seeds: int,
+        cases: int,
+        batch: int | None,
+    ) -> dict[str, list[Search]]:
+        """Let each sampler search with each seed; return the searches by sampler."""
+        tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
+        for level in levels:
+            self.plan.povs.check_level(level)
+        plan = self.plan.for_cases(batch or COMPARED_BATCH)
+        title = f"{plan.vut.spec} v level {'/'.join(map(level_name, levels))}"
+        by_place, number = dict[int, Search](), count(1)
+        with workers_or_here(self.workers) as processes:
+            for place, one in processes.run(partial(search, plan), tasks, _lost_search, chunk=1):
+                by_place[place] = one
+                self.on_part(title, next(number), len(tasks), "runs", tasks[place][0])
+        searches: dict[str, list[Search]] = {name: [] for name in samplers}
+        for place, (name, *_) in enumerate(tasks):
+            searches[name].append(by_place[place])
+        return searches
 
 
-def compare(
-    searches: Sequence[Search],
-    truths: Mapping[int, Truth],
-    limit: float | None = None,
-    dense: Mapping[int, Truth] = MappingProxyType({}),
-) -> SamplerSummary:
-    """Compare what one sampler found, one search a seed, with the truth at each level.
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """The median over the seeds, and the quartiles; None where too few seeds have a number."""
 
-    `limit` is the coverage of all that is known to fail (`limit_fmc`). Where a level has a `dense`
-    truth, its failures are those of which the covered share is one.
+    median: float | None
+    low: float | None
+    high: float | None
+
+    @classmethod
+    def of(cls, values: ArrayLike) -> Spread:
+        """Return the spread of a number for each seed; NaN and infinite ones are none."""
+        ordered = np.sort(np.asarray(values, dtype=np.float64))
+
+        def quantile(part: float) -> float | None:
+            place = part * (len(ordered) - 1)
+            low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
+            if not np.isfinite(high):
+                return None
+            return float(low + (place - math.floor(place)) * (high - low))
+
+        return cls(quantile(0.5), quantile(0.25), quantile(0.75))
+
+    def text(self, form: str) -> str:
+        """Return the median, with the quartiles in brackets."""
+        median, low, high = (
+            "-" if value is None else f"{value:{form}}"
+            for value in (self.median, self.low, self.high)
+        )
+        return f"{median} [{low}, {high}]"
+
+
+@dataclass(frozen=True, slots=True)
+class SamplerSummary:
+    """One sampler over all seeds; FMC is summed over the levels.
+
+    Attributes:
+        fmc: failure mode coverage.
+        fmc_over_truth: as a share of the truth's; None where that is too small.
+        fmc_over_limit: as a share of all that is known to fail.
+        covered_share: share of the truth's failures within a radius of a failure found, the mean
+            over the levels with any.
+        failures: failures found.
+        regions_found: regions of the truth in which a failure was found; None where the truth
+            is too small to tell regions.
+        cases_to_90_percent: cases until .9 of the truth's FMC.
+        sampler_s: median seconds spent in the sampler.
+        cases_by_batch: cases after each batch.
+        fmc_by_batch: quartiles of FMC after each batch, at 25, 50 and 75 %.
+        covered_share_by_batch: median of the covered share after each batch; None without failures.
     """
-    curves = np.array([search.fmc for search in searches])
-    whole = None if any_small(truths.values()) else _truth_fmc(truths)
-    share, of_limit = (
-        curves[:, -1] / divisor if divisor else np.full(len(curves), np.nan)
-        for divisor in (whole, limit)
-    )
-    failures = np.array([sum(o.failed for o in search.outcomes) for search in searches])
-    regions_found, seeds_with_all = _regions_found(searches, truths)
-    after = _cases_by_batch(searches[0])
-    half, most = (_cases_to(part * (whole or np.inf), curves, after) for part in (0.5, 0.9))
-    covered_shares = _covered_shares(searches, covered_of(truths, dense))
-    half_covered, most_covered = (_cases_to(part, covered_shares, after) for part in (0.5, 0.9))
-    by_batch = [np.quantile(curves, part, axis=0).tolist() for part in (0.25, 0.75)]
-    is_known = not np.isnan(covered_shares).any()
-    return SamplerSummary(
-        fmc_median=float(np.median(curves[:, -1])),
-        fmc_quartiles=_quartiles(curves[:, -1]),
-        covered_share_median=_quantile(covered_shares[:, -1], 0.5),
-        covered_share_quartiles=_quartiles(covered_shares[:, -1]),
-        fmc_over_truth_median=_quantile(share, 0.5),
-        fmc_over_truth_quartiles=_quartiles(share),
-        fmc_over_limit_median=_quantile(of_limit, 0.5),
-        fmc_over_limit_quartiles=_quartiles(of_limit),
-        failures_median=float(np.median(failures)),
-        failures_quartiles=_quartiles(failures),
-        regions_found_median=_quantile(regions_found, 0.5),
-        regions_found_quartiles=_quartiles(regions_found),
-        seeds_with_all_regions=seeds_with_all,
-        cases_to_50_percent_covered_median=_quantile(half_covered, 0.5),
-        cases_to_50_percent_covered_quartiles=_quartiles(half_covered),
-        cases_to_90_percent_covered_median=_quantile(most_covered, 0.5),
-        cases_to_90_percent_covered_quartiles=_quartiles(most_covered),
-        cases_to_50_percent_median=_quantile(half, 0.5),
-        cases_to_50_percent_quartiles=_quartiles(half),
-        cases_to_90_percent_median=_quantile(most, 0.5),
-        cases_to_90_percent_quartiles=_quartiles(most),
-        sampler_s_median=float(np.median([search.sampler_s for search in searches])),
-        cases_by_batch=after,
-        fmc_by_batch_median=np.median(curves, axis=0).tolist(),
-        fmc_by_batch_quartiles=(by_batch[0], by_batch[1]),
-        covered_share_by_batch_median=(
-            np.median(covered_shares, axis=0).tolist() if is_known else None
-        ),
-        levels={level: _level_share(searches, level) for level in truths},
-    )
+
+    fmc: Spread
+    fmc_over_truth: Spread
+    fmc_over_limit: Spread
+    covered_share: Spread
+    failures: Spread
+    regions_found: Spread
+    cases_to_90_percent: Spread
+    sampler_s: float
+    cases_by_batch: list[int]
+    fmc_by_batch: list[list[float]]
+    covered_share_by_batch: list[float] | None
+
+    def columns(self, *, small: bool, timed: bool) -> dict[str, str]:
+        """Return the cells of its row by heading; nothing is divided by a `small` truth."""
+        of_truth = {
+            "FMC / truth": self.fmc_over_truth.text(".3f"),
+            "FMC / limit": self.fmc_over_limit.text(".3f"),
+        }
+        return {
+            **({} if small else of_truth),
+            "covered share": self.covered_share.text(".3f"),
+            "FMC": self.fmc.text(".4f"),
+            "failures": self.failures.text(".0f"),
+            "regions": self.regions_found.text(".1f"),
+            "to 90 %": self.cases_to_90_percent.text(".0f"),
+            **({"sampler s": f"{self.sampler_s:.2f}"} if timed else {}),
+        }
 
 
-def any_small(truths: Iterable[Truth]) -> bool:
-    """Return whether one of the truths is too small to be divided by."""
-    return any(truth.is_small for truth in truths)
+@dataclass(frozen=True, repr=False)
+class SamplerStudy(Result):
+    """Samplers beside each other, and beside the ground truth, over several seeds.
 
-
-def _truth_fmc(truths: Mapping[int, Truth]) -> float:
-    return sum(fmc(truth.failures) for truth in truths.values())
-
-
-def covered_of(truths: Mapping[int, Truth], dense: Mapping[int, Truth]) -> dict[int, FloatArray]:
-    """Return by level the failing points of uniform cases of which the covered share is one.
-
-    They are those of the dense truth where there is one: the more, the smaller the error.
+    Attributes:
+        searches: the searches of each sampler, one a seed.
+        truths: the truth by level.
+        dense: the dense truth of the levels that have one.
+        cases: cases of each search.
+        batch: cases of a batch; None where samplers chose.
+        figure: file that was drawn, if any.
     """
-    points = {level: dense.get(level, truth).failures for level, truth in truths.items()}
-    return {level: failing[:MOST_PROBES] for level, failing in points.items() if len(failing)}
 
+    searches: dict[str, list[Search]]
+    truths: dict[int, Truth]
+    dense: dict[int, Truth] = field(default_factory=dict)
+    cases: int = 400
+    batch: int | None = None
+    figure: Path | None = None
 
-def _covered_shares(searches: Sequence[Search], failing: Mapping[int, FloatArray]) -> FloatArray:
-    """Return the covered share after each batch, (S, batches); NaN where no truth has failures."""
-    shares = np.full((len(searches), len(searches[0].fmc)), np.nan)
-    for row, search in zip(shares, searches, strict=True):
-        of_levels = [_covered_by_batch(search, level, points) for level, points in failing.items()]
-        if of_levels:
-            row[:] = np.mean(of_levels, axis=0)
-    return shares
+    @cached_property
+    def truth_fmc(self) -> float:
+        """Failure mode coverage of the truth, summed over the levels."""
+        return sum(fmc(truth.failures) for truth in self.truths.values())
 
+    @property
+    def is_small(self) -> bool:
+        """Whether a truth is too small to be divided by."""
+        return any(truth.is_small for truth in self.truths.values())
 
-def _covered_by_batch(search: Search, level: int, points: FloatArray) -> FloatArray:
-    """Return the share of points, (m, d), that the failures of a level cover after each batch."""
-    failed = [o for o in search.outcomes if o.failed and o.case.level == level]
-    batches, places = np.array([o.batch for o in failed], dtype=int), search.failures(level)
-    numbers = np.unique([outcome.batch for outcome in search.outcomes])
-    first = np.full(len(points), np.inf)
-    for number in numbers[::-1]:
-        first[covered(points, places[batches == number])] = number
-    return np.array([(first <= number).mean() for number in numbers])
+    @cached_property
+    def regions(self) -> list[tuple[int, FloatArray]] | None:
+        """Level and points of each region of the truths; None where one cannot tell regions."""
+        if not all(truth.tells_regions for truth in self.truths.values()):
+            return None
+        return [(one, region) for one, t in self.truths.items() for region in t.real_regions()]
 
+    @cached_property
+    def limit_fmc(self) -> float:
+        """Coverage of all that is known to fail, summed over the levels: no search has more.
 
-def _regions_found(
-    searches: Sequence[Search], truths: Mapping[int, Truth]
-) -> tuple[FloatArray, int | None]:
-    """Return how many regions of the truths each search found, and how many searches found all.
+        A truth of a few thousand cases misses places that searches find. At each level this is the
+        coverage of what truth and searches found together, or of a dense truth, if that is more.
+        """
+        known, total = list(chain.from_iterable(self.searches.values())), 0.0
+        for level, truth in self.truths.items():
+            failing = [truth.failures, *(search.failures(level) for search in known)]
+            failing = [points for points in failing if len(points)] or failing[:1]
+            dense = fmc(self.dense[level].failures) if level in self.dense else 0.0
+            total += max(fmc(np.concatenate(failing)), dense)
+        return total
 
-    NaN and None where a truth does not tell regions.
-    """
-    if not all(truth.tells_regions for truth in truths.values()):
-        return np.full(len(searches), np.nan), None
-    real = [(level, region) for level, truth in truths.items() for region in truth.real_regions()]
-    found = [sum(_found(s.failures(level), region) for level, region in real) for s in searches]
-    return np.array(found, dtype=np.float64), sum(number == len(real) for number in found)
+    @cached_property
+    def oracle_fmc(self) -> dict[int, float]:
+        """Coverage of an oracle by number of cases."""
+        return oracle(self.truths, self.cases, self.batch)
 
+    @cached_property
+    def probes(self) -> dict[int, FloatArray]:
+        """The failing uniform cases of which the covered share is one, by level.
 
-def _cases_by_batch(search: Search) -> list[int]:
-    """Return the number of cases that have run after each batch."""
-    sizes = Counter(outcome.batch for outcome in search.outcomes)
-    return list(accumulate(sizes.values()))
+        They are those of the dense truth where there is one: the more, the smaller the error.
+        """
+        points = {one: self.dense.get(one, truth).failures for one, truth in self.truths.items()}
+        return {level: failing[:MOST_PROBES] for level, failing in points.items() if len(failing)}
 
+    @cached_property
+    def samplers(self) -> dict[str, SamplerSummary]:
+        """What each sampler found."""
+        return {name: self._summary(searches) for name, searches in self.searches.items()}
 
-def _cases_to(target: float, curves: FloatArray, after: list[int]) -> FloatArray:
-    """Return the cases that each search needs to reach a coverage; infinite where it does not."""
-    reached = curves >= target
-    return np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
+    def _summary(self, searches: Sequence[Search]) -> SamplerSummary:
+        """Return what one sampler found, one search a seed."""
+        curves = np.array([search.fmc for search in searches])
+        divisor = math.nan if self.is_small else self.truth_fmc or math.nan
+        after = list(accumulate(Counter(o.batch for o in searches[0].outcomes).values()))
+        reached = curves >= (0.9 * divisor)
+        regions_found = [
+            math.nan
+            if self.regions is None
+            else sum(bool(covered(s.failures(one), place).any()) for one, place in self.regions)
+            for s in searches
+        ]
+        shares = np.full(curves.shape, np.nan)
+        if self.probes:
+            for row, search in zip(shares, searches, strict=True):
+                of_levels = [search.covered_shares(one, at) for one, at in self.probes.items()]
+                row[:] = np.mean(of_levels, axis=0)
+        return SamplerSummary(
+            fmc=Spread.of(curves[:, -1]),
+            fmc_over_truth=Spread.of(curves[:, -1] / divisor),
+            fmc_over_limit=Spread.of(curves[:, -1] / (self.limit_fmc or math.nan)),
+            covered_share=Spread.of(shares[:, -1]),
+            failures=Spread.of([sum(o.failed for o in one.outcomes) for one in searches]),
+            regions_found=Spread.of(regions_found),
+            cases_to_90_percent=Spread.of(
+                np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
+            ),
+            sampler_s=float(np.median([search.sampler_s for search in searches])),
+            cases_by_batch=after,
+            fmc_by_batch=np.quantile(curves, (0.25, 0.5, 0.75), axis=0).tolist(),
+            covered_share_by_batch=np.median(shares, axis=0).tolist() if self.probes else None,
+        )
 
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        first = next(iter(self.samplers.values()))
+        return {
+            "truth_fmc": self.truth_fmc,
+            "truth_failures": sum(len(truth.failures) for truth in self.truths.values()),
+            "truth_regions": None if self.regions is None else len(self.regions),
+            "truth_too_small": self.is_small,
+            "covered_of": sum(map(len, self.probes.values())),
+            "limit_fmc": self.limit_fmc,
+            "dense_fmc": {level: fmc(truth.failures) for level, truth in self.dense.items()},
+            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
+            "samplers": {name: asdict(result) for name, result in self.samplers.items()},
+        }
 
-def _quantile(values: FloatArray, part: float) -> float | None:
-    """Return a quantile, linear between two values; None where one of them is not finite."""
-    ordered = np.sort(values)
-    place = part * (len(ordered) - 1)
-    low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
-    if not np.isfinite(high):
-        return None
-    return float(low + (place - math.floor(place)) * (high - low))
+    def lines(self) -> list[str]:
+        """Return truth, limit and oracle, and a table of the samplers."""
+        figure = [] if self.figure is None else [f"figure: {self.figure}"]
+        return [*self.found(timed=True), *figure]
 
+    def found(self, *, timed: bool) -> list[str]:
+        """Return the lines without the figure, and without seconds unless `timed`."""
+        failures = sum(len(truth.failures) for truth in self.truths.values())
+        return [
+            f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
+            + ("" if self.regions is None else f", {counted(len(self.regions), 'region')}"),
+            *(
+                f"  at level {level_name(level)} it is {remark}"
+                for level, truth in self.truths.items()
+                for remark in truth.remarks()
+            ),
+            f"limit: FMC {self.limit_fmc:.4f}, of all that truth and searches found"
+            + (f", or of {DENSE_CASES:,} uniform cases, where that is more" if self.dense else ""),
+            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
+            *self._table(timed=timed),
+            *self._error_of_shares(),
+        ]
 
-def _quartiles(values: FloatArray) -> Quartiles:
-    return _quantile(values, 0.25), _quantile(values, 0.75)
+    def _table(self, *, timed: bool) -> list[str]:
+        """Return a line per sampler: medians, with the quartiles in brackets."""
+        from rich.console import Console
+        from rich.table import Table
 
+        table = Table(
+            box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left"
+        )
+        table.add_column("sampler")
+        rows = {
+            name: one.columns(small=self.is_small, timed=timed)
+            for name, one in self.samplers.items()
+        }
+        for heading in next(iter(rows.values()), {}):
+            table.add_column(heading, justify="right", no_wrap=True)
+        for name, cells in rows.items():
+            table.add_row(name, *cells.values())
+        text = StringIO()
+        # As wide as it is: a line of a table that is read by a program must not be broken.
+        Console(width=220, highlight=False, soft_wrap=True, file=text).print(table)
+        return [line.rstrip() for line in text.getvalue().splitlines()]
 
-def _level_share(searches: Sequence[Search], level: int) -> LevelShare:
-    cases = [sum(o.case.level == level for o in search.outcomes) for search in searches]
-    points = [search.failures(level) for search in searches]
-    return LevelShare(
-        cases_median=float(np.median(cases)),
-        failures_median=float(np.median([len(failing) for failing in points])),
-        fmc_median=float(np.median([fmc(failing) for failing in points])),
-    )
-
-
-def _found(points: FloatArray, region: FloatArray) -> bool:
-    """Return whether one of some failures, (m, d), lies in a region of the truth, (n, d)."""
-    return bool(covered(points, region).any())
+    def _error_of_shares(self) -> list[str]:
+        """Return of what the covered share is one, and its largest error (Wilson, 1927)."""
+        if not self.probes:
+            return []
+        counts, z, errors = [len(points) for points in self.probes.values()], 1.96, []
+        for one in self.samplers.values():
+            p = one.covered_share.median or 0.0
+            halves = [
+                z / (1.0 + z**2 / n) * math.sqrt(p * (1.0 - p) / n + (z / (2.0 * n)) ** 2)
+                for n in counts
+            ]
+            errors.append(math.hypot(*halves) / len(counts))
+        return [
+            f"covered share: of {counted(sum(counts), 'failing uniform case')}, those within a "
+            f"radius of a failure found; to within {max(errors):.2f} (95 %)"
+        ]
 
 
 def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[int, float]:
@@ -430,249 +518,3 @@ def greedy_cover(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]
         order.append(place)
         gains.append(new)
     return points[order], np.array(gains)
-
-
-OnPart = Callable[[str, int, int, str, str], None]
-"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
-
-
-@dataclass(frozen=True, slots=True)
-class Study:
-    """A plan, and what truths and searches run it with.
-
-    Attributes:
-        plan: how cases run.
-        workers: where they run; by default in this process.
-        cache: folder of the truths, by default the user's.
-        on_part: told how far each truth is, and all searches together.
-        engine: what moves the vehicles of truths: see `SimulationPlan.with_engine`.
-    """
-
-    plan: SimulationPlan
-    workers: Workers | None = None
-    cache: Path | None = None
-    on_part: OnPart = lambda *_: None
-    engine: str | None = None
-
-    def truth(
-        self,
-        level: int,
-        cases: int | None = None,
-        seed: int = 0,
-        repeats: Repeats | None = None,
-    ) -> Truth:
-        """Return the truth at a level, from the cache where it is kept."""
-        total, ended = TRUTH_CASES[level] if cases is None else cases, 0
-        size = "dense truth" if total == DENSE_CASES else "truth"
-        title = f"{size} of {self.plan.vut.spec} at level {level_name(level)}"
-
-        def ran(more: int) -> None:
-            nonlocal ended
-            ended += more
-            self.on_part(title, ended, total, "cases", "")
-
-        plan = self.plan.at_level(level).with_engine(self.engine)
-        where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
-        return ground_truth(plan, level, total, seed, repeats=repeats, **where)
-
-    def dense_truths(self, levels: Sequence[int], wanted: bool | None) -> dict[int, Truth]:
-        """Return the dense truths by level: made where `wanted`, where that is None the kept."""
-        if wanted is False:
-            return {}
-        if wanted:
-            return {level: self.truth(level, DENSE_CASES) for level in levels}
-        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
-        return {level: truth for level, truth in kept.items() if truth is not None}
-
-    def searches(
-        self,
-        levels: tuple[int, ...],
-        samplers: Sequence[str],
-        seeds: int,
-        cases: int,
-        batch: int | None,
-    ) -> dict[str, list[Search]]:
-        """Let each sampler search with each seed; return the searches by sampler: see `search`."""
-        title = f"{self.plan.vut.spec} v level {'/'.join(map(level_name, levels))}"
-        number = count(1)
-        return search(
-            self.plan,
-            levels,
-            samplers,
-            seeds=seeds,
-            cases=cases,
-            batch=batch,
-            workers=self.workers,
-            on_search=lambda name, _: self.on_part(
-                title, next(number), len(samplers) * seeds, "runs", name
-            ),
-        )
-
-
-@dataclass(frozen=True, repr=False)
-class SamplerStudy(Result):
-    """Samplers beside each other, and beside the ground truth, over several seeds.
-
-    Attributes:
-        samplers: `SamplerSummary` by name: medians and quartiles over the seeds.
-        truths: the truth by level.
-        dense: the dense truth of the levels that have one.
-        limit_fmc: coverage of all that truth and searches found, or of the dense truths.
-        oracle_fmc: coverage of an oracle by number of cases.
-        cases: cases of each search.
-        figure: file that was drawn, if any.
-    """
-
-    samplers: dict[str, SamplerSummary]
-    truths: dict[int, Truth]
-    dense: dict[int, Truth]
-    limit_fmc: float
-    oracle_fmc: dict[int, float]
-    cases: int
-    figure: Path | None = None
-
-    @property
-    def truth_fmc(self) -> float:
-        """Failure mode coverage of the truth, summed over the levels."""
-        return _truth_fmc(self.truths)
-
-    @property
-    def is_small(self) -> bool:
-        """Whether a truth is too small to be divided by."""
-        return any_small(self.truths.values())
-
-    @classmethod
-    def of(
-        cls,
-        searches: Mapping[str, Sequence[Search]],
-        truths: dict[int, Truth],
-        dense: dict[int, Truth],
-        cases: int,
-        batch: int | None,
-    ) -> SamplerStudy:
-        """Compare searches of so many cases, by sampler, with the truths by level."""
-        limit = limit_fmc(chain.from_iterable(searches.values()), truths, dense)
-        summaries = {
-            name: compare(of_name, truths, limit, dense) for name, of_name in searches.items()
-        }
-        return cls(summaries, truths, dense, limit, oracle(truths, cases, batch), cases)
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        first = next(iter(self.samplers.values()))
-        return {
-            "truth_fmc": self.truth_fmc,
-            "truth_too_small": self.is_small,
-            "covered_of": sum(map(len, covered_of(self.truths, self.dense).values())),
-            "limit_fmc": self.limit_fmc,
-            "dense_levels": list(self.dense),
-            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
-            **{name: asdict(result) for name, result in self.samplers.items()},
-        }
-
-    def lines(self) -> list[str]:
-        """Return truth, limit and oracle, and a table of the samplers."""
-        failures = sum(len(truth.failures) for truth in self.truths.values())
-        tells = all(truth.tells_regions for truth in self.truths.values())
-        real = sum(len(truth.real_regions()) for truth in self.truths.values())
-        return [
-            f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
-            + (f", {counted(real, 'region')}" if tells else ""),
-            *(
-                f"  at level {level_name(level)} it is {remark}"
-                for level, truth in self.truths.items()
-                for remark in truth.remarks()
-            ),
-            f"limit: FMC {self.limit_fmc:.4f}, {self._limit_is()}",
-            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
-            *_table(self.samplers, small=self.is_small),
-            *self._covered_is(),
-            *([] if self.figure is None else [f"figure: {self.figure}"]),
-        ]
-
-    def _covered_is(self) -> list[str]:
-        """Return of what the covered share is one, and the interval of each sampler's median."""
-        failing = covered_of(self.truths, self.dense)
-        if not failing:
-            return []
-        counts = [len(points) for points in failing.values()]
-        errors = [
-            math.sqrt(sum(_half_width(one.covered_share_median or 0.0, n) ** 2 for n in counts))
-            / len(counts)
-            for one in self.samplers.values()
-        ]
-        return [
-            f"covered share: of {counted(sum(counts), 'failing uniform case')}, those within a "
-            f"radius of a failure found; to within {max(errors):.2f} (95 %)"
-        ]
-
-    def _limit_is(self) -> str:
-        if not self.dense:
-            return "of all that truth and searches found (--dense runs 1,000,000 cases)"
-        part = "" if len(self.dense) == len(self.truths) else " at some levels"
-        return (
-            f"of {DENSE_CASES:,} uniform cases{part}, or of all that was found, where that is more"
-        )
-
-
-def _half_width(share: float, n: int) -> float:
-    """Return half the width of the 95 % interval of a binomial share (Wilson, 1927)."""
-    z = 1.96
-    return z / (1.0 + z**2 / n) * math.sqrt(share * (1.0 - share) / n + (z / (2.0 * n)) ** 2)
-
-
-def _table(compared: Mapping[str, SamplerSummary], *, small: bool) -> list[str]:
-    """Return a line per sampler: medians, with the quartiles in brackets.
-
-    Nothing is divided by the FMC of a `small` truth.
-    """
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left")
-    table.add_column("sampler")
-    rows = {name: _columns(one, small=small) for name, one in compared.items()}
-    for heading in next(iter(rows.values()), {}):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for name, cells in rows.items():
-        table.add_row(name, *cells.values())
-    text = StringIO()
-    # As wide as it is: a line of a table that is read by a program must not be broken.
-    Console(width=220, highlight=False, soft_wrap=True, file=text).print(table)
-    return [line.rstrip() for line in text.getvalue().splitlines()]
-
-
-def _columns(one: SamplerSummary, *, small: bool) -> dict[str, str]:
-    """Return the cells of a sampler by heading."""
-
-    def cell(name: str, form: str) -> str:
-        return _spread(getattr(one, f"{name}_median"), getattr(one, f"{name}_quartiles"), form)
-
-    covered_share, sampler_s = cell("covered_share", ".3f"), f"{one.sampler_s_median:.2f}"
-    if small:
-        return {
-            "covered share": covered_share,
-            "50 % covered": cell("cases_to_50_percent_covered", ".0f"),
-            "90 % covered": cell("cases_to_90_percent_covered", ".0f"),
-            "FMC": cell("fmc", ".4f"),
-            "failures": cell("failures", ".0f"),
-            "sampler s": sampler_s,
-        }
-    return {
-        "FMC / truth": cell("fmc_over_truth", ".3f"),
-        "FMC / limit": cell("fmc_over_limit", ".3f"),
-        "covered share": covered_share,
-        "FMC": cell("fmc", ".4f"),
-        "failures": cell("failures", ".0f"),
-        "regions": cell("regions_found", ".1f"),
-        "to 50 %": cell("cases_to_50_percent", ".0f"),
-        "to 90 %": cell("cases_to_90_percent", ".0f"),
-        "sampler s": sampler_s,
-    }
-
-
-def _spread(median: float | None, quartiles: Quartiles, form: str) -> str:
-    median_text, low, high = (
-        "-" if value is None else f"{value:{form}}" for value in (median, *quartiles)
-    )
-    return f"{median_text} [{low}, {high}]"

@@ -58,7 +58,7 @@ print(ms.compare_runs(run, "runs/b").worse(0.01), ms.history([run, "runs/b"]).li
 print(ms.export(run, 3)[0].name, ms.report(run).name, ms.replay(run, 3).diverged_at_s)
 code: int = ms.open_in_gui(run, 3)
 print(ms.truth(Mine, 0, cases=100).failures.shape, ms.truths("fsm").truths[0].score.mean())
-print(ms.benchmark("fsm", 0, samplers=["uniform"], seeds=2).samplers["uniform"].fmc_median)
+print(ms.benchmark("fsm", 0, samplers=["uniform"], seeds=2).samplers["uniform"].fmc.median)
 print(ms.probability(run, cases=100).estimate.low)
 print(ms.crosscheck(run).found.motion.largest_m)
 print(ms.repair(run, ["gain=0..1"], trials=9).repair.spec)

@@ -8,7 +8,8 @@ import shutil
 import pytest
 from calling import assert_refused
 
-from merge_sumo.studies.reproduction import TABLE_II, TABLE_JSON, Scale
+from merge_sumo.reports.reproduction_page import TABLE_JSON
+from merge_sumo.studies.reproduction import TABLE_II, Scale
 
 
 @pytest.fixture(autouse=True)
@@ -16,34 +17,25 @@ def cache(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
 
 
-COMPARE = ("benchmark", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
+BENCHMARK = ("benchmark", "--vut", "design1", "--level", "0", "--truth-cases", 300, "--workers", 1)
 SMALL = ("--samplers", "uniform,gpr", "--seeds", 2, "--cases", 30, "--batch", 15)
 
 
-class TestCompare:
+class TestBenchmark:
     def test_prints_one_json_object_with_the_keys_that_are_promised(self, call):
-        code, out, err = call(*COMPARE, *SMALL, "--json")
+        code, out, err = call(*BENCHMARK, *SMALL, "--json")
         assert code == 0, err
         assert out.count("\n") == 1
         found = json.loads(out)
         assert found["truth_fmc"] > 0.0
         assert found["limit_fmc"] >= found["truth_fmc"]
-        assert found["dense_levels"] == []
+        assert found["dense_fmc"] == {}
         assert len(found["oracle_fmc_by_batch"]) == 2
-        promised = {
-            "fmc_median",
-            "fmc_over_truth_median",
-            "fmc_over_truth_quartiles",
-            "fmc_over_limit_median",
-            "regions_found_median",
-            "cases_to_90_percent_median",
-            "sampler_s_median",
-        }
         for name in ("uniform", "gpr"):
-            assert promised <= set(found[name])
+            assert set(found["samplers"][name]["fmc"]) == {"median", "low", "high"}
 
     def test_prints_a_line_per_sampler_and_draws_the_figure(self, call, tmp_path):
-        code, out, err = call(*COMPARE, *SMALL, "--figure", "curves.svg")
+        code, out, err = call(*BENCHMARK, *SMALL, "--figure", "curves.svg")
         assert code == 0, err
         assert (tmp_path / "curves.svg").read_text().count("<svg") == 1
         assert "figure: curves.svg" in out
@@ -51,30 +43,10 @@ class TestCompare:
             line.split()[0] for line in out.splitlines() if line.strip()
         }
 
-    @pytest.mark.long
-    def test_uses_a_dense_truth_once_it_was_made_unless_told_not_to(self, call, monkeypatch):
-        monkeypatch.setattr("merge_sumo.studies.sampler_study.DENSE_CASES", 900)
-        tiny = (*COMPARE, "--samplers", "uniform", "--seeds", 1, "--cases", 10, "--batch", 10)
-        found: dict = {}
-        for option in ("", "--dense", "--dense", "", "--no-dense"):
-            code, out, err = call(*tiny, *filter(None, [option]), "--json")
-            assert code == 0, err
-            result = json.loads(out)
-            found.setdefault(option, []).append((result["dense_levels"], result["limit_fmc"]))
-        (none_yet, (kept, limit)), (without,) = found[""], found["--no-dense"]
-        assert none_yet == without
-        assert without[0] == []
-        assert kept == [0]
-        assert found["--dense"] == [(kept, limit)] * 2
-        assert limit > without[1]
-        code, out, err = call(*tiny)
-        assert "limit: FMC" in out
-        assert "of 900 uniform cases" in out
-
     @pytest.mark.parametrize("figure", ["f.pdf", "gone/f.png", "mine.png"])
     def test_refuses_a_figure_that_cannot_be_before_it_runs_anything(self, call, tmp_path, figure):
         (tmp_path / "mine.png").write_text("mine")
-        assert_refused(call(*COMPARE, *SMALL, "--figure", figure), "--figure")
+        assert_refused(call(*BENCHMARK, *SMALL, "--figure", figure), "--figure")
         assert not (tmp_path / "cache").exists()
         assert (tmp_path / "mine.png").read_text() == "mine"
 

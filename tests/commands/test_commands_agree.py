@@ -157,9 +157,9 @@ def check_compare_and_truth(world: World, records: list[dict[str, Any]]) -> None
         "benchmark", *world.tried.asked, *sampler, "--truth-cases", count, "--workers", 1
     )
     assert compared["truth_fmc"] == truth["fmc"] == fmc(points[failing])
-    assert compared["uniform"]["failures_median"] == sum(map(fails, records))
+    assert compared["samplers"]["uniform"]["failures"]["median"] == sum(map(fails, records))
     of_campaign = world.campaign["levels"][str(level)]["fmc"]
-    assert compared["uniform"]["fmc_median"] == pytest.approx(of_campaign)
+    assert compared["samplers"]["uniform"]["fmc"]["median"] == pytest.approx(of_campaign)
 
 
 def probability_judges_as_run(world: World) -> None:

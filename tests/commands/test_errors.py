@@ -176,7 +176,7 @@ class TestAnOptionThatIsGivenTwice:
         [
             ("campaign", "--vut", "design1", "--vut", "design2"),
             ("truth", "--vut", "design1", "--level", 0, "--level", 1),
-            ("benchmark", "--vut", "design1", "--level", 0, "--dense", "--no-dense"),
+            ("benchmark", "--vut", "design1", "--cases", 10, "--cases", 20),
             ("scenario", "new", "a.toml", "--net", "x", "--net", "y"),
             ("policies", "export", "vut1", "--out", "a", "--out", "b"),
         ],

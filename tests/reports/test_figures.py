@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,50 +17,27 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
-from merge_sumo.studies.sampler_study import LevelShare, SamplerSummary
 from merge_sumo.values.fmc import RADIUS
 
 
-def compared(end: float) -> SamplerSummary:
-    return SamplerSummary(
-        fmc_median=end,
-        fmc_quartiles=(end, end),
-        covered_share_median=0.5,
-        covered_share_quartiles=(0.5, 0.5),
-        fmc_over_truth_median=None,
-        fmc_over_truth_quartiles=(None, None),
-        fmc_over_limit_median=None,
-        fmc_over_limit_quartiles=(None, None),
-        failures_median=1.0,
-        failures_quartiles=(1.0, 1.0),
-        regions_found_median=1.0,
-        regions_found_quartiles=(1.0, 1.0),
-        seeds_with_all_regions=1,
-        cases_to_50_percent_covered_median=None,
-        cases_to_50_percent_covered_quartiles=(None, None),
-        cases_to_90_percent_covered_median=None,
-        cases_to_90_percent_covered_quartiles=(None, None),
-        cases_to_50_percent_median=None,
-        cases_to_50_percent_quartiles=(None, None),
-        cases_to_90_percent_median=None,
-        cases_to_90_percent_quartiles=(None, None),
-        sampler_s_median=0.0,
-        cases_by_batch=[20, 40],
-        fmc_by_batch_median=[end / 2.0, end],
-        fmc_by_batch_quartiles=([0.0, end / 2.0], [end, 2.0 * end]),
-        covered_share_by_batch_median=[0.4, 0.5],
-        levels={0: LevelShare(40.0, 1.0, end)},
+def curves(*, together: bool = False):
+    """Draw two samplers; `together`, all lines end at one place."""
+    ends = (0.05, 0.05) if together else (0.01, 0.05)
+    samplers = {
+        name: SimpleNamespace(
+            cases_by_batch=[20, 40],
+            fmc_by_batch=[[0.0, end / 2.0], [end / 2.0, end], [end, 2.0 * end]],
+        )
+        for name, end in zip(("uniform", "gpr"), ends, strict=True)
+    }
+    truth, limit = (0.05, 0.05) if together else (0.12, 0.15)
+    study: Any = SimpleNamespace(
+        samplers=samplers,
+        truth_fmc=truth,
+        oracle_fmc={0: 0.0, 10: 0.1, 40: truth},
+        limit_fmc=limit,
     )
-
-
-def curves():
-    return figures.coverage_curves(
-        "design1 v level 0",
-        {"uniform": compared(0.01), "gpr": compared(0.05)},
-        0.12,
-        {0: 0.0, 10: 0.1, 40: 0.12},
-        0.15,
-    )
+    return figures.coverage_curves("design1 v level 0", study)
 
 
 def panel(n: int, dims: int) -> Panel:
@@ -80,9 +59,7 @@ class TestTheCurves:
         assert len(axes.collections) == 2, "a band for each sampler"
 
     def test_name_lines_that_end_together_apart(self):
-        figure = figures.coverage_curves(
-            "t", {"uniform": compared(0.05), "gpr": compared(0.05)}, 0.05, {0: 0.0, 40: 0.05}, 0.05
-        )
+        figure = curves(together=True)
         heights = sorted(
             text.xyann[1] for text in figure.axes[0].texts if isinstance(text, Annotation)
         )

@@ -1,4 +1,4 @@
-"""CoverageGrid truth and comparison of samplers, in worker processes with a SUMO each."""
+"""Truths in the cache, and samplers beside each other and a truth, by hand and in SUMO."""
 
 # mypy: no-strict-optional
 
@@ -8,7 +8,7 @@ import json
 import shlex
 import shutil
 import sys
-from dataclasses import asdict
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +19,11 @@ from vut_contract import factory
 from merge_sumo.errors import UserError
 from merge_sumo.studies.sampler_study import (
     SamplerStudy,
+    SamplerSummary,
     Search,
-    compare,
-    limit_fmc,
+    Spread,
+    Study,
     oracle,
-    search,
 )
 from merge_sumo.studies.truth import Truth, ground_truth, known_truth
 from merge_sumo.values.case import from_unit, to_unit
@@ -141,27 +141,23 @@ def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_na
     assert truth_of("traci", tmp_path / "cache", command=command) == 4
 
 
-def test_a_comparison_says_what_samplers_found_of_the_truth(truth):
-    (found,) = search(plan_for("design1"), (0,), ["uniform"], seeds=2, cases=50, batch=20).values()
-    result = compare(found, {0: truth})
-    assert result.cases_by_batch == [20, 40, 50]
-    assert len(result.fmc_by_batch_median) == 3
-    assert result.fmc_by_batch_median == sorted(result.fmc_by_batch_median)
-    assert truth.is_small
-    assert result.fmc_over_truth_median is None
-    assert result.cases_to_90_percent_median is None
-    assert result.covered_share_by_batch_median == sorted(result.covered_share_by_batch_median)
-    low, high = result.covered_share_quartiles
-    assert 0.0 < low <= result.covered_share_median <= high <= 1.0
-    low, high = result.fmc_quartiles
-    assert low <= result.fmc_median <= high
-    assert result.levels[0].cases_median == 50
+def test_a_study_says_what_samplers_found_of_the_truth(cache):
+    study = Study(plan_for("design1"), cache=cache)
+    result = study.compare((0,), ["uniform"], seeds=2, cases=50, batch=20, truth_cases=300)
+    found = result.samplers["uniform"]
+    assert found.cases_by_batch == [20, 40, 50]
+    assert all(curve == sorted(curve) for curve in found.fmc_by_batch)
+    assert result.is_small
+    assert found.fmc_over_truth == found.cases_to_90_percent == Spread(None, None, None)
+    assert found.covered_share_by_batch == sorted(found.covered_share_by_batch)
+    share = found.covered_share
+    assert 0.0 < share.low <= share.median <= share.high <= 1.0
+    assert result.dense == {}
 
 
 def test_a_search_of_all_levels_sums_their_coverage():
-    (found,) = search(plan_for("design1"), (0, 1), ["uniform"], seeds=1, cases=40, batch=40)[
-        "uniform"
-    ]
+    searches = Study(plan_for("design1")).searches((0, 1), ["uniform"], 1, 40, 40)
+    (found,) = searches["uniform"]
     assert {outcome.case.level for outcome in found.outcomes} == {0, 1}
     assert found.fmc[-1] == sum(fmc(found.failures(level)) for level in (0, 1))
 
@@ -180,138 +176,101 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
     return Search(outcomes, curve, sampler_s)
 
 
-def dense_truth(points: list[list[float]]) -> Truth:
-    """Return a truth with two failures at each of some points, so that it is large enough."""
-    failures = np.array([*points, *points])
-    return Truth(failures, np.full(len(failures), -600.0))
+def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
+    """Return a truth with some failures at each of some points: two of them are large enough."""
+    at = np.array(points * failures or [(0.5, 0.5)])
+    return Truth(at, np.full(len(at), -600.0 if failures else -1.0))
 
 
-class TestAComparisonByHand:
-    truth = dense_truth([[0.2, 0.2], [0.8, 0.8]])
-    half = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
-    most = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
+TWO = truth_with((0.2, 0.2), (0.8, 0.8))
+SMALL = truth_with((0.2, 0.2), (0.8, 0.8), failures=1)
+NONE = truth_with(failures=0)
+HALF = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
+MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
+FAR = searched([[(0.8, 0.2)]])
 
-    def test_has_medians_over_the_seeds(self):
-        found = compare([self.most, self.half], {0: self.truth})
-        assert found.regions_found_median == 1.5
-        assert found.seeds_with_all_regions == 1
-        assert found.failures_median == 1.5
-        assert found.fmc_over_truth_median == pytest.approx(0.75)
-        assert found.sampler_s_median == 2.0
 
-    def test_has_quartiles_over_the_seeds(self):
-        found = compare([self.most, self.half], {0: self.truth})
-        assert found.regions_found_quartiles == (1.25, 1.75)
-        assert found.failures_quartiles == (1.25, 1.75)
-        assert found.fmc_over_truth_quartiles == pytest.approx((0.625, 0.875))
-        low, high = found.fmc_by_batch_quartiles
-        assert high[0] == pytest.approx(0.75 * fmc(np.zeros((1, 2))))
-        assert low[0] == pytest.approx(0.25 * fmc(np.zeros((1, 2))))
+def study_of(*searches: Search, truth: Truth = TWO, **more) -> SamplerStudy:
+    return SamplerStudy({"mine": list(searches)}, {0: truth}, cases=4, **more)
 
-    def test_counts_cases_to_a_share_of_the_truth(self):
-        found = compare([self.most] * 2, {0: self.truth})
-        assert found.cases_to_50_percent_median == 2.0
-        assert found.cases_to_50_percent_quartiles == (2.0, 2.0)
-        assert found.cases_to_90_percent_median == 4.0
+
+def summary(*searches: Search, **more) -> SamplerSummary:
+    return study_of(*searches, **more).samplers["mine"]
+
+
+class TestASamplerByHand:
+    def test_has_medians_and_quartiles_over_the_seeds(self):
+        found = summary(MOST, HALF)
+        assert found.regions_found == Spread(1.5, 1.25, 1.75)
+        assert found.failures == Spread(1.5, 1.25, 1.75)
+        assert astuple(found.fmc_over_truth) == pytest.approx((0.75, 0.625, 0.875))
+        assert found.sampler_s == 2.0
+        low, median, high = found.fmc_by_batch
+        disc = fmc(np.zeros((1, 2)))
+        assert (low[0], median[0], high[0]) == pytest.approx((disc / 4, disc / 2, disc * 3 / 4))
 
     def test_has_no_cases_to_a_share_that_too_few_seeds_reach(self):
-        found = compare([self.most, self.half, self.half], {0: self.truth})
-        assert found.cases_to_90_percent_median is None
-        assert found.cases_to_90_percent_quartiles == (None, None)
-        assert json.dumps(asdict(found), allow_nan=False)
-        found = compare([self.most, self.most, self.half], {0: self.truth})
-        assert found.cases_to_90_percent_median == 4.0, "just enough seeds reach it"
-        assert found.cases_to_90_percent_quartiles == (4.0, None)
+        assert summary(MOST, HALF, HALF).cases_to_90_percent == Spread(None, None, None)
+        assert summary(MOST, MOST, HALF).cases_to_90_percent == Spread(4.0, 4.0, None)
 
     def test_without_failures_in_the_truth_has_no_share_of_it(self):
-        nothing = Truth(np.array([[0.5, 0.5]]), np.array([-1.0]))
-        found = compare([self.half], {0: nothing})
-        assert found.fmc_over_truth_median is None
-        assert json.dumps(asdict(found), allow_nan=False)
+        found = study_of(HALF, truth=NONE)
+        assert found.samplers["mine"].fmc_over_truth.median is None
+        assert found.samplers["mine"].covered_share.median is None
+        assert json.dumps(found.to_record(), allow_nan=False)
+
+    def test_covers_a_share_of_the_failures_of_the_truth(self):
+        assert summary(HALF, truth=SMALL).covered_share_by_batch == [0.0, 0.5]
+        assert summary(MOST, truth=SMALL).covered_share_by_batch == [0.5, 1.0]
+        dense = {0: truth_with((0.2, 0.2), (0.8, 0.8), (0.5, 0.5), (0.9, 0.1))}
+        assert summary(HALF, truth=SMALL, dense=dense).covered_share.median == 0.25
+
+    def test_covers_the_mean_share_over_the_levels_with_failures(self):
+        for other, share in ((NONE, 0.5), (truth_with((0.2, 0.2)), 0.25)):
+            found = SamplerStudy({"mine": [HALF]}, {0: SMALL, 1: other}, cases=3)
+            assert found.samplers["mine"].covered_share.median == share
 
 
-class TestTheCoveredShare:
-    half, most = TestAComparisonByHand.half, TestAComparisonByHand.most
-    small = Truth(np.array([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5]]), np.array([-600.0, -700.0, -1.0]))
-
-    def test_is_that_of_the_failures_of_the_truth_near_one_found(self):
-        found = compare([self.half], {0: self.small})
-        assert found.covered_share_by_batch_median == [0.0, 0.5]
-        assert found.covered_share_median == 0.5
-        assert found.cases_to_50_percent_covered_median == 3.0
-        assert found.cases_to_90_percent_covered_median is None
-        assert compare([self.most], {0: self.small}).cases_to_90_percent_covered_median == 4.0
-
-    def test_is_of_the_dense_truth_where_there_is_one(self):
-        dense = {0: dense_truth([[0.2, 0.2], [0.8, 0.8], [0.5, 0.5], [0.9, 0.1]])}
-        assert compare([self.half], {0: self.small}, None, dense).covered_share_median == 0.25
-
-    def test_of_levels_is_the_mean_over_those_with_failures(self):
-        none = Truth(np.array([[0.5, 0.5]]), np.array([-1.0]))
-        other = dense_truth([[0.2, 0.2]])
-        assert compare([self.half], {0: self.small, 1: none}).covered_share_median == 0.5
-        assert compare([self.half], {0: self.small, 1: other}).covered_share_median == 0.25
-        assert compare([self.half], {0: none}).covered_share_median is None
-
-    def test_is_shown_in_place_of_shares_of_a_truth_that_is_too_small(self):
-        found = SamplerStudy.of({"uniform": [self.half]}, {0: self.small}, {}, 3, None)
+class TestTheLinesOfAStudy:
+    def test_divide_by_no_truth_that_is_too_small(self):
+        found = study_of(HALF, truth=SMALL)
         text = "\n".join(found.lines())
-        assert (
-            "at level 0 it is too small to be divided by: as many cases again could add up to"
-            in text
-        )
+        assert "at level 0 it is too small to be divided by: as many cases again could" in text
         assert "too small for regions: 100% of the failures have no other one within 0.05" in text
         assert "covered share: of 2 failing uniform cases" in text
         assert "FMC / truth" not in text
-        assert "90 % covered" in text
         record = found.to_record()
         assert record["truth_too_small"]
-        assert record["uniform"]["fmc_over_truth_median"] is None
-        assert record["uniform"]["seeds_with_all_regions"] is None
+        assert record["truth_regions"] is None
+        assert record["samplers"]["mine"]["fmc_over_truth"]["median"] is None
 
-    def test_is_shown_beside_those_of_a_large_one(self):
-        truth = TestAComparisonByHand.truth
-        text = "\n".join(SamplerStudy.of({"uniform": [self.half]}, {0: truth}, {}, 3, None).lines())
+    def test_divide_by_a_large_one(self):
+        text = "\n".join(study_of(HALF).lines())
         assert "too small" not in text
         assert "FMC / truth" in text
-        assert "covered share: of 4 failing" in text
+        assert "sampler s" in text
+        assert "sampler s" not in "\n".join(study_of(HALF).found(timed=False))
 
 
 class TestTheLimit:
-    truth = TestAComparisonByHand.truth
-    near = searched([[(0.2, 0.24)]])
-    far = searched([[(0.8, 0.2)]])
-
     def test_is_the_coverage_of_all_that_truth_and_searches_found(self):
         found = np.array([[0.2, 0.2], [0.8, 0.8], [0.2, 0.24], [0.8, 0.2]])
-        assert limit_fmc([self.near, self.far], {0: self.truth}, {}) == pytest.approx(fmc(found))
-        assert limit_fmc([], {0: self.truth}, {}) == fmc(self.truth.failures)
+        assert study_of(HALF, FAR).limit_fmc == pytest.approx(fmc(found))
 
     def test_is_that_of_a_dense_truth_where_it_is_more(self):
         points = np.random.default_rng(0).random((50, 2))
         dense = Truth(points, np.full(50, -600.0))
-        assert limit_fmc([self.far], {0: self.truth}, {0: dense}) == fmc(points)
-        poor = Truth(points[:1], np.full(1, -600.0))
-        without = limit_fmc([self.far], {0: self.truth}, {})
-        assert limit_fmc([self.far], {0: self.truth}, {0: poor}) == without
-
-    def test_is_summed_over_the_levels_each_with_what_is_more_there(self):
-        one = Truth(np.array([[0.5, 0.5]]), np.array([-600.0]))
-        dense = Truth(np.array([[0.1, 0.1], [0.9, 0.9]]), np.full(2, -600.0))
-        limit = limit_fmc([self.far], {0: one, 1: one}, {1: dense})
-        assert limit == pytest.approx(4.0 * fmc(one.failures))
+        assert study_of(FAR, dense={0: dense}).limit_fmc == fmc(points)
+        poor = {0: truth_with((0.2, 0.2), failures=1)}
+        assert study_of(FAR, dense=poor).limit_fmc == study_of(FAR).limit_fmc
 
     def test_is_never_passed_although_the_truth_is(self):
-        truth = dense_truth([[0.2, 0.2]])
-        search = searched([[(0.2, 0.2), (0.8, 0.2)]])
-        found = compare([search], {0: truth}, limit_fmc([search], {0: truth}, {}))
-        assert found.fmc_over_truth_median == pytest.approx(2.0)
-        assert found.fmc_over_limit_median == pytest.approx(1.0)
-        assert found.fmc_over_limit_quartiles == pytest.approx((1.0, 1.0))
+        found = summary(searched([[(0.2, 0.2), (0.8, 0.2)]]), truth=truth_with((0.2, 0.2)))
+        assert found.fmc_over_truth.median == pytest.approx(2.0)
+        assert astuple(found.fmc_over_limit) == pytest.approx((1.0, 1.0, 1.0))
 
-    def test_that_nobody_gave_and_one_of_nothing_have_no_share(self):
-        assert compare([self.far], {0: self.truth}).fmc_over_limit_median is None
-        assert compare([searched([[]])], {0: self.truth}, 0.0).fmc_over_limit_median is None
+    def test_of_nothing_has_no_share(self):
+        assert summary(searched([[]]), truth=NONE).fmc_over_limit.median is None
 
 
 def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
