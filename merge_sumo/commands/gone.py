@@ -44,6 +44,8 @@ def check_command(arguments: Sequence[str]) -> None:
 
 def check_options(command: str, arguments: Sequence[str], known: Container[str]) -> None:
     """Raise `UserError` where an argument is an option that is gone, and not a `known` one."""
+    if command == "benchmark" and arguments and not arguments[0].startswith("-"):
+        raise UserError(f"benchmark takes no samplers: {OPTIONS['benchmark --quick']}")
     for argument in arguments:
         name = argument.partition("=")[0]
         if name == "--":

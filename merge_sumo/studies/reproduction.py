@@ -221,7 +221,8 @@ class Reproduction(Result):
         ]
         for title, one in self.columns.items():
             truth = one.study.truths[one.column.level]
-            rows += [f"\nThe truth of {title} is {remark}." for remark in truth.remarks()]
+            for remark in truth.remarks():
+                rows += ["", f"The truth of {title} is {remark}."]
         return rows if self.page is None else [*rows, f"all of it: {self.page}"]
 
     def rows(self) -> Iterator[tuple[str, list[str]]]:

@@ -35,6 +35,11 @@ def test_a_command_and_an_option_that_are_gone_name_their_successors(monkeypatch
     assert refused("campaign", "--old") == said
 
 
+def test_the_contest_of_samplers_is_named_where_it_was():
+    for arguments in (("uniform", "gpr"), ("--quick",), ("--problems", "table")):
+        assert "`python tools/benchmark`" in refused("benchmark", *arguments)
+
+
 @pytest.mark.parametrize("name", gone.COMMANDS)
 def test_no_command_is_both_here_and_gone(name):
     assert name not in commands()
