@@ -19,7 +19,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -85,17 +85,13 @@ from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
-from merge_sumo.reports.board import write_board
-from merge_sumo.reports.campaign_panel import CampaignPanel
-from merge_sumo.reports.campaign_progress import CampaignProgress, Phase
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
-from merge_sumo.reports.progress import Bars, TrainingBars, is_watched
+from merge_sumo.reports.progress import Bars, CampaignBars, TrainingBars
 from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
-from merge_sumo.reports.running_page import RunningPage
 from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.finder import find_corridor
@@ -115,7 +111,6 @@ from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.counterfactuals import note_avoidance
-from merge_sumo.studies.expectation import note_expectation
 from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
@@ -257,26 +252,22 @@ def _concluded(
     junit = _path(runner.junit)
     if junit is not None:
         check_junit(junit, folder)
-    quiet = not (is_watched() if runner.progress is None else runner.progress)
-    progress = CampaignProgress(
-        _title(settings), settings.cases, settings.levels, tolerated=settings.tolerated
-    )
+    if not goes_on:
+        check_new(folder)
+    bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=runner.progress)
     try:
-        with (
-            runner.open(plan) as opened,
-            CampaignPanel(progress, RunningPage(folder), quiet=quiet) as panel,
-        ):
-            progress.workers = opened.count
+        with runner.open(plan) as opened, bars:
+            bars.begin(_title(settings))
 
             def case_ended(outcome: Outcome) -> None:
-                panel.case_ended(outcome)
+                bars.case_ended(outcome)
                 if runner.on_case is not None:
                     runner.on_case(outcome)
 
             if goes_on:
                 done = resume_campaign(
                     *(settings, plan, folder, case_ended),
-                    on_before=panel.ran_before,
+                    on_before=bars.ran_before,
                     force=force,
                     workers=opened,
                     check=runner.checks,
@@ -287,24 +278,29 @@ def _concluded(
                     settings, plan, folder, case_ended, workers=opened, check=runner.checks
                 )
             result = CampaignRun(done, gates)
-            _write_findings(result, plan, opened, panel, runner)
+            _write_findings(result, plan, opened, bars, runner)
     except (KeyboardInterrupt, Stopped) as stop:
         if folder.exists():
             link_latest(folder)
             stop.add_note(f"stopped; go on with ms.resume({str(folder)!r})")
         raise
     if junit is not None:
-        write_junit(junit, done, result.summary.levels, result.verdict, result.gates)
+        write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
 
 
 def _write_findings(
-    result: CampaignRun, plan: SimulationPlan, opened: Workers, panel: CampaignPanel, runner: Runner
+    result: CampaignRun, plan: SimulationPlan, opened: Workers, bars: CampaignBars, runner: Runner
 ) -> None:
-    """Write what follows the cases into the folder: counterfactuals, expectation, report."""
+    """Write what follows the cases into the folder: counterfactuals and report."""
     done, checks = result.run, runner.checks
-    expected = opened.begin_beside(note_expectation, Run(done.folder.resolve(), done.outcomes))
-    careful, page = (partial(panel.advance, phase) for phase in (Phase.CAREFUL, Phase.REPORT))
+
+    def careful(count: int, total: int) -> None:
+        bars.counted("careful drivers", count, total, "failures")
+
+    def page(count: int, total: int) -> None:
+        bars.counted("report", count, total, "")
+
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
         note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
@@ -313,7 +309,6 @@ def _write_findings(
     # Learned on another machine, surrogates may differ in a last bit. More workers than cores
     # would learn each surrogate more often than that saves time.
     local = opened if runner.dask is None and opened.count <= workers_or_cores(None) else None
-    expected()
     write_report(done, result.summary, local, page)
 
 
@@ -587,19 +582,11 @@ def export(
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
-def report(run: AnyRun) -> Path:
-    """Write the report of a campaign again and return its path; as `merge-sumo report`."""
-    return _opened(run).report()
-
-
-def board(run: AnyRun) -> Shown:
-    """Write the page of a campaign for a safety board, and its JSON; as `merge-sumo board`.
-
-    Args:
-        run: the campaign, or its folder.
-    """
-    html, record = write_board(_opened(run).run)
-    return Shown({"board": str(html), "record": str(record)}, [str(html), str(record)])
+def report(run: AnyRun) -> Shown:
+    """Write the report of a campaign again, and return its facts; as `merge-sumo report`."""
+    opened = _opened(run)
+    path = str(opened.report())
+    return Shown({"report": path, "facts": [asdict(fact) for fact in opened.facts]}, [path])
 
 
 def replay(folder: AnyRun, index: int | None = None) -> Replay:

@@ -17,7 +17,7 @@ from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
+from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.verdict import (
     MESSAGE_CHARACTERS,
     GateResult,
@@ -31,9 +31,9 @@ from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
+from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.counterfactuals import in_a_sentence, read_avoidance
 from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
@@ -59,6 +59,17 @@ PLACE: Final = ("index", "level")
 VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
 """Columns that it shows before and behind the coordinates of the case; the rows hold all of
 `outcomes.jsonl`."""
+
+
+TOLD: Final = {
+    "a case fails when",
+    "cases with contact that are no failures",
+    "cases that ran more than once",
+    "failures that ran too seldom to tell",
+    "failures that driver careful avoids",
+    "failures that a careful POV avoids",
+}
+"""Facts of a campaign as a whole that the terminal lists, too."""
 
 
 class Table(list[dict[str, Any]]):
@@ -156,12 +167,9 @@ class CampaignRun(Result):
         return merging_of(self._run.cases)
 
     @cached_property
-    def careful(self) -> str | None:
-        """Share of the failures that a careful driver would have avoided, in a sentence.
-
-        None where the drivers of the counterfactuals drove no failure.
-        """
-        return in_a_sentence(read_avoidance(self._run).values())
+    def facts(self) -> list[Fact]:
+        """Each fact of the campaign, with the file and the key that it is from."""
+        return facts_of(self._run, self.summary, self.verdict)
 
     @cached_property
     def against(self) -> RunComparison | None:
@@ -204,9 +212,7 @@ class CampaignRun(Result):
     def report(self) -> Path:
         """Write the HTML report and return its path."""
         from merge_sumo.reports.report import write_report
-        from merge_sumo.studies.expectation import note_expectation
 
-        note_expectation(self._run)
         return write_report(self._run)
 
     def to_record(self) -> dict[str, Any]:
@@ -220,7 +226,6 @@ class CampaignRun(Result):
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
-            "careful": self.careful,
             "fail_when": criterion.text,
             "notes": notes_on(outcomes, criterion),
             **({} if self.against is None else {AGAINST: self.against.to_record()}),
@@ -230,28 +235,25 @@ class CampaignRun(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return the verdict, the levels, and the paths of report and worst case."""
-        run, levels = self._run, self.summary.levels
+        """Return the verdict, the facts of each level, and the paths of report and worst case."""
+        run = self._run
+        told = [fact for fact in self.facts if fact.level is None and fact.name in TOLD]
         optional = [
             self._converged_line() if self.converged else None,
             unrepeatable(self.repeats),
             self.verdict.counts,
-            None if run.criterion.is_papers else f"  a case fails when {run.criterion.words}",
+            *self.verdict.trouble_lines(),
+            *table_lines(self.facts),
+            *(f"  {fact.name}: {fact.shown}" for fact in told),
+            None if self.merging is None else f"  {self.merging.sentence}",
+            f"  {run.ran_again_in_words}" if run.ran_again else None,
+            *(f"  note: {note}" for note in doubts(run.cases, run.criterion)),
+            *self._against_lines(),
+            f"report: {self.report_file}",
         ]
-        if self.summary.severities:
-            counts = (f"{number} {name}" for name, number in self.summary.severities.items())
-            optional.append(f"  severity of all cases: {', '.join(counts)}")
-        optional += [] if self.chance is None else [f"  {self.chance.sentence}"]
-        optional += [] if self.merging is None else [f"  {self.merging.sentence}"]
-        optional += self.verdict.trouble_lines()
-        optional += [f"  {run.ran_again_in_words}"] if run.ran_again else []
-        optional += [f"  note: {note}" for note in doubts(run.cases, run.criterion)]
-        optional += [_level_line(level, summary) for level, summary in levels.items()]
-        optional += self._against_lines()
-        optional += [self.careful, f"report: {self.report_file}"]
-        worst = failures(run.cases)[:1]
-        folders = [run.folder / SCENARIOS / case_name(outcome.index) for outcome in worst]
-        optional += [f"worst case: merge-sumo replay {quoted(path)} --gui" for path in folders]
+        for outcome in failures(run.cases)[:1]:
+            folder = quoted(run.folder / SCENARIOS / case_name(outcome.index))
+            optional.append(f"worst case: merge-sumo replay {folder} --gui")
         return [line for line in optional if line is not None]
 
     def _against_lines(self) -> list[str]:
@@ -299,24 +301,14 @@ class CampaignRun(Result):
             for level, one in self.summary.levels.items()
         )
         title = escape(f"{self._run.vut}: {self.verdict.counts}")
-        warnings = filter(None, [unrepeatable(self.repeats), *self.verdict.sentences])
+        untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
+        warnings = filter(None, [unrepeatable(self.repeats), *untested])
         wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in warnings)
         return (
             f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
             "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
             f"<th>FMC</th></tr></thead><tbody>{rows}</tbody></table>"
         )
-
-
-def _level_line(level: int, summary: LevelSummary) -> str:
-    """Return the result at a POV level in a line."""
-    title = f"  level {level_name(level)}"
-    if summary.cases and not summary.tested:
-        return f"{title}: nothing was tested in {summary.cases} cases"
-    return (
-        f"{title}: {counted(summary.failures, 'failure')} in {counted(summary.cases, 'case')}, "
-        f"FMC {summary.fmc:.4f}, {counted(summary.regions, 'region')}"
-    )
 
 
 class CaseRun(Result):

@@ -309,39 +309,16 @@ def replay(
 def report(given: Given, run: RunArgument) -> None:
     """Write the report of a campaign again and print its path.
 
+    With --json each of its facts is printed, with the file and the key that it is from.
+
     Example:  merge-sumo report runs/design2
     """
     from merge_sumo import api
 
     opened = api.open_run(run)
-    path = api.report(opened)
-    if given.as_json:
-        print_json({"report": str(path)})
-    else:
-        show(path)
-    _say_interruption(opened)
-
-
-def _say_interruption(opened: CampaignRun) -> None:
-    """Say on standard error that a campaign was interrupted, where it was."""
+    given.print(api.report(opened))
     if sentence := opened.run.interruption:
         say(sentence)
-
-
-@app.verb()
-def board(given: Given, run: RunArgument) -> None:
-    """Write the page of a campaign for a safety board, and the same as JSON for a safety case.
-
-    board.html prints on A4 and board.json holds its sentences; each number names its file and key.
-    Nothing is simulated: what no study has left in the folder is said with its command.
-
-    Example:  merge-sumo board runs/design2
-    """
-    from merge_sumo import api
-
-    opened = api.open_run(run)
-    given.print(api.board(opened))
-    _say_interruption(opened)
 
 
 @app.verb(
@@ -387,13 +364,7 @@ def compare_runs(
     compared = api.compare_runs(runs["A"], runs["B"], out=out, **given.keywords)
     why = compared.worse(tolerance)
     if given.as_json:
-        campaigns = {
-            name.lower(): {
-                **run.verdict.to_record(),
-                "careful": run.careful,
-            }
-            for name, run in runs.items()
-        }
+        campaigns = {name.lower(): run.verdict.to_record() for name, run in runs.items()}
         print_json({**campaigns, **compared.to_record(), **_judgement(why, tolerance)})
     else:
         _print_comparison(compared, runs)
@@ -410,8 +381,6 @@ def compare_runs(
 def _print_comparison(compared: RunComparison, runs: dict[str, CampaignRun]) -> None:
     for name, run in runs.items():
         show(f"{name}: {run.folder} ({run.run.vut}): {run.verdict.counts}")
-        if run.careful is not None:
-            show(f"  {run.careful}")
         for line in run.verdict.trouble_lines():
             show(line)
     for line in compared.lines():

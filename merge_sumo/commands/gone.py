@@ -8,6 +8,7 @@ from typing import Final
 from merge_sumo.errors import UserError
 
 COMMANDS: Final[Mapping[str, str]] = {
+    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
     "bounds how much of the pool can fail",
 }

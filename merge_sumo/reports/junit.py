@@ -3,14 +3,14 @@
 Every case is a test case, in a test suite per POV level, so that a CI system shows the share that
 passes: what the criterion calls a failure and a timeout are a `failure`, an error of the VUT or of
 the simulation an `error`. The type of a failure is its severity: contact, conflict, harsh or safe.
-A first suite has the gates, and whether anything was tested. A campaign against an earlier version
-of the VUT has a suite of the cases that one of both fails, in which what broke is a `failure`.
-Times are simulated seconds.
+A first suite has the gates, whether anything was tested, and the facts as properties. A campaign
+against an earlier version of the VUT has a suite of the cases that one of both fails, in which what
+broke is a `failure`. Times are simulated seconds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -22,6 +22,7 @@ from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
 from merge_sumo.campaigns.against import AGAINST
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
@@ -49,11 +50,11 @@ def check_junit(path: Path, folder: Path) -> None:
 
 
 def write_junit(
-    path: Path, run: Run, levels: Iterable[int], verdict: Verdict, gates: Sequence[GateResult]
+    path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> None:
     """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written."""
     text = etree.tostring(
-        junit(run, levels, verdict, gates),
+        junit(run, facts, verdict, gates),
         xml_declaration=True,
         encoding="UTF-8",
         pretty_print=True,
@@ -62,15 +63,15 @@ def write_junit(
 
 
 def junit(
-    run: Run, levels: Iterable[int], verdict: Verdict, gates: Sequence[GateResult]
+    run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> etree._Element:
     """Return a campaign as the element `testsuites`."""
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
-    _gates(root, verdict, gates)
+    _gates(root, facts, verdict, gates)
     _against(root, run)
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
     shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
-    for level in levels:
+    for level, _ in by_level(facts)[1]:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.cases:
             if outcome.case.level == level:
@@ -83,8 +84,14 @@ def junit(
     return root
 
 
-def _gates(root: etree._Element, verdict: Verdict, gates: Sequence[GateResult]) -> None:
+def _gates(
+    root: etree._Element, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
+) -> None:
     suite = etree.SubElement(root, "testsuite", name="gates")
+    properties = etree.SubElement(suite, "properties")
+    for fact in facts:
+        level = "" if fact.level is None else f"level {level_name(fact.level)}: "
+        etree.SubElement(properties, "property", name=f"{level}{fact.name}", value=fact.shown)
     tested = _test(suite, f"the VUT reaches {verdict.goal}", f"{CLASS}.gates", 0.0)
     if not verdict.tested:
         _wrong(tested, "failure", "NOTHING_TESTED", verdict.nothing_tested)

@@ -1,62 +1,35 @@
-"""What a person sees while something runs: bars on standard error, with rates."""
+"""What a person sees while something runs: bars on a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Self
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from merge_sumo.system.printable import printable
+from merge_sumo.analysis.verdict import in_counts, judge
+from merge_sumo.reports.report import REPORT, RunningReport
+from merge_sumo.system.printable import counted, printable
+from merge_sumo.values.chance import one_per_case
+from merge_sumo.values.score import Outcome
 
 if TYPE_CHECKING:
     from merge_sumo.training.check import PolicyCheck
     from merge_sumo.training.helix import TrainingProgress
 
-
 PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
 LINES: Final = 10
-"""Lines that are said of what goes on where there is no terminal to draw on."""
-
-
-@dataclass(slots=True)
-class Work:
-    """Progress of some work: items done of a total, and its time by the monotonic clock.
-
-    What was done `before` a resume says nothing of the rate; `said` is what was done when a line
-    was last said of it.
-    """
-
-    total: int
-    start_s: float
-    done: int = 0
-    before: int = 0
-    end_s: float | None = None
-    said: int = 0
-
-    @property
-    def elapsed_s(self) -> float:
-        """Seconds that it has taken so far."""
-        return (time.monotonic() if self.end_s is None else self.end_s) - self.start_s
-
-    @property
-    def left_s(self) -> float | None:
-        """Seconds that are left at the rate so far; None where nothing was done yet."""
-        done = self.done - self.before
-        if self.done >= self.total:
-            return 0.0
-        return (self.total - self.done) * self.elapsed_s / done if done > 0 else None
-
-    def is_due(self) -> bool:
-        """Return whether to say a line where there is no terminal: after each tenth, and last."""
-        since = self.done - self.said
-        due = since >= -(-self.total // LINES) or (self.done >= self.total and since > 0)
-        self.said = self.done if due else self.said
-        return due
+"""Lines that are said of what goes on where there is no terminal to draw on, at most."""
+LINE_S: Final = 1.0
+"""Seconds between two of these lines, at least."""
+FRESH_S: Final = 0.25
+"""Seconds for which what a terminal shows may be old."""
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
@@ -75,19 +48,43 @@ def clock_text(duration_s: float) -> str:
     return f"{hours}:{minutes:02d}:{whole_s % 60:02d}" if hours else f"{minutes}:{whole_s % 60:02d}"
 
 
-def notebook() -> Any:
-    """Return IPython's display module where this runs in a notebook, else None."""
-    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
-    if getattr(shell, "kernel", None) is None:
-        return None
-    from importlib import import_module
-
-    return import_module("IPython.display")
-
-
 def is_watched() -> bool:
     """Return whether a person sees what this process shows: in a notebook or on a terminal."""
-    return notebook() is not None or sys.stderr.isatty()
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return getattr(shell, "kernel", None) is not None or sys.stderr.isatty()
+
+
+@dataclass(slots=True)
+class _Work:
+    """What a bar counts: done of a total, since when, and how much of it was done before.
+
+    `said` and `said_s` are what was done, and when, as it was last shown.
+    """
+
+    total: int
+    start_s: float
+    before: int = 0
+    said: int = 0
+    said_s: float = -1e9
+
+    def is_due(self, done: int, *, drawn: bool) -> bool:
+        """Return whether to show it: on a terminal what is fresh, else a tenth; the end always."""
+        now_s = time.monotonic()
+        since, since_s = done - self.said, now_s - self.said_s
+        due = since_s >= (FRESH_S if drawn else LINE_S) and (drawn or since * LINES >= self.total)
+        if due or (done >= self.total and since > 0):
+            self.said, self.said_s = done, now_s
+            return True
+        return False
+
+    def note(self, done: int, unit: str) -> str:
+        """Return the rate, if it has a unit, and the time that is left at it."""
+        counted, elapsed_s = done - self.before, time.monotonic() - self.start_s
+        rate = rate_text(counted, elapsed_s, unit) if unit else ""
+        if done >= self.total or counted <= 0:
+            return rate
+        left = clock_text((self.total - done) * elapsed_s / counted)
+        return f"{rate}  {left} left".strip()
 
 
 class Bars:
@@ -99,7 +96,7 @@ class Bars:
 
     def __init__(self, console: Console | None = None, *, shown: bool | None = True) -> None:
         """Show nothing yet, or never where it is not to be `shown`; None is where it is watched."""
-        self._console = console or Console(stderr=True)
+        self._console = console or Console(stderr=True, force_jupyter=False)
         self._is_shown = is_watched() if shown is None else shown
         self._progress = Progress(
             TextColumn("{task.description}", markup=False),
@@ -109,43 +106,40 @@ class Bars:
             console=self._console,
         )
         self._tasks: dict[str, TaskID] = {}
-        self._work: dict[str, Work] = {}
+        self._work: dict[str, _Work] = {}
         self._opened_s = time.monotonic()
 
-    def _work_of(self, title: str, total: int) -> Work:
-        # What ends first began before: with the others, or when the bar before was full.
-        return self._work.setdefault(title, Work(total, self._opened_s))
+    def counted(
+        self, title: str, done: int, total: int, unit: str, note: str | Callable[[], str] = ""
+    ) -> None:
+        """Set a bar that counts things called `unit`, with their rate and the time left.
 
-    def show(self, title: str, completed: int, total: int, note: str) -> None:
-        """Set a bar."""
-        work = self._work_of(title, total)
-        work.done = completed
-        left_s = work.left_s if completed < total else None
-        left = "" if left_s is None else f"{clock_text(left_s)} left"
-        said = "  ".join(filter(None, (note.strip(), left)))
-        if self._is_shown and not self._console.is_terminal:
-            if work.is_due():
-                line = f"{printable(title)}: {completed:,}/{total:,}, {said}"
-                self._console.print(line, highlight=False, markup=False, soft_wrap=True)
-        elif self._is_shown and title in self._tasks:
-            self._progress.update(self._tasks[title], completed=completed, note=said)
-        elif self._is_shown:
+        A `note` that takes time to make is a function; it is called when it is shown.
+        """
+        # What ends first began before: with the others, or when the bar before was full.
+        start_s = self._opened_s if done else time.monotonic()
+        work = self._work.setdefault(title, _Work(total, start_s))
+        if done >= total:
+            self._opened_s = time.monotonic()
+        drawn = self._console.is_terminal
+        if not (self._is_shown and work.is_due(done, drawn=drawn)):
+            return
+        text = note if isinstance(note, str) else note()
+        said = "  ".join(filter(None, (text.strip(), work.note(done, unit))))
+        if not drawn:
+            self.say(f"{printable(title)}: {done:,}/{total:,}  {said}")
+        elif title in self._tasks:
+            self._progress.update(self._tasks[title], completed=done, note=said)
+        else:
             self._progress.start()
             self._tasks[title] = self._progress.add_task(
-                printable(title), total=total, completed=completed, note=said
+                printable(title), total=total, completed=done, note=said
             )
-        if completed >= total:
-            self._opened_s = time.monotonic()
-
-    def counted(self, title: str, done: int, total: int, unit: str, note: str = "") -> None:
-        """Set a bar that counts things called `unit`, with their rate."""
-        elapsed_s = self._work_of(title, total).elapsed_s
-        self.show(title, done, total, f"{rate_text(done, elapsed_s, unit)}  {note}")
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
         if self._is_shown:
-            self._console.print(text)
+            self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def __enter__(self) -> Self:
         return self
@@ -172,6 +166,52 @@ class Counter(Bars):
         self.counted(self._title, self._count, self._total, self._unit, note)
 
 
+class CampaignBars(Bars):
+    """Bars of a campaign, its careful drivers and its report, which is rewritten as it goes on."""
+
+    def __init__(
+        self,
+        folder: Path,
+        cases: int,
+        tolerated: float = 0.0,
+        *,
+        shown: bool | None = True,
+        console: Console | None = None,
+    ) -> None:
+        super().__init__(console, shown=shown)
+        self._folder, self._cases, self._tolerated = folder, cases, tolerated
+        self._report = RunningReport(folder)
+        self._outcomes: list[Outcome] = []
+
+    def begin(self, title: str) -> None:
+        """Say what begins, and where its report is: the first case may take long."""
+        cases = counted(self._cases, "case")
+        self.say(f"{printable(title)}: {cases}, watch {printable(str(self._folder / REPORT))}")
+        self.counted("cases", 0, self._cases, "cases")
+
+    def case_ended(self, outcome: Outcome) -> None:
+        """Count a case."""
+        self._outcomes.append(outcome)
+        self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
+        self._report.rewrite()
+
+    def ran_before(self, outcome: Outcome) -> None:
+        """Count a case that ran before a resume: it says nothing of how fast this goes."""
+        self._outcomes.append(outcome)
+        work = self._work.setdefault("cases", _Work(self._cases, 0.0))
+        work.before, work.start_s = len(self._outcomes), time.monotonic()
+
+    def _found(self) -> str:
+        found = judge(one_per_case(self._outcomes, self._tolerated))
+        return ", ".join(in_counts(found.errors, found.timeouts, found.failures))
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        """Stop the bars, and the rewriting of a report that nobody will finish."""
+        super().__exit__(kind, error, trace)
+        if error is not None:
+            self._report.stopped()
+
+
 class TrainingBars(Bars):
     """A bar per network with return and share of crashes, and its regret when it is finished."""
 
@@ -187,7 +227,7 @@ class TrainingBars(Bars):
         if now.regret is not None:
             self._regret[now.network] = f"  regret at least {now.regret:.2%}"
         note += self._regret.get(now.network, "")
-        self.show(f"{now.network} {now.stage}", now.done, now.total, note)
+        self.counted(f"{now.network} {now.stage}", now.done, now.total, "updates", note)
 
     def done(self, name: str, check: PolicyCheck | None) -> None:
         """Say how a network turned out, or that it was there already."""

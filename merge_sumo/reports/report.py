@@ -9,13 +9,17 @@ page's own policy lets nothing run but that script and lets nothing load at all.
 from __future__ import annotations
 
 import json
+import math
+import time
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Final
 
 from markupsafe import Markup
 
 from merge_sumo.analysis.summary import Summary
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
@@ -29,6 +33,12 @@ REPORT: Final = "report.html"
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 """By this a report is known as ours, and may be replaced by a newer one."""
 HEAD_BYTES: Final = 1000
+FIRST_S: Final = 2.0
+"""Seconds after which the report of a running campaign first appears."""
+EVERY_S: Final = 5
+"""Seconds between two reports of a running campaign, at least."""
+MOST_SHARE: Final = 0.1
+"""Of the time of a campaign that its report may take while it runs."""
 
 
 def write_report(
@@ -49,6 +59,42 @@ def write_report(
     replace_own(path, html.encode(errors="backslashreplace"))
     write_against(run)
     return path
+
+
+class RunningReport:
+    """The report of a campaign that runs, rewritten every few seconds for a browser to load again.
+
+    It has no surrogates, which take seconds to learn. It never stops a campaign: where it cannot be
+    written, or `report.html` is somebody else's, that is said when the last one is written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._due_s = time.monotonic() + FIRST_S
+        self._is_there = False
+
+    def rewrite(self) -> None:
+        """Write the report if its time has come."""
+        start_s = time.monotonic()
+        if start_s >= self._due_s and (self._folder / OUTCOMES).is_file():
+            self._write(running=True)
+            took_s = time.monotonic() - start_s
+            self._due_s = start_s + max(EVERY_S, took_s / MOST_SHARE)
+            if not self._is_there:
+                self._due_s = math.inf
+
+    def stopped(self) -> None:
+        """Write what ran into the report of a campaign that was stopped."""
+        if self._is_there:
+            self._write(running=False)
+
+    def _write(self, *, running: bool) -> None:
+        self._is_there = False
+        with suppress(UserError):
+            check_report(self._folder)
+            html = report_page(Run(self._folder), learns=False, running=running)
+            replace_own(self._folder / REPORT, html.encode(errors="backslashreplace"))
+            self._is_there = True
 
 
 def check_report(folder: Path) -> None:
@@ -76,9 +122,15 @@ def report_page(
     summary: Summary | None = None,
     workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
+    *,
+    learns: bool = True,
+    running: bool = False,
 ) -> str:
-    """Return the report of a run as HTML."""
-    model = ReportModel(run, summary, workers, on_part)
+    """Return the report of a run as HTML; of one that is `running`, it is loaded again and again.
+
+    Without `learns` it has no surrogates.
+    """
+    model = ReportModel(run, summary, workers, on_part, learns=learns)
     words = shared_words(model)
     sections = sections_of(model, words)
     model.part_ended()
@@ -91,6 +143,8 @@ def report_page(
         styles=("report.css",),
         scripts=("player.js", "report.js"),
         sections=sections,
+        every_s=EVERY_S if running else 0,
+        now=f"{datetime.now().astimezone():%H:%M:%S}",
         data=Markup(data),  # noqa: S704 (JSON without "<")
         **words,
         **head_words(model),

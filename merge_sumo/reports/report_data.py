@@ -33,7 +33,7 @@ from merge_sumo.values.signals import to_record
 
 SVO_NEAR_RAD: Final = 0.1
 NEAR_SHARE: Final = 1.0 / 16.0
-MOST_STEPS: Final = 40
+MOST_STEPS: Final = 20
 """Batches, or groups of batches, in the charts of the search."""
 MOST_BALLS: Final = 20_000
 """Balls that are counted for a level's curve of coverage: of more failures it has fewer points."""
@@ -203,7 +203,6 @@ def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
             [o for o in others if o.case.level == level],
             facts.surfaces[level],
             facts.truths[level],
-            facts.expected.get(level),
         )
         for level in facts.levels
     }

@@ -87,12 +87,10 @@ def maps_of(
     others: Sequence[Outcome],
     surface: Surface | None,
     truth: Truth | None,
-    expected: tuple[Grid, NDArray[np.uint8]] | None = None,
 ) -> dict[str, Any]:
     """Return what the script draws the map of a level from.
 
-    `others` are outcomes that the page counts instead of showing one by one; `expected` is how near
-    the twin of the VUT expects gaps, (n,), at the nodes of a grid.
+    `others` are outcomes that the page counts instead of showing one by one.
     """
     dims = len(scenario.dimensions(level))
     pairs = pairs_of(dims, surface)
@@ -105,7 +103,6 @@ def maps_of(
             {
                 "chance": None if surface is None else _chance(surface, dims, pair.axes),
                 "truth": None if truth is None else _truth(truth, dims, pair.axes),
-                "expected": None if expected is None else _expected(*expected),
                 "counts": _counts(others, scenario, level, pair.axes) if others else None,
             }
             for pair in pairs
@@ -143,17 +140,6 @@ def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
         _, near = cKDTree(truth.points).query(nodes(GRID[dims]), k=NEIGHBOURS)
         return _packed(GRID[dims], failed[near].mean(axis=1))
     return _means(truth.points[:, list(axes)], failed.astype(np.float64))
-
-
-def _expected(grid: Grid, near: NDArray[np.uint8]) -> dict[str, Any]:
-    from scipy.ndimage import maximum_filter
-
-    # Failures may lie on a thin curve: what is drawn is what they would cover.
-    shape = [n for n in grid[::-1] if n > 1]
-    reach = [int(radius_for(len(shape)) * (n - 1) + 0.5) for n in shape]
-    steps = np.meshgrid(*[np.arange(-r, r + 1) / max(r, 1) for r in reach], indexing="ij")
-    ball = np.square(steps).sum(axis=0) <= 1.0
-    return _packed(grid, maximum_filter(near.reshape(shape), footprint=ball).ravel() / 255.0)
 
 
 def _means(points: FloatArray, values: FloatArray) -> dict[str, Any]:

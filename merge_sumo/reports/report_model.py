@@ -21,11 +21,11 @@ from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failure
 from merge_sumo.engine.plan import plan_key, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
+from merge_sumo.reports.facts import facts_of
 from merge_sumo.reports.report_maps import GRID
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.studies.counterfactuals import read_avoidance
-from merge_sumo.studies.expectation import read_expectation
 from merge_sumo.studies.explanation import read_explanations
 from merge_sumo.studies.stress import stress_of
 from merge_sumo.studies.truth import TRUTH_CASES, Truth, TruthKey
@@ -61,12 +61,14 @@ class ReportModel:
         summary: Summary | None = None,
         workers: Workers | None = None,
         on_part: OnPart = lambda _done, _total: None,
+        *,
+        learns: bool = True,
     ) -> None:
         """Read what the page shows; `UserError` where settings have no list of levels.
 
         `summary` is that of the run, where it is known; on several `workers` its surrogates are
         asked. `on_part` is told how many parts of the report are ready, and how many there are,
-        from 0 on; also from another thread.
+        from 0 on; also from another thread. Without `learns` there are no surrogates.
         """
         self.run = run
         self.road = road_of_run(run)
@@ -76,12 +78,15 @@ class ReportModel:
         self.chance = chance_in(run.outcomes, run.tolerated)
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
         self.verdict = judge(self.cases)
+        self.facts = facts_of(run, self.summary, self.verdict)
         self.levels = list(self.summary.levels)
         # The surrogate of each level; the cases; the text; the data.
         self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
         self._counting = threading.Lock()
         on_part(0, self._parts)
-        self._surfaces = _meanwhile(partial(_surfaces, run, self.levels, workers, self.part_ended))
+        self.learns = learns
+        levels = self.levels if learns else []
+        self._surfaces = _meanwhile(partial(_surfaces, run, levels, workers, self.part_ended))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.worst = failures(self.cases)
         self.regions = regions_of(self.worst)
@@ -98,7 +103,6 @@ class ReportModel:
             key=lambda o: (o.score, o.index),
         )
         self.surprises = surprises(self.cases, run.scenario.dx_crash_m)[:LISTED]
-        self.expected = read_expectation(run)
         self.untested = [o for o in self.cases if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]
@@ -133,7 +137,7 @@ class ReportModel:
     @property
     def surfaces(self) -> dict[int, Surface | None]:
         """What a surrogate says of each level; they are learned while the rest is read."""
-        return self._surfaces.result()
+        return {**dict.fromkeys(self.levels), **self._surfaces.result()}
 
     def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
         """Return the coordinates of a level, in the pool's order."""

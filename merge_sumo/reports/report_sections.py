@@ -6,7 +6,7 @@ The head of the page and several sections share words: those of `shared_words`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Final
@@ -23,28 +23,19 @@ from merge_sumo.campaigns import repeats
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
-from merge_sumo.reports.board_statements import BoardModel
-from merge_sumo.reports.headline import (
-    avoidable_text,
-    harmful_merges_text,
-    headline,
-    overlaps_before_m_text,
-)
+from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.counterfactuals import in_a_sentence
 from merge_sumo.studies.crosscheck import crosscheck_of
 from merge_sumo.studies.stress import NOTHING
-from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import MergeScenario, lane_of, level_name
-from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import meanings
 from merge_sumo.vuts.output import LOG, end_of
 
@@ -73,44 +64,39 @@ class ReportSection:
 def shared_words(model: ReportModel) -> dict[str, Any]:
     """Return what the head of the page and several sections need."""
     run, summary = model.run, model.summary
-    levels, fmc_axis = levels_of(model)
+    levels = levels_of(model)
     return {
         "vut": run.vut,
-        "counts": model.verdict.counts,
         "troubles": model.troubles(),
         "summary": summary,
-        "settings": {name: _shown(value) for name, value in run.settings.items() if value},
         "scenario": run.scenario,
         "is_merge": isinstance(run.scenario, MergeScenario),
         "lane_m": lane_of(run.scenario),
         "traffic": run.scenario.vehicles > 2,
         "coordinates": model.coordinates,
         "levels": levels,
-        "fmc_axis": fmc_axis,
         "any_truth": any(level.truth is not None for level in levels),
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
-        "avoidance": _avoidance(model),
+        "avoidance": list(REFERENCES) if model.avoidance else [],
         "chance": model.chance,
         "repeated": model.repeated,
     }
 
 
 def head_words(model: ReportModel) -> dict[str, Any]:
-    """Return the result in sentences, and what a reader is to know of the page as a whole."""
-    run, wanted = model.run, model.run.settings.get("cases")
-    rule = run.criterion, run.scenario
-    result = headline(model.verdict, model.summary, model.worst, model.kinds, *rule)
+    """Return what a reader is to know of the page as a whole."""
+    run = model.run
     lost = [str(o.index) for o in model.shown if o.index not in model.motion]
     if len(lost) > LISTED:
         lost = [*lost[:LISTED], counted(len(lost) - LISTED, "other")]
     return {
-        "headline": " ".join(filter(None, (result, run.ran_again_in_words))),
         "unrepeatable": repeats.unrepeatable(model.repeats),
-        "careful": in_a_sentence(model.avoidance.values()),
         "lost": in_words(lost) if lost else "",
-        "notes": notes_on(model.cases, run.criterion),
-        "torn": run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted),
+        "notes": [*notes_on(model.cases, run.criterion), *filter(None, [run.ran_again_in_words])],
+        "interruption": run.interruption,
+        "resume": f"merge-sumo campaign --resume {quoted(run.folder)}",
+        "wanted": run.settings.get("cases"),
     }
 
 
@@ -118,43 +104,29 @@ def _untested(model: ReportModel) -> dict[str, Any] | None:
     return {"more_troubles": model.verdict.troubles[LISTED:]} if model.troubles() else None
 
 
-def _numbers(model: ReportModel) -> dict[str, Any]:
-    outcomes, scenario = model.cases, model.run.scenario
+def _facts(model: ReportModel) -> dict[str, Any]:
+    columns, rows = by_level(model.facts)
+    names = {column.name for column in columns}
+    overall = [fact for fact in model.facts if fact.level is None]
+    dims = {len(model.run.scenario.dimensions(level)) for level in model.levels}
     return {
-        "found": model.verdict,
-        "hardest_mps2": _largest(model.worst, "pov_sustained_brake_mps2"),
-        "slowdown_mps": _largest(model.worst, "pov_slowdown_mps"),
-        "truth_cases": " or ".join(
-            f"{count:,}" for count in sorted({TRUTH_CASES[level] for level in model.levels})
-        ),
-        "plausible_chance": f"{max(PLAUSIBLE, model.run.tolerated):.0%}",
-        "fewest_failures": FEWEST_FAILURES,
-        "radii": _radii({len(model.run.scenario.dimensions(level)) for level in model.levels}),
-        "avoidable": avoidable_text(model.worst, scenario),
-        "after": harmful_merges_text(outcomes, scenario),
-        "before": overlaps_before_m_text(outcomes, scenario),
-        "batches": len({o.batch for o in model.run.outcomes}),
-        "recorded": _recorded(model.run),
-        "driven": _duration(sum(o.measures.t_end_s for o in model.run.outcomes)),
+        "columns": columns,
+        "rows": rows,
+        "totals": {fact.name: fact for fact in overall if fact.name in names},
+        "facts": [fact for fact in overall if fact.name not in names],
+        "radii": [(dim, radius_for(dim)) for dim in sorted(dims) if dim > 3],
     }
-
-
-def _largest(outcomes: Sequence[Outcome], name: str) -> float | None:
-    """Return the largest value of a measure; None where no outcome has one."""
-    return max((v for o in outcomes if (v := o.measures.value(name)) is not None), default=None)
 
 
 def _maps(model: ReportModel) -> dict[str, Any]:
     scenario = model.run.scenario
     return {
         "severities": meanings(scenario),
+        "plausible_chance": f"{max(PLAUSIBLE, model.run.tolerated):.0%}",
+        "fewest_failures": FEWEST_FAILURES,
+        "learns": model.learns,
         "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
     }
-
-
-def _board(model: ReportModel) -> dict[str, Any]:
-    topics = BoardModel(model.run, summary=model.summary).topics()
-    return {"topics": topics, "command": f"merge-sumo board {quoted(model.run.folder)}"}
 
 
 def _merging(model: ReportModel) -> dict[str, Any] | None:
@@ -176,7 +148,7 @@ def _merging(model: ReportModel) -> dict[str, Any] | None:
 
 
 def _in_words(model: ReportModel) -> dict[str, Any] | None:
-    kinds = _kinds(model)
+    kinds = Counter(model.kinds.values()).most_common()
     if not model.boxes and not kinds:
         return None
     described = Counter(box.level for box in model.boxes for _ in range(box.failures))
@@ -189,6 +161,7 @@ def _in_words(model: ReportModel) -> dict[str, Any] | None:
             if count > 0
         ),
         "kinds": kinds,
+        "meaning": MEANING,
         "braked": f"{BRAKED_MPS:g}",
     }
 
@@ -247,58 +220,20 @@ def _cases(model: ReportModel) -> dict[str, Any]:
         (f"Ten worst failures, {first}", model.spread),
         ("Ten cases nearest to a failure", model.near[:LISTED]),
     ]
-    if model.surprises:
-        tables.append(("Ten largest errors of the twin's predictions", model.surprises))
     other_net = model.run.settings.get("net_sha256") != model.road.sha256
     return {"tables": tables, "other_net": other_net}
 
 
-def _printed(model: ReportModel) -> dict[str, Any] | None:
-    printed = end_of(model.run.folder / LOG)
-    return {"printed": printed} if printed else None
-
-
-def _how(model: ReportModel) -> dict[str, Any]:
+def _about(model: ReportModel) -> dict[str, Any]:
+    """Return what the search knows of itself, and what it ran with."""
     criterion = model.run.criterion
     return {
+        "surprises": model.surprises,
+        "printed": end_of(model.run.folder / LOG),
+        "recorded": _recorded(model.run),
         "flat_settings": list(_flat(model.run.settings)),
         "criterion": None if criterion.is_papers else criterion.words,
     }
-
-
-def _radii(dims_of_levels: Set[int]) -> str:
-    """Return what to know of the radius where there are more than three coordinates."""
-    more = sorted(dims for dims in dims_of_levels if dims > 3)
-    if not more:
-        return ""
-    parts = [f"{radius_for(dims):.2f} for {dims} coordinates" for dims in more]
-    return (
-        f"It is {in_words(parts)}: there a ball covers as much of a layer of failures as in three. "
-        "Then the volume is integrated by quasi-Monte Carlo, to within some tenths of a percent."
-    )
-
-
-def _kinds(model: ReportModel) -> list[dict[str, Any]]:
-    found = Counter(model.kinds.values())
-    avoidable = Counter(model.kinds[o.index] for o in model.worst if _avoidable_kind(model, o))
-    return [
-        {"name": kind.value, "meaning": MEANING[kind], "count": count, "avoidable": avoidable[kind]}
-        for kind, count in found.most_common()
-    ]
-
-
-def _avoidance(model: ReportModel) -> list[tuple[str, str]]:
-    """Return by driver how many failures it avoids; nothing where that is not known."""
-    known = list(model.avoidance.values())
-    if not known:
-        return []
-    counts = {name: sum(name in one.avoided_by for one in known) for name in REFERENCES}
-    counts["careful, in the POV's place"] = sum(one.pov_careful for one in known)
-    return [(name, f"{count} of {len(known)}") for name, count in counts.items()]
-
-
-def _avoidable_kind(model: ReportModel, outcome: Outcome) -> bool:
-    return outcome.index in model.kinds and bool(outcome.measures.avoidable)
 
 
 def _recorded(run: Run) -> str | None:
@@ -356,9 +291,8 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
     "report section",
     {
         "untested": ReportSection(template=_own("untested"), words=_untested),
-        "numbers": ReportSection(template=_own("numbers"), words=_numbers),
+        "facts": ReportSection(template=_own("facts"), words=_facts),
         "where": ReportSection(template=_own("where"), words=_maps),
-        "board": ReportSection(template=_own("board"), words=_board),
         "against": ReportSection(template=_own("against"), words=_against),
         "merging": ReportSection(template=_own("merging"), words=_merging),
         "words": ReportSection(template=_own("words"), words=_in_words),
@@ -366,9 +300,7 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "peers": ReportSection(template=_own("peers"), words=_peers),
         "cases": ReportSection(template=_own("cases"), words=_cases),
         "all": ReportSection(template=_own("all")),
-        "search": ReportSection(template=_own("search")),
-        "printed": ReportSection(template=_own("printed"), words=_printed),
-        "how": ReportSection(template=_own("how"), words=_how),
+        "about": ReportSection(template=_own("about"), words=_about),
     },
     accepts=lambda item: isinstance(item, ReportSection),
     contract="a merge_sumo.reports.report_sections.ReportSection",

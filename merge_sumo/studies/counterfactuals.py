@@ -157,26 +157,6 @@ def _upgrade_from_0_1(record: dict[str, Any]) -> dict[str, Any]:
     return record
 
 
-def in_a_sentence(avoidances: Iterable[Avoidance]) -> str | None:
-    """Return how many failures careful drivers would have avoided; None where nothing is known."""
-    known = list(avoidances)
-    if not known:
-        return None
-    careful = sum(one.by_careful for one in known)
-    takeover = sum(one.by_takeover_driver for one in known)
-    pov = sum(one.pov_careful for one in known)
-    times = sorted(one.latest_takeover_s for one in known if one.latest_takeover_s is not None)
-    plural = "failure" if len(known) == 1 else "failures"
-    sentence = (
-        f"{careful} of {len(known)} {plural} would have been avoided by a careful and competent "
-        f"driver, {takeover} by the fuzzy safety model"
-    )
-    if times and takeover:
-        middle = times[math.floor((len(times) - 1) / 2)]
-        sentence += f" (which may take over until {middle:.1f} s, in the median)"
-    return f"{sentence}, and {pov} by a careful driver on the mainline."
-
-
 # The failures of a campaign.
 
 

@@ -48,7 +48,7 @@ run: ms.CampaignRun = ms.campaign(Mine, level=0, cases=40, seed=1, **setup)
 for vut in (keep, "design2", Batched, Mine()):
     ms.campaign(vut, deadline_s=1.0)
 worst: int = run.failures[0]["index"]
-print(run.verdict.failures, run.summary.levels[0].fmc, run.report_file, run.careful)
+print(run.verdict.failures, run.summary.levels[0].fmc, run.report_file, run.facts[0].file)
 case: ms.CaseRun = ms.run_case(Mine, run.failures[0], level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
 again = ms.run_case(recorded=(run, 3), debug=True)
 print(case.measures.end, case.failed, again.trajectory.motion[0, 0, 0])

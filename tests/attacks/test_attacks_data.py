@@ -559,9 +559,8 @@ class TestATextOfAStranger:
         written = [*(tmp_path / "xosc").rglob("*.xosc")]
         assert len(written) == 2, "as recorded, and with a free ego"
         assert {etree.parse(xosc).getroot().tag for xosc in written} == {"OpenSCENARIO"}
-        verdict = open_run(folder).verdict
-        found = Run(folder)
-        write_junit(tmp_path / "junit.xml", found, (0, 2), verdict, [])
+        opened = open_run(folder)
+        write_junit(tmp_path / "junit.xml", opened.run, opened.facts, opened.verdict, [])
         assert etree.parse(tmp_path / "junit.xml").getroot().tag == "testsuites"
         notebook = open_run(folder)._repr_html_() + open_run(folder).errors._repr_html_()
         assert "<script" not in notebook

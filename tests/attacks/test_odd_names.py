@@ -139,7 +139,7 @@ class TestATerminal:
 
     def test_shows_a_title_as_it_is(self, capsys):
         with Bars() as bars:
-            bars.show("a [/red] \x1b[31m\udcff", 1, 1, "[/bold]")
+            bars.counted("a [/red] \x1b[31m\udcff", 1, 1, "cases", "[/bold]")
         said = capsys.readouterr().err
         assert "[/red] \\x1b[31m\\udcff" in said
 

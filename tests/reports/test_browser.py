@@ -24,9 +24,7 @@ from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
-from merge_sumo.reports.campaign_progress import CampaignProgress
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.running_page import running_page
 from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
@@ -132,11 +130,8 @@ def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
     compared = compare_runs(made, other, rerun=False)
     file = tmp_path / "compared.html"
     write_page(comparison_page(compared, made, other, {}), file)
-    progress = CampaignProgress(EVIL, 400, (0, 1, 2))
-    for outcome in made.outcomes:
-        progress.case_ended(outcome)
     running = tmp_path / "running.html"
-    running.write_text(running_page(progress, tmp_path, stopped=True), encoding="utf-8")
+    running.write_text(report.report_page(other, learns=False, running=True), encoding="utf-8")
     for page_file in (file, running):
         with shown(browser, page_file, **options) as page:
             assert EVIL in page.inner_text("h1")
@@ -159,7 +154,7 @@ def test_marks_filters_and_table_know_the_four_words(browser, made):
             drawn = marks.evaluate_all("all => all.map((m) => m.dataset.case)")
             assert sorted(map(int, drawn)) == indices
             chip = page.locator(f".legend [data-filter=severity][data-value={word}]")
-            assert chip.inner_text().split() == [word, str(len(indices))]
+            assert chip.inner_text().strip() == word
             if indices:
                 chip.click()
                 assert page.evaluate("location.hash").endswith(f"severity={word}")
@@ -692,7 +687,7 @@ def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
     (folder / "outcomes.jsonl").write_bytes(b"")
     report.write_report(Run(folder))
     with shown(browser, folder / report.REPORT) as page:
-        assert "No case has run" in page.inner_text(".verdict")
+        assert page.inner_text("tr.all .num:nth-child(2)") == "0"
 
 
 @pytest.mark.parametrize("name", some([None, "curved", "left turn"], None, "left turn"))
@@ -776,7 +771,6 @@ def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
     write_avoidance(run.folder, lines)
     with shown(browser, report.write_report(run)) as page:
         assert "In the VUT's place careful, rss would have avoided it." in page.inner_text("#case")
-        assert "1 of" in page.inner_text(".verdict")
         page.locator(".map input[type=checkbox]").first.check()
         bright = page.locator(".map .mark.fail:not(.faint)")
         for value, wanted in (("careful", 1), ("pov", 1), ("fsm", 0), ("", len(found))):

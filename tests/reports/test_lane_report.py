@@ -59,7 +59,7 @@ class TestSentences:
     def test_call_no_merge_by_m_on_a_lane(self, made, page):
         text = text_of(page)
         assert re.findall(r".{20}\bM\b.{20}", without(text, OF_M)) == []
-        assert "(front bumpers within 6 m at the merge;" in text
+        assert "front bumpers within 6 m at the merge (score < -500)" in text
         assert "would have kept 6 m at the merge" in text
         assert "the VUT did not reach the mainline in 12 s" in text
         titles = [measure["title"] for measure in data_of(page)["measures"]]
@@ -72,7 +72,7 @@ class TestSentences:
         # The page names its folder, which pytest would name after this test.
         run = write_run(tmp_path_factory.mktemp("point") / "run", per_level=20)
         page = report_page(run)
-        assert "(front bumpers within 6 m at M;" in text_of(page)
+        assert "front bumpers within 6 m at M (score < -500)" in text_of(page)
         assert "lane" not in without(text_of(page), ("along the lane", "where the lanes run"))
         assert not {"lane", "place"} & set(data_of(page))
         assert not {"x_merge_m", "lane_share", "stood_s"} & set(data_of(page)["cases"])

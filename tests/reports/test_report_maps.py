@@ -142,8 +142,8 @@ class TestWords:
     def words(cls, tmp_path_factory):
         folder = tmp_path_factory.mktemp("traffic") / "run"
         model = ReportModel(write_run(folder, 40, error=None, scenario=TRAFFIC))
-        numbers, words = (SECTIONS[name].words(model) for name in ("numbers", "words"))
-        return {**shared_words(model), **numbers, **words}
+        facts, words = (SECTIONS[name].words(model) for name in ("facts", "words"))
+        return {**shared_words(model), **facts, **words}
 
     def test_name_the_pairs_and_what_they_explain(self, words):
         zero, _, two = words["levels"]
@@ -155,7 +155,7 @@ class TestWords:
         assert len(zero.axes) != 3
 
     def test_say_how_large_a_ball_is_where_it_is_not_the_papers(self, words):
-        assert "0.12 for 4 coordinates and 0.20 for 5 coordinates" in words["radii"]
+        assert [(d, round(r, 2)) for d, r in words["radii"]] == [(4, 0.12), (5, 0.2)]
 
     def test_speak_of_headways_and_of_when_the_other_cars_are_due(self, words):
         features = " ".join(words["sentences"])

@@ -181,7 +181,8 @@ class TestParameters:
         assert of_gap.passing
         assert (of_kp.value, of_kp.low, of_kp.high) == (1.4, 1.0, 1.41)
         assert read_explanations(Run(folder))[worst.index] == result.found
-        assert "the VUT's gap_m is 16.20; passes at" in ms.report(folder).read_text("utf-8")
+        page = ms.open_run(folder).report().read_text("utf-8")
+        assert "the VUT's gap_m is 16.20; passes at" in page
 
     def test_of_ones_own_controller_by_hand(self, tmp_path):
         mine = tmp_path / "mine.py"

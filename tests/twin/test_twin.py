@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,13 +25,6 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
-from merge_sumo.studies.expectation import (
-    EXPECTED,
-    learned_twin,
-    nearness,
-    note_expectation,
-    read_expectation,
-)
 from merge_sumo.system.records import decode, to_plain
 from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
 from merge_sumo.twin.observation import NOW, Observation
@@ -409,23 +401,3 @@ class TestTheReport:
         assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]
         assert prediction_error_m(told[2]) == 2.0
         assert prediction_error_m(missed) is None
-
-    def test_expects_failures_where_they_are(self, whole):
-        twin = learned_twin(whole, [0, 1])
-        fails = [o.case for o in whole.outcomes if o.failed and o.case.level == 1]
-        assert np.median(nearness(twin, 1, to_unit(fails, 1, scenario=US23), 6.0)) > 0.5
-
-    def test_shows_what_a_file_says_that_is_as_we_write_it(self, whole, tmp_path):
-        run = Run(Path(shutil.copytree(whole.folder, tmp_path / "run")))
-        assert read_expectation(run) == {} or (run.folder / EXPECTED).exists()
-        note_expectation(run)
-        found = read_expectation(run)
-        assert set(found) == {0, 1}
-        assert all(len(row) == np.prod(grid) and row.max() > 0 for grid, row in found.values())
-        record = json.loads((run.folder / EXPECTED).read_text())["levels"]
-        first = next(iter(record))
-        bad: object
-        for bad in ({"9": record[first]}, {first: record[first][1:]}, {first: [256] * 1681}, []):
-            (run.folder / EXPECTED).write_text(json.dumps({"levels": bad}))
-            with pytest.raises(UserError, match="is not as it was written"):
-                read_expectation(run)

@@ -165,7 +165,7 @@ function FailureMap(figure) {
   };
   this.level = level;
   this.draw = () => {
-    const { chance, truth, expected } = of.grids[pair], share = all ? null : unit(third, at);
+    const { chance, truth } = of.grids[pair], share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
@@ -190,7 +190,6 @@ function FailureMap(figure) {
       const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
       draw(balls, "ellipse", { cx: x, cy: y, rx: r * frame.scale * width, ry: r * frame.scale * height });
     }
-    if (expected) draw(svg, "path", { class: "expected", "clip-path": "url(#clip)", d: contour(slice(expected, share), expected.nx, expected.ny, 127.5, X, Y) });
     if (truth) draw(svg, "path", { class: "outline", "clip-path": "url(#clip)", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {

@@ -1,0 +1,247 @@
+"""The facts of a campaign: each once, with its unit, and the file and the key that it is from.
+
+The report prints them as one table, `merge-sumo report --json` as one list; the terminal and JUnit
+take their lines from them. What no study has left in the folder is no fact.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from merge_sumo.analysis.chance import chance_in
+from merge_sumo.analysis.summary import LevelSummary, Summary
+from merge_sumo.analysis.verdict import Verdict
+from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
+from merge_sumo.studies.probability import RESULT, probability_of
+from merge_sumo.studies.stress import STRESS, stress_of
+from merge_sumo.system.printable import printable
+from merge_sumo.values.fmc import radius_for
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.severity import Severity
+
+PERCENT: Final = "%"
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """A fact of a campaign.
+
+    Attributes:
+        name: what it is, in words.
+        value: a number in `unit`, or a text.
+        unit: "" for counts, for texts and for FMC.
+        file: file of the run folder that it is from.
+        key: key of that file, or the lines of it that are counted.
+        level: POV level that it is of; None where it is of all.
+    """
+
+    name: str
+    value: float | str
+    unit: str
+    file: str
+    key: str
+    level: int | None = None
+
+    @property
+    def shown(self) -> str:
+        """The value as it is printed, with its unit."""
+        if isinstance(self.value, str):
+            text = printable(self.value)
+        elif isinstance(self.value, int):
+            text = f"{self.value:,}"
+        else:
+            text = f"{self.value:.3g}" if self.unit else f"{self.value:.4f}"
+        return f"{text} {self.unit}".strip()
+
+
+def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
+    """Return the facts of a campaign, by what its folder holds.
+
+    Raises `UserError` where a file of a study is not as it was written.
+    """
+    return [
+        *_tested(run),
+        *_found(run, summary, verdict),
+        *(
+            fact
+            for level, found in summary.levels.items()
+            for fact in _of_level(run, level, found, untested=verdict.tested < verdict.cases)
+        ),
+        *_repeats(run),
+        *_motion(run),
+        *_avoided(run),
+        *_studies(run),
+    ]
+
+
+def by_level(facts: Iterable[Fact]) -> tuple[list[Fact], list[tuple[int, list[Fact | None]]]]:
+    """Return the facts of levels as a table: one of each name, and a row for each level."""
+    of_levels = [fact for fact in facts if fact.level is not None]
+    columns = list({fact.name: fact for fact in of_levels}.values())
+    rows: dict[int, dict[str, Fact]] = {}
+    for fact in of_levels:
+        if fact.level is not None:
+            rows.setdefault(fact.level, {})[fact.name] = fact
+    return columns, [(level, [row.get(c.name) for c in columns]) for level, row in rows.items()]
+
+
+def table_lines(facts: Sequence[Fact]) -> list[str]:
+    """Return the facts of levels as the lines of a table for a terminal."""
+    columns, rows = by_level(facts)
+    names = [", ".join(filter(None, (c.name, c.unit))) for c in columns]
+    lines = [["level", *names]]
+    for level, row in rows:
+        cells = ["-" if f is None else f.shown.removesuffix(f.unit).strip() for f in row]
+        lines.append([level_name(level), *cells])
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
+        "  " + "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
+        for line in lines
+    ]
+
+
+def _failing(run: Run) -> str:
+    """Return by what a failing line of `outcomes.jsonl` is known."""
+    return f"score < {FAILURE_SCORE:g}" if run.criterion.is_papers else "margin < 0"
+
+
+def _tested(run: Run) -> Iterator[Fact]:
+    settings, criterion = run.settings, run.criterion
+    yield Fact("VUT", run.vut, "", SETTINGS, "vut")
+    yield Fact("scenario", run.scenario.name, "", SETTINGS, "scenario.name")
+    key = "fail_when" if criterion.require is None else "require"
+    words = criterion.words
+    if criterion.is_papers:
+        place = run.scenario.place
+        words = f"front bumpers within {run.scenario.dx_crash_m:g} m at {place} ({words})"
+    yield Fact("a case fails when", words, "", SETTINGS, key)
+    sampler = f"{settings.get('sampler')}, seed {settings.get('seed') or 0}"
+    yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
+
+
+def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
+    failing = _failing(run)
+
+    def counted(name: str, number: int, key: str) -> Fact:
+        return Fact(name, number, "", OUTCOMES, key)
+
+    yield counted("cases", summary.cases, "lines")
+    if verdict.errors:
+        yield counted("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
+    if verdict.timeouts:
+        yield counted("timeouts", verdict.timeouts, "end: TIMEOUT")
+    yield counted("failures", summary.failures, failing)
+    if summary.failures:
+        yield counted("failures with contact", verdict.contacts, f"{failing}, severity: contact")
+    for severity, about in (
+        (Severity.CONTACT, "cases with contact that are no failures"),
+        (Severity.CONFLICT, "cases with a conflict that are no failures"),
+        (Severity.HARSH, "cases with harsh braking after the merge that are no failures"),
+    ):
+        number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
+        if number:
+            yield counted(about, number, f"severity: {severity}, not {failing}")
+    before = sum(map(_overlaps_before, run.cases))
+    if before:
+        key = "before_clearance_m < 0, severity not contact"
+        yield counted(run.scenario.said("cases whose bodies overlap before M alone"), before, key)
+
+
+def _overlaps_before(outcome: Outcome) -> bool:
+    measures = outcome.measures
+    overlap = (measures.before_clearance_m or 0.0) < 0.0
+    return overlap and measures.severity != Severity.CONTACT
+
+
+def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> Iterator[Fact]:
+    failing = _failing(run)
+
+    def fact(name: str, value: float, key: str, unit: str = "") -> Fact:
+        return Fact(name, value, unit, OUTCOMES, key, level)
+
+    yield fact("cases", found.cases, "level")
+    if untested:
+        yield fact("without a verdict", found.cases - found.tested, "end")
+    if found.tested or not found.cases:
+        yield fact("failures", found.failures, failing)
+        yield fact("regions", found.regions, f"{failing}: starts")
+        radius = radius_for(len(run.scenario.dimensions(level)))
+        yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
+
+
+def _repeats(run: Run) -> Iterator[Fact]:
+    chance = chance_in(run.outcomes, run.tolerated)
+    if chance is None:
+        return
+    for name, number in (
+        ("runs", chance.runs),
+        ("cases that ran more than once", chance.repeated),
+        ("of these, cases whose runs differ", chance.varied),
+        ("of these, cases that both fail and pass", chance.both_ways),
+        ("failures that ran too seldom to tell", chance.undecided),
+    ):
+        yield Fact(name, number, "", OUTCOMES, "draw")
+    if chance.tolerated:
+        yield Fact(
+            "share of its runs in which a case may fail",
+            *(100.0 * chance.tolerated, PERCENT, SETTINGS, "tolerated"),
+        )
+
+
+def _motion(run: Run) -> Iterator[Fact]:
+    worst = failures(run.cases)
+    failing = _failing(run)
+    driven_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
+    yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
+    if not worst:
+        return
+    yield Fact("worst case", worst[0].index, "", OUTCOMES, "lowest score")
+    known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
+    if known:
+        name = "failures that full braking or full acceleration of the VUT avoids"
+        yield Fact(name, sum(known), "", OUTCOMES, f"{failing}, avoidable")
+    for name, measure, unit in (
+        ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
+        ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
+    ):
+        values = [v for o in worst if (v := o.measures.value(measure)) is not None]
+        if values:
+            yield Fact(name, max(values), unit, OUTCOMES, f"{failing}: {measure}")
+
+
+def _avoided(run: Run) -> Iterator[Fact]:
+    known = list(read_avoidance(run).values())
+    if not known:
+        return
+    if len(known) < sum(outcome.failed for outcome in run.cases):
+        yield Fact("failures that reference drivers drove", len(known), "", AVOIDANCE, "lines")
+    for name in REFERENCES:
+        number = sum(name in one.avoided_by for one in known)
+        yield Fact(f"failures that driver {name} avoids", number, "", AVOIDANCE, "avoided_by")
+    times = [one.latest_takeover_s for one in known if one.latest_takeover_s is not None]
+    if times:
+        middle = statistics.median_low(times)
+        name = "last time at which driver fsm may take over, in the median"
+        yield Fact(name, middle, "s", AVOIDANCE, "latest_takeover_s")
+    number = sum(one.pov_careful for one in known)
+    yield Fact("failures that a careful POV avoids", number, "", AVOIDANCE, "pov_careful")
+
+
+def _studies(run: Run) -> Iterator[Fact]:
+    stress = stress_of(run.folder)
+    if stress is not None and stress.failures:
+        name = f"failures that stay failures in all {stress.runs} runs of the stress test"
+        yield Fact(name, len(stress.robust), "", STRESS, "rungs")
+    known = probability_of(run.folder)
+    if known is not None:
+        for name in ("probability", "low", "high"):
+            end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
+            value = 100.0 * getattr(known, name)
+            yield Fact(f"probability that a case fails{end}", value, PERCENT, RESULT, name)
+        yield Fact("fresh cases of that", known.cases, "", RESULT, "cases")
