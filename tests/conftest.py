@@ -8,14 +8,10 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 
 import pytest
-from accounts import Account, second_account
 from calling import Said
 from campaigning import campaign_settings, run_campaign
 from foreign_nets import corridor_of
@@ -128,27 +124,6 @@ def call(monkeypatch, tmp_path, command_line) -> Callable[..., Said]:
     """Return what runs the command line, from a folder of its own."""
     monkeypatch.chdir(tmp_path)
     return command_line
-
-
-@pytest.fixture(scope="session")
-def other_account() -> Iterator[Account]:
-    """Make a second account of this machine, and remove it in the end."""
-    if os.geteuid() != 0:
-        pytest.skip("a second account needs root")
-    with ExitStack() as made:
-        try:
-            account = made.enter_context(second_account())
-        except OSError as error:
-            require(available=False, reason=str(error))
-        yield account
-
-
-@pytest.fixture
-def common() -> Iterator[Path]:
-    """Return a folder that everybody on this machine can write."""
-    with tempfile.TemporaryDirectory() as folder:
-        Path(folder).chmod(0o777)
-        yield Path(folder).resolve()
 
 
 @pytest.fixture

@@ -175,8 +175,7 @@ def main() -> None:
         export_onnx("vut1", folder / "vut1.onnx")
         build_fmu(folder / "level0.fmu")
         command = shlex.join([sys.executable, str(folder / "client.py"), "{port}"])
-        with_command = VutOptions(command=command)
-        subscribing = VutOptions(command=command.replace("client.py", "subscriber.py"))
+        subscribing = command.replace("client.py", "subscriber.py")
 
         in_process = VutOptions(in_process=True)
 
@@ -191,8 +190,8 @@ def main() -> None:
             "python, in process": driver(f"{folder / 'law.py'}:Vut", given=in_process),
             "python, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32),
             "in process, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32, in_process),
-            "traci": driver("traci", given=with_command),
-            "traci, subscribing": driver("traci", given=subscribing),
+            "traci": driver(f"traci:{command}"),
+            "traci, subscribing": driver(f"traci:{subscribing}"),
             "fmu": driver(f"fmu:{folder / 'level0.fmu'}"),
             "onnx": driver(f"onnx:{folder / 'vut1.onnx'}?decision_period_s=0.1"),
         }

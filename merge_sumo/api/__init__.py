@@ -73,7 +73,7 @@ from merge_sumo.campaigns.scenario_suggestion import (
     suggested_lane_m,
     unseen,
 )
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
@@ -112,7 +112,7 @@ from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.history import History, history_of
-from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies.run_study import RunStudy, notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
 from merge_sumo.studies.truth import Repeats, Truth
 from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
@@ -186,7 +186,7 @@ def campaign(
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
             `seed`, `stop_after_converged`, `learn_from`), how a case is run
             and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
-            `vut_command`, `deadline_s`, `vut_memory_gib`), where it runs
+            `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
             see `CampaignKeywords`.
 
@@ -204,18 +204,14 @@ def resume(
     run: AnyRun,
     *,
     vut: AnyVut | None = None,
-    force: bool = False,
-    trust_vut: bool = False,
     **given: Unpack[CampaignKeywords],
 ) -> CampaignRun:
     """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
 
     Args:
         run: the campaign, or its folder.
-        vut: the VUT again, where it was an object of a process that is gone: only its name tells
-            that it is the same. So with a `pov`.
-        force: go on although something differs that decides outcomes.
-        trust_vut: run the controller that a folder names although it was not made here.
+        vut: the VUT again, where it is code of your own: a run folder names no code to run. So
+            with `pov` and `against`. Of an object only its name tells that it is the same.
         given: as of `campaign`. The settings must be those of the campaign: `cases` may be more.
     """
     check_keywords("resume", given, CampaignKeywords)
@@ -223,14 +219,14 @@ def resume(
     recorded = read_settings(folder)
     named = {name: one for name, one in given.items() if one is not None or name == "workers"}
     fields, runner = given_again(vut, named, {name: recorded.get(name) for name in ("vut", "pov")})
-    settings = settings_of(folder, recorded, fields, trust=trust_vut, goes_on=True)
+    settings = settings_of(folder, recorded, fields, goes_on=True)
     if "level" in named:
         policies = policies_folder(settings.policies, settings.scenario)
         scenario_levels, own = settings.scenario.levels, settings.pov is not None
         levels = parse_levels(str(named["level"]), policies, scenario_levels, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
-    return _concluded(settings, resolve(settings), folder, runner, goes_on=True, force=force)
+    return _concluded(settings, resolve(settings), folder, runner, goes_on=True)
 
 
 def _concluded(
@@ -240,12 +236,10 @@ def _concluded(
     runner: Runner,
     *,
     goes_on: bool = False,
-    force: bool = False,
 ) -> CampaignRun:
     """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
 
-    It begins in a new folder, or goes on in one, also with `force` where something differs. An
-    interruption has a note on how to go on.
+    It begins in a new folder, or goes on in one. An interruption has a note on how to go on.
     """
     gates = list(runner.gates)
     parse_gates(gates, against=settings.against is not None)
@@ -268,7 +262,6 @@ def _concluded(
                 done = resume_campaign(
                     *(settings, plan, folder, case_ended),
                     on_before=bars.ran_before,
-                    force=force,
                     workers=opened,
                     check=runner.checks,
                     warn=_notice,
@@ -282,7 +275,9 @@ def _concluded(
     except (KeyboardInterrupt, Stopped) as stop:
         if folder.exists():
             link_latest(folder)
-            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r})")
+            again = controllers(asdict(settings)).items()
+            named = "".join(f", {name}={spec!r}" for name, spec in again)
+            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r}{named})")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
@@ -370,22 +365,20 @@ def run_case(
     debug: bool = False,
     gui: bool = False,
     out: AnyPath | None = None,
-    trust_vut: bool = False,
     on_end: Callable[[CaseRun], None] | None = None,
     **given: Unpack[CaseKeywords],
 ) -> CaseRun:
     """Run one case and return it; the same as `merge-sumo run`.
 
     Args:
-        vut: vehicle under test, as of `campaign`; with `recorded`, the campaign's by default.
+        vut: vehicle under test, as of `campaign`; with `recorded`, the campaign's by default, if it
+            is of this package or of SUMO.
         case: a row of `run.cases` or `run.failures`: default of level and coordinates.
         recorded: a campaign, or its folder, and the index of its case: default of everything.
         level: POV level 0, 1 or 2, or "own" for a `pov`; by default that of the case, else 0.
         debug: run the VUT in this process without a deadline, so that breakpoints work.
         gui: show it in sumo-gui while it runs; returns when the window is closed.
         out: new folder to keep it in.
-        trust_vut: run the controller that the folder of `recorded` names although the folder was
-            not made here.
         on_end: called with the result when the case has ended, before a window is closed.
         given: coordinates `x_pov0_m`, `v_pov0_mps`, at level 2 `svo_rad`, and others that the
             scenario has: `v_vut0_mps`, `headway_ahead_s`, `headway_behind_s`, those of another
@@ -396,7 +389,7 @@ def run_case(
         name: value for name, value in given.items() if name not in setup and value is not None
     }
     if recorded is not None:
-        settings, one = _recorded_case(vut, recorded, level, setup, values, trust=trust_vut)
+        settings, one = _recorded_case(vut, recorded, level, setup, values)
     elif vut is not None:
         settings, one = _given_case(vut, case or {}, level, setup, values)
     else:
@@ -406,6 +399,8 @@ def run_case(
     for sentence in outside_of_the_pool(one):
         warnings.warn(sentence, Notice, stacklevel=2)
     plan = resolve(settings, debug=debug)
+    if recorded is not None:
+        notice_changes(_opened(recorded[0]).run, plan)
 
     def ended(result: Ended) -> None:
         if out is not None:
@@ -422,8 +417,6 @@ def _recorded_case(
     level: int | str | None,
     setup: Mapping[str, Any],
     values: Mapping[str, Any],
-    *,
-    trust: bool,
 ) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     fields, _ = given_again(vut, setup, {})
@@ -434,7 +427,7 @@ def _recorded_case(
         policies = policies_folder(setup.get("policies"), run.scenario)
         own = fields.get("pov") is not None
         number = one_level(str(level), policies, run.scenario.levels, own=own)
-    settings = settings_today(run, {**fields, **ONE, "levels": (number,)}, trust=trust)
+    settings = settings_today(run, {**fields, **ONE, "levels": (number,)})
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(number)))
     kept = {name: getattr(before, name) for name in names}
     case = case_of(settings.scenario, number, {**kept, **values})
@@ -476,7 +469,6 @@ def rerun(
     run: AnyRun,
     indices: Iterable[int] | int = (),
     *,
-    vut: AnyVut | None = None,
     level: int | str | None = None,
     **given: Unpack[RerunKeywords],
 ) -> Rerun:
@@ -485,7 +477,6 @@ def rerun(
     Args:
         run: the campaign, or its folder.
         indices: its cases; all of them by default.
-        vut: as of `campaign`; the campaign's, as its files are now, by default.
         level: only the cases with a POV of this level; "all" by default.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
@@ -494,7 +485,7 @@ def rerun(
     before = _opened(run).run
     wanted = _of_level(before, _listed(indices), level)
     total = len(set(wanted) or before.outcomes)
-    with _study_of(before, given, "{vut} again", total, vut=vut) as study:
+    with _study_of(before, given, "{vut} again", total) as study:
         return versions.rerun(study, wanted)
 
 
@@ -506,7 +497,6 @@ def _study_of(
     total: int,
     unit: str = "cases",
     *,
-    vut: AnyVut | None = None,
     engine: str | None = Engine.SUMO,
 ) -> Iterator[RunStudy]:
     """Open a campaign for a study that runs cases of it, with a bar that counts `total` of them.
@@ -514,7 +504,7 @@ def _study_of(
     "{vut}" in the title stands for the VUT.
     """
     # Whoever calls the verb: between are the verb, `with`, this function and the two below.
-    settings, plan, runner = _today(run, given, vut, stacklevel=7)
+    settings, plan, runner = _today(run, given, stacklevel=7)
     plan = plan.with_engine(engine)
     counter = runner.counter(title.format(vut=settings.vut), total, unit)
     with runner.open(plan) as opened, counter:
@@ -522,12 +512,12 @@ def _study_of(
 
 
 def _today(
-    run: Run, given: RerunKeywords, vut: AnyVut | None, stacklevel: int
+    run: Run, given: RerunKeywords, stacklevel: int
 ) -> tuple[CampaignSettings, SimulationPlan, Runner]:
     """Return how and where cases of a campaign run today: settings, their plan, and the runner."""
-    others = {name: one for name, one in given.items() if name != "trust_vut"}
-    fields, runner = given_again(vut, others, {"vut": run.vut}, stacklevel)
-    settings = settings_today(run, fields, trust=given.get("trust_vut", False))
+    others = {name: one for name, one in given.items() if name != "vut"}
+    fields, runner = given_again(given.get("vut"), others, {"vut": run.vut}, stacklevel)
+    settings = settings_today(run, fields)
     return settings, resolve(settings), runner
 
 
@@ -635,7 +625,6 @@ def compare_runs(
     *,
     rerun: bool = True,
     policies: AnyPath | None = None,
-    trust_vut: bool = False,
     out: AnyPath | None = None,
     tolerance: float = 0.0,
 ) -> RunComparison:
@@ -648,7 +637,6 @@ def compare_runs(
         b: the campaign after, or its folder.
         rerun: run the failures, errors and timeouts of each with the other's VUT.
         policies: folder of the learned drivers, where they are elsewhere now.
-        trust_vut: run the controllers that the folders name although they were not made here.
         out: page to write; nothing may be there. None is written when left out.
         tolerance: by how much B may be worse before the page says so.
     """
@@ -662,7 +650,7 @@ def compare_runs(
         motions[of, index] = trajectory
 
     compared = versions.compare_runs(
-        first, second, rerun=rerun, given=given, trust=trust_vut, on_motion=keep
+        first, second, rerun=rerun, given=(given, given), on_motion=keep
     )
     if out is not None:
         write_page(comparison_page(compared, first, second, motions, tolerance), Path(out))
@@ -970,7 +958,6 @@ def repair(
     run: AnyRun,
     params: Iterable[str],
     *,
-    vut: AnyVut | None = None,
     cost: str = mending.Cost.TIME,
     trials: int = mending.DEFAULT_TRIALS,
     rounds: int = mending.DEFAULT_ROUNDS,
@@ -986,7 +973,6 @@ def repair(
     Args:
         run: the campaign, or its folder.
         params: parameters that may change, with their ranges: "headway_s=0.5..3".
-        vut: as of `campaign`; the campaign's, as its files are now, by default.
         cost: "time" to the merge, or "braking": of what the repair is to cost least.
         trials: trials of a round.
         rounds: most rounds of search and fresh campaign.
@@ -1008,7 +994,7 @@ def repair(
     folder = dated(f"repair-{before.folder.name}") if out is None else Path(out)
     if not resume:
         check_new(folder)
-    today, plan, runner = _today(before, given, vut, stacklevel=5)
+    today, plan, runner = _today(before, given, stacklevel=5)
     runner = replace(runner, check=check)
     RunStudy(before, today, plan).check_same_system()
     motions: dict[Path, dict[tuple[str, int], Trajectory]] = {}
@@ -1033,11 +1019,13 @@ def repair(
         settings = mending.fresh_settings(today, asked, spec, number)
         ran = _fresh_campaign(settings, campaign, runner)
         seen = motions[ran.folder] = {}
+        of_both = {n: v for n in ("policies", "pov") if (v := getattr(today, n)) is not None}
+        # The earlier version, where its folder may not name it.
+        named = {"vut": today.vut} if "vut" in controllers(before.settings) else {}
         compared = versions.compare_runs(
             before,
             ran,
-            given={} if today.policies is None else {"policies": today.policies},
-            trust=given.get("trust_vut", False),
+            given=({**of_both, **named}, {**of_both, "vut": spec}),
             on_motion=lambda of, index, motion: seen.update({(of, index): motion}),
         )
         return ran, compared
@@ -1158,7 +1146,7 @@ def check_vut(
     Args:
         vut: as of `campaign`.
         scenario: a `Scenario`, its name, or its TOML file; "us23" by default.
-        hosting: `policies`, `vut_command`, `deadline_s`, `vut_memory_gib`; see
+        hosting: `policies`, `deadline_s`, `vut_memory_gib`; see
             `Hosting`.
     """
     check_keywords("check_vut", hosting, Hosting)

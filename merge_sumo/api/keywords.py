@@ -28,14 +28,12 @@ class Hosting(TypedDict, total=False):
     Attributes:
         policies: folder of learned drivers instead of the shipped ones.
         pov: a POV of your own, at level "own": anything that `vut` takes, but not "traci".
-        vut_command: command that starts the controller of `vut="traci"`.
         deadline_s: time in s that a VUT may take for a step before the case is a VUT_ERROR.
         vut_memory_gib: memory in GiB that the process of a VUT of your own may take.
     """
 
     policies: Path | str | None
     pov: AnyVut | None
-    vut_command: str | None
     deadline_s: float
     vut_memory_gib: float
 
@@ -138,10 +136,11 @@ class RerunKeywords(Hosting, Running, total=False):
     """Keywords of what runs cases of a recorded campaign: of `Hosting` and `Running`, and these.
 
     Attributes:
-        trust_vut: run the controller that the folder names although it was not made here.
+        vut: vehicle under test, as of `campaign`; by default the one of the run, if it is of this
+            package or of SUMO. One that is code is given again: a run folder names no code to run.
     """
 
-    trust_vut: bool
+    vut: AnyVut | None
 
 
 class CampaignKeywords(Settings, Running, total=False):

@@ -30,6 +30,7 @@ from merge_sumo.campaigns.against import AGAINST
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
+from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
@@ -254,6 +255,9 @@ class CampaignRun(Result):
         for outcome in failures(run.cases)[:1]:
             folder = quoted(run.folder / SCENARIOS / case_name(outcome.index))
             optional.append(f"worst case: merge-sumo replay {folder} --gui")
+        if self.named_again:
+            again = f"merge-sumo rerun {quoted(self.folder)}{self.named_again}"
+            optional.append(f"run it again: {again}")
         return [line for line in optional if line is not None]
 
     def _against_lines(self) -> list[str]:
@@ -277,6 +281,11 @@ class CampaignRun(Result):
             *([f"  error or timeout, so no verdict: {', '.join(parts)}"] if parts else []),
             f"what broke: {self.folder / AGAINST_PAGE}",
         ]
+
+    @property
+    def named_again(self) -> str:
+        """Options that name again the controllers that are code, which no run folder does."""
+        return named_again(self.settings)
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""

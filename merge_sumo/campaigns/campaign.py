@@ -12,13 +12,12 @@ from typing import Any, Final
 
 from merge_sumo.campaigns.against import AGAINST, PairedSearch, by_batch
 from merge_sumo.campaigns.in_flight import Flight, by_rounds, conduct_in_flight
-from merge_sumo.campaigns.ownership import FILES
 from merge_sumo.campaigns.plan import resolve_earlier
 from merge_sumo.campaigns.prefetch import ChunkResults, Prefetch, RunChunks, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.sampler_copy import search_on_two_cores
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
-from merge_sumo.campaigns.store import RAN_AGAIN, SETTINGS, Batch, Journal, Run, spread_failures
+from merge_sumo.campaigns.store import FILES, RAN_AGAIN, Batch, Journal, Run, spread_failures
 from merge_sumo.campaigns.transfer import lessons
 from merge_sumo.engine.evaluate import (
     CaseResult,
@@ -37,7 +36,7 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_own
-from merge_sumo.system.hashing import Files, sha256_of
+from merge_sumo.system.hashing import Files, files_now
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
@@ -49,10 +48,6 @@ from merge_sumo.vuts.output import LOG
 
 EXPORTED_FAILURES: Final = 10
 SCENARIOS: Final = "scenarios"
-FORCED: Final = "forced"
-"""Key of `campaign.json`: what differed where a campaign went on with --force."""
-SEAL: Final = "seal"
-"""Key of `campaign.json` in folders of version 0.1; it means nothing any more."""
 
 OnCase = Callable[[Outcome], None]
 """Called with every case as it ends, in the order in which cases end."""
@@ -141,7 +136,6 @@ def resume_campaign(
     on_case: OnCase | None = None,
     *,
     on_before: OnCase | None = None,
-    force: bool = False,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
     warn: Callable[[str], None] = lambda _: None,
@@ -158,7 +152,6 @@ def resume_campaign(
         folder: where the campaign is.
         on_case: called with the cases that ran before, too, without `on_before`.
         on_before: called with the outcomes of cases that ran before.
-        force: go on although something differs; that is recorded.
         workers: where cases run.
         check: called after every batch.
         warn: called with a sentence on what was dropped.
@@ -166,7 +159,7 @@ def resume_campaign(
     check_own(folder / SCENARIOS, folder / AGAINST)
     with workers_or_here(workers) as available, ExitStack() as journals:
         opened: list[_Open] = []
-        compared: list[tuple[Changes, bool]] = []
+        rewrites = []
         for at, of_version, planned in _with_earlier(folder, settings, plan, workers):
             if opened and not (opened[0].history or os.path.lexists(at)):
                 # It was stopped between the making of its two folders.
@@ -174,16 +167,16 @@ def resume_campaign(
                     pass
             journal, before, dropped = Journal.reopen(at)
             journals.enter_context(journal)
-            record, changes, rewrite = _compared(before, of_version, planned, force=force)
+            record, rewrite = _compared(before, of_version, planned)
             opened.append(_Open(of_version, planned, record, journal, before))
-            compared.append((changes, rewrite))
+            rewrites.append(rewrite)
             if dropped:
                 warn(f"{at}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
         for earlier in opened[1:]:
             earlier.keep_cases_of(opened[0])
-        for one, (changes, rewrite) in zip(opened, compared, strict=True):
+        for one, rewrite in zip(opened, rewrites, strict=True):
             open_simulators(one.plan, available, first=one.settings.in_flight is not None)
-            one.go_on(changes, rewrite=rewrite)
+            one.go_on(rewrite=rewrite)
         if (on_outcome := on_before or on_case) is not None:
             for outcome in opened[0].history:
                 on_outcome(outcome)
@@ -201,25 +194,23 @@ def _with_earlier(
     return [(at, of, _plan_in(at, of, planned, workers)) for at, of, planned in both]
 
 
-Changes = dict[str, tuple[Any, Any]]
-"""By name, what was recorded and what is so now."""
-
-
 def _compared(
-    before: Run, settings: CampaignSettings, plan: SimulationPlan, *, force: bool
-) -> tuple[dict[str, Any], Changes, bool]:
-    """Return the record of a campaign that goes on, what differs, and whether to write it.
+    before: Run, settings: CampaignSettings, plan: SimulationPlan
+) -> tuple[dict[str, Any], bool]:
+    """Return the record of a campaign that goes on, and whether to write it.
 
-    Raises `UserError` where something differs and it is not to go on with `force`.
+    Raises `UserError` where something differs that decides outcomes: cases of two controllers make
+    no campaign.
     """
-    recorded = {k: v for k, v in before.settings.items() if k not in (FORCED, RAN_AGAIN, SEAL)}
+    recorded = {k: v for k, v in before.settings.items() if k != RAN_AGAIN}
     record = record_of(settings, plan)
     # Where policies are decides nothing: what is in them does.
     moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
     recorded["policies"] = record["policies"]
     # What was loaded while it ran must be the same, too, although it is not loaded yet.
     for name in FILES:
-        record[name] = _files_now(recorded, name, record[name] or {}) or None
+        known = recorded.get(name) or {}
+        record[name] = files_now(known, record[name] or {}) or None
     # Which cases come next does not depend on how many there are to be.
     cases = recorded.get("cases")
     grown = isinstance(cases, int) and cases < settings.cases
@@ -231,32 +222,13 @@ def _compared(
             f"in {before.folder} a case fails when {before.criterion.text}, and not when "
             f"{settings.criterion.text}: a campaign has one criterion; begin another one"
         )
-    if changes and not force:
+    if changes:
         name, (was, now) = next(iter(changes.items()))
         raise UserError(
             f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
-            "same, or go on with --force, which is recorded"
+            "same, or begin a new campaign"
         )
-    return record, changes, bool(changes or moved or grown)
-
-
-def _files_now(recorded: Mapping[str, Any], name: str, known: Files) -> Files:
-    """Return the files that a record names as they are now, and those that are known by now.
-
-    A name in the record is relative to where the campaign was begun, which may be elsewhere.
-    """
-    files = recorded.get(name)
-    again: Files = {}
-    for file in files if isinstance(files, dict) else {}:
-        try:
-            now = sha256_of(Path(file))
-        except ValueError as error:
-            raise UserError(f"{SETTINGS} has a file that no file can be named: {error}") from error
-        same = [other for other in known if other.endswith(f"/{file}")]
-        if now is None and same:
-            now, known = known[same[0]], {k: v for k, v in known.items() if k != same[0]}
-        again[file] = now
-    return again | known
+    return record, moved or grown
 
 
 class _Open:
@@ -283,19 +255,14 @@ class _Open:
         self.history: list[Outcome] = [] if before is None else before.outcomes
         self._record, self._noted = record, _Noted(record)
 
-    def go_on(self, changes: Changes, *, rewrite: bool) -> None:
-        """Write the record of a campaign that goes on, with what differs; see `_compared`."""
+    def go_on(self, *, rewrite: bool) -> None:
+        """Write the record of a campaign that goes on, where it is another; see `_compared`."""
         before, record = self.before, self._record
         assert before is not None, "it goes on"  # noqa: S101
-        if before.settings.get(FORCED) or changes:
-            forced = {"from_case": len(before.outcomes), "differs": changes}
-            record[FORCED] = [*_forced(before), *([forced] if changes else [])]
         if before.ran_again:
             record[RAN_AGAIN] = before.ran_again
         if rewrite:
             self.journal.rewrite_settings(record)
-        else:
-            self.journal.note_own(record)
         self._noted = _Noted(record)
 
     def run_chunks(self, workers: Workers) -> RunChunks:
@@ -495,11 +462,6 @@ def _plan_in(
     if settings.in_flight is not None:
         at_once = math.ceil(settings.in_flight / (1 if workers is None else workers.count))
     return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
-
-
-def _forced(run: Run) -> list[Any]:
-    forced = run.settings.get(FORCED, [])
-    return forced if isinstance(forced, list) else [forced]
 
 
 def case_name(index: int) -> str:

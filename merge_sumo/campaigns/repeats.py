@@ -119,7 +119,7 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     have gone. Half are the first cases, which a new controller ran; the others are spread over the
     campaign, and run before those. Errors may be a slow machine's doing, and are left out.
     """
-    if waits_for_client(settings.vut, settings.vut_command):
+    if waits_for_client(settings.vut):
         return []
     own_vut = not is_built_in(settings.vut)
     own_pov = settings.pov is not None and not is_built_in(settings.pov)

@@ -7,7 +7,6 @@ from dataclasses import MISSING, asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from merge_sumo.campaigns.ownership import check_own_code
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
@@ -20,6 +19,7 @@ from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import RecordError, check_fields
 from merge_sumo.values.case import Pool
 from merge_sumo.values.chance import check_tolerated
@@ -27,7 +27,7 @@ from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import is_built_in, kind_of
+from merge_sumo.vuts.registry import is_built_in, names_code, waits_for_client
 
 DEFAULT_CASES: Final = 800
 
@@ -46,7 +46,6 @@ class CampaignSettings:
     tolerated: float = 0.0
     seed: int = 0
     stop_after_converged: float | None = None
-    vut_command: str | None = None
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
     policies: str | None = None
@@ -101,7 +100,6 @@ class CampaignSettings:
     def _check_texts(self) -> None:
         for option, text in (
             ("--vut", self.vut),
-            ("--vut-command", self.vut_command),
             ("--policies", self.policies),
             ("--pov", self.pov),
             ("--against", self.against),
@@ -151,10 +149,10 @@ class CampaignSettings:
                     f"{option} does not go with --against, which runs each batch with two "
                     "versions: leave one of them away"
                 )
-        if kind_of(against).by_command:
+        if waits_for_client(against):
             raise UserError(
-                f"--against is {against}: --vut-command starts one controller; name an earlier "
-                "version that needs no command"
+                f"--against is {against}: a client that a person starts drives one VUT; name an "
+                "earlier version that needs none"
             )
         if against == self.vut:
             raise UserError(f"--against is {against}, and so is --vut: name two versions")
@@ -167,7 +165,7 @@ class CampaignSettings:
         """
         if self.against is None:
             raise UserError("the campaign has no --against")
-        return replace(self, vut=self.against, against=None, vut_command=None)
+        return replace(self, vut=self.against, against=None)
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
         """Return what says of the outcomes so far whether the search is over, if anything does."""
@@ -210,7 +208,6 @@ class CampaignSettings:
     def vut_options(self, policies: Path | None) -> VutOptions:
         """Return how the VUT is hosted, with the learned drivers of a folder."""
         return VutOptions(
-            command=self.vut_command,
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
             policies=policies,
@@ -264,26 +261,32 @@ def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
     return same_name and all(one[key] == other[key] for key in deciding)
 
 
+MOST_SHOWN: Final = 200
+"""Characters of a spec in a message."""
+
+
 def settings_of(
     folder: Path,
     recorded: Mapping[str, Any],
     given: Mapping[str, object] | None = None,
     *,
-    trust: bool = False,
     goes_on: bool = False,
 ) -> CampaignSettings:
     """Return the settings of a campaign, as its folder records them or as they are given anew.
 
     Only a campaign that goes on runs the earlier version that it is against.
 
-    Raises `UserError` where one is missing or something else, and, without `trust`, where a folder
-    that may be a stranger's names a controller that nobody named here.
+    Raises `UserError` where one is missing or something else, and where it is a controller that is
+    code, which is never run because a folder names it: who may have written that?
     """
     given = {**({} if goes_on else {"against": None}), **(given or {})}
     record = {**recorded, **given}
-    _check_begun_here(folder, record, given)
-    if not trust:
-        check_own_code(folder, recorded, given)
+    for name, spec in controllers(record).items():
+        if name not in given:
+            raise UserError(
+                f"{folder} was run with {name} {printable(spec)[:MOST_SHOWN]}, and a run folder "
+                f"names no code to run: name it again, --{name} SPEC"
+            )
     known = {
         spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
     }
@@ -301,20 +304,20 @@ def settings_of(
         raise UserError(f"{folder / SETTINGS}: {error}") from error
 
 
-def _check_begun_here(folder: Path, record: Mapping[str, Any], given: Mapping[str, object]) -> None:
-    """Refuse to run a controller whose files have names that are relative to another folder."""
-    vut = "vut_command" if record.get("vut_command") else "vut"
-    for spec, files in ((vut, "vut_files"), ("pov", "pov_files")):
-        who, names = str(record.get(spec)), record.get(files)
-        if spec in given or not isinstance(names, dict):
-            continue
-        beside = [name for name in names if not Path(name).is_absolute()]
-        found = any(Path(name).exists() or f"/{name}" in who for name in beside)
-        if beside and not found:
-            raise UserError(
-                f"{folder} was begun where {beside[0]} is, and there is none here: do this in that "
-                "folder"
-            )
+def controllers(record: Mapping[str, Any]) -> dict[str, str]:
+    """Return the controllers of a record that are code of a user's, by the name of the setting."""
+    named = {name: record.get(name) for name in ("vut", "pov", "against")}
+    return {
+        name: spec for name, spec in named.items() if isinstance(spec, str) and names_code(spec)
+    }
+
+
+def named_again(record: Mapping[str, Any]) -> str:
+    """Return the options that name the controllers of a record again, for the end of a command.
+
+    Empty where a run folder names them all.
+    """
+    return "".join(f" --{name} {quoted(spec)}" for name, spec in controllers(record).items())
 
 
 def _check_still_there(folder: Path, policies: str) -> None:

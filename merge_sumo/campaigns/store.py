@@ -16,11 +16,12 @@ import hashlib
 import io
 import json
 import os
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
@@ -29,14 +30,11 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.ownership import RECORD, note_run
 from merge_sumo.errors import UserError
-from merge_sumo.system.anchors import Anchor
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import decode
-from merge_sumo.system.trust import begun_here
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -47,13 +45,18 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.signals import SignalRuns, Signals, from_runs, to_record
 from merge_sumo.values.trajectory import Trajectory
 
-SETTINGS: Final = RECORD
+SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
+_FORMER: Final = {"collision": PAPER_CRITERION.fail_when}
+_FORMER_NAME: Final = re.compile(r"\bgap_m\b")
+"""What release 0.1 called the paper's criterion, and the measure `bumper_gap_m`."""
 RAN_AGAIN: Final = "ran_again"
 """Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
+FILES: Final = ("vut_files", "pov_files")
+"""Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
 Batch = list[tuple[Outcome, Trajectory]]
@@ -275,7 +278,7 @@ def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     require = settings.get("require")
     if not (require is None or isinstance(require, str)):
         raise UserError(f"{path} has something else than a formula as require")
-    return Criterion(fail_when, require)
+    return Criterion(_FORMER_NAME.sub("bumper_gap_m", _FORMER.get(fail_when, fail_when)), require)
 
 
 def _absent_packages(settings: Mapping[str, Any]) -> str:
@@ -424,14 +427,9 @@ class Journal:
     The folder appears whole or not at all, and what was appended once stays.
     """
 
-    def __init__(self, folder: Path, place: Anchor, outcomes: io.FileIO, *, begun: bool) -> None:
-        """Take the folder by name and as it is held, and its open outcomes.
-
-        Use `create` or `reopen`. `begun` is whether this user began the campaign there.
-        """
+    def __init__(self, folder: Path, outcomes: io.FileIO) -> None:
+        """Take the folder and its open outcomes; use `create` or `reopen`."""
         self.folder = folder
-        self._place = place
-        self._begun = begun
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
@@ -439,15 +437,11 @@ class Journal:
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
         """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        with new_folder(folder) as new, ExitStack() as undo:
+        with new_folder(folder) as new:
             (new / TRAJECTORIES).mkdir()
             _write(new / SETTINGS, _settings_text(settings))
-            place = Anchor(new)
-            undo.callback(place.close)
-            journal = cls(folder, place, (new / OUTCOMES).open("wb", buffering=0), begun=True)
-            note_run(new, folder, settings, begun=True)  # before a kill can leave the folder alone
+            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0))
             sync_folder(new)
-            undo.pop_all()
         return journal
 
     @classmethod
@@ -460,30 +454,25 @@ class Journal:
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
-        undo = ExitStack()
         try:
-            place = Anchor(folder)
-            undo.callback(place.close)
-            outcomes = (place.path / OUTCOMES).open("r+b", buffering=0)
-            undo.callback(outcomes.close)
+            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
         except OSError as error:
-            undo.close()
             if error.errno in (errno.ENOENT, errno.ENOTDIR):
                 raise UserError(
                     f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
                 ) from error
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
         try:
-            journal = cls(folder, place, outcomes, begun=begun_here(folder, SETTINGS))
+            journal = cls(folder, outcomes)
             run = Run(folder)
             dropped = len(run.outcomes) - run.whole_batches() + run.torn
             if dropped:
                 journal.keep(run, run.whole_batches())
         except OSError as error:
-            undo.close()
+            outcomes.close()
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
         except BaseException:
-            undo.close()
+            outcomes.close()
             raise
         return journal, run, dropped
 
@@ -501,12 +490,12 @@ class Journal:
         The trajectories go first, so that every outcome on disk has its trajectory there. Raises
         `UserError` when they cannot be written; what was there before stays.
         """
-        paths = [batch_file(self._place.path, batch[0][0].batch) for batch in batches]
+        paths = [batch_file(self.folder, batch[0][0].batch) for batch in batches]
         lines, arrays = zip(*map(_encoded, batches), strict=True)
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
             list(self._threads.map(_write, paths, arrays))
-            sync_folder(self._place.path / TRAJECTORIES)
+            sync_folder(self.folder / TRAJECTORIES)
             try:
                 _write_all(self._outcomes, b"".join(lines))
             except OSError:
@@ -520,12 +509,7 @@ class Journal:
 
     def rewrite_settings(self, settings: dict[str, Any]) -> None:
         """Put other settings in the place of those that were there, all or nothing."""
-        replace_own(self.folder / SETTINGS, _settings_text(settings), place=self._place.path)
-        self.note_own(settings)
-
-    def note_own(self, settings: dict[str, Any]) -> None:
-        """Remember that this user runs the code that the settings name, from this folder."""
-        note_run(self.folder, self.folder, settings, begun=self._begun)
+        replace_own(self.folder / SETTINGS, _settings_text(settings))
 
     def __enter__(self) -> Self:
         return self
@@ -533,7 +517,6 @@ class Journal:
     def __exit__(self, *_: object) -> None:
         self._threads.shutdown()
         self._outcomes.close()
-        self._place.close()
 
 
 def _encoded(batch: Batch) -> tuple[bytes, bytes]:

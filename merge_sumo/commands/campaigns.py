@@ -13,8 +13,8 @@ from merge_sumo.commands.options import (
     HOSTING,
     RUNNING,
     SETUP,
+    VUT_AGAIN,
     RunArgument,
-    Shared,
     flag,
     option,
     optional,
@@ -31,12 +31,6 @@ SETTINGS: Final = (
 COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
 
 
-def _vut_option(help: str, show_default: str) -> Shared:
-    return optional(
-        str, help, metavar="SPEC", show_default=show_default, autocompletion=complete.vuts
-    )
-
-
 @app.verb(
     options=(
         *(
@@ -46,7 +40,7 @@ def _vut_option(help: str, show_default: str) -> Shared:
             "tolerate",
             *SETUP,
         ),
-        *(*RUNNING, "trust_vut"),
+        *RUNNING,
     )
 )
 def campaign(
@@ -62,12 +56,6 @@ def campaign(
             autocompletion=complete.runs,
         ),
     ] = None,
-    force: Annotated[
-        bool,
-        typer.Option(
-            "--force", help="Resume although something differs; campaign.json records it."
-        ),
-    ] = False,
     gate: Annotated[
         list[str] | None,
         typer.Option(
@@ -102,10 +90,9 @@ def campaign(
 
     with stoppable("batch", how_to_go_on) as check:
         if resume is None:
-            del given.keywords["trust_vut"]  # The controllers of a new campaign are named here.
             run = api.campaign(**given.keywords, **for_ci, out=folder, check=check)
         else:
-            run = api.resume(folder, **given.written, **for_ci, force=force, check=check)
+            run = api.resume(folder, **given.written, **for_ci, check=check)
     given.print(run)
     for remark in run.remarks():
         say(remark)
@@ -115,17 +102,20 @@ def campaign(
 def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     if not folder.exists():
         return "stopped before the first case; nothing was written"
-    # None of these is a setting of the campaign, which its folder would remember.
-    words = [f"--resume {quoted(folder)}", *(f"--gate {quoted(gate)}" for gate in gates)]
+    from merge_sumo import api
+
+    # None of these is a setting of the campaign that its folder would bring.
+    words = [f"--resume {quoted(folder)}{api.open_run(folder).named_again}"]
+    words += [f"--gate {quoted(gate)}" for gate in gates]
     if junit is not None:
         words.append(f"--junit {quoted(junit)}")
     return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
 
 
 @app.verb(
-    options=(*COORDINATES, *SETUP, "trust_vut"),
+    options=(*COORDINATES, *SETUP),
     own={
-        "vut": _vut_option("Vehicle under test.", "with --case the campaign's"),
+        "vut": VUT_AGAIN,
         "level": optional(
             str,
             "POV level: 0, 1, 2 or own.",
@@ -195,8 +185,8 @@ def _coordinates(given: list[str]) -> dict[str, float]:
 
 
 @app.verb(
-    options=("level", *HOSTING, "policies", "tolerance", *RUNNING, "trust_vut"),
-    own={"vut": _vut_option("The changed VUT.", "the campaign's, as its files are now")},
+    options=("level", *HOSTING, "policies", "tolerance", *RUNNING),
+    own={"vut": VUT_AGAIN},
 )
 def rerun(
     given: Given,
@@ -323,7 +313,7 @@ def report(given: Given, run: RunArgument) -> None:
 
 @app.verb(
     "compare-runs",
-    options=["tolerance", "policies", "trust_vut"],
+    options=["tolerance", "policies"],
     own={
         "rerun": option(
             bool,

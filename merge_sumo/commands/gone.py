@@ -27,6 +27,10 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--problems": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--samplers": "`merge-sumo benchmark` compares samplers on a VUT",
     "--truth-cases": "`merge-sumo benchmark` compares samplers on a VUT",
+    "--trust-vut": "a run folder names no code to run: name a controller of your own again, --vut "
+    "SPEC (and --pov)",
+    "--force": "a campaign with something changed begins anew, in a folder of its own",
+    "--vut-command": 'the spec has the command, as in --vut "traci:python my.py {port}"',
     "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "compare --vut": "`merge-sumo benchmark` compares samplers on a VUT",

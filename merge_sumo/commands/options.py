@@ -28,7 +28,7 @@ PANEL_OF: Final = {name: panel for panel, names in PANELS.items() for name in na
 
 GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     "What is tested": (
-        *("vut", "vut_command", "against", "level", "scenario"),
+        *("vut", "against", "level", "scenario"),
         *("net", "mainline", "ramp", "point", "follow_up", "sense", "act", "case", "at"),
         *("x", "v", "psi"),
         *("headway_ahead", "headway_behind", "only", "a_min", "check"),
@@ -47,10 +47,10 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Verdict": (*("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),),
     "Where it runs, and what it writes": (
-        *("out", "resume", "force", "crime", "workers", "dask", "junit", "figure"),
+        *("out", "resume", "crime", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
-    "Trust and limits": ("trust_vut", "vut_memory"),
+    "Limits": ("vut_memory",),
     "For experts": (
         *("require", "pov", "policies", "sampler", "batch", "in_flight", "learn_from"),
         *("engine", "deadline"),
@@ -257,13 +257,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         str, "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT."
     ),
     "quiet": flag("Show no progress.", "--quiet", "-q"),
-    "trust_vut": flag(
-        "Run the controller that a folder names although it is not known to be yours.",
-        "--trust-vut",
-    ),
-    "vut_command": optional(
-        str, "Command that starts the controller of --vut traci; {port} stands for the port."
-    ),
     "deadline": option(
         float, DEADLINE_S, "Seconds that a VUT may take for a step before it is a VUT_ERROR."
     ),
@@ -272,7 +265,16 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     ),
 }
 
-HOSTING: Final = ("vut_command", "deadline", "vut_memory")
+VUT_AGAIN: Final = optional(
+    str,
+    "Vehicle under test, perhaps a changed one. A file, module, command or model is always named "
+    "here: a run folder names no code to run.",
+    metavar="SPEC",
+    show_default="the campaign's",
+    autocompletion=complete.vuts,
+)
+"""Option of what drives in cases of a recorded campaign."""
+HOSTING: Final = ("deadline", "vut_memory")
 OF_SCENARIO: Final = ("follow_up", "sense", "act")
 SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", *OF_SCENARIO, *HOSTING)
 RUNNING: Final = ("workers", "dask", "quiet")

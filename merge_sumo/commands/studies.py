@@ -16,6 +16,7 @@ from merge_sumo.commands.options import (
     RUNNING,
     SEED,
     SETUP,
+    VUT_AGAIN,
     RunArgument,
     VutOption,
     flag,
@@ -24,7 +25,7 @@ from merge_sumo.commands.options import (
 )
 from merge_sumo.commands.printing import folder_of, same_command, stoppable
 
-OF_RECORDED: Final = ("policies", "pov", *HOSTING, *RUNNING, "trust_vut")
+OF_RECORDED: Final = ("policies", "pov", *HOSTING, *RUNNING)
 """Options of the studies that run cases of a recorded campaign."""
 TRUTH_CASES: Final = "10000, at level 2 20000"
 
@@ -116,6 +117,7 @@ def benchmark(
 @app.verb(
     options=("engine", *OF_RECORDED),
     own={
+        "vut": VUT_AGAIN,
         "cases": option(int, 4000, "Fresh cases to run."),
         "distribution": optional(
             Path, "JSON: how often cases occur.", metavar="FILE", show_default="uniform"
@@ -145,6 +147,7 @@ def probability(given: Given, run: RunArgument) -> None:
     "failures-per-merge",
     options=("engine", *OF_RECORDED),
     own={
+        "vut": VUT_AGAIN,
         "density": optional(
             float,
             "Cars per km of the mainline's lane.",
@@ -188,6 +191,7 @@ def failures_per_merge(
 @app.verb(
     options=OF_RECORDED,
     own={
+        "vut": VUT_AGAIN,
         "draws": option(
             int, 5, "Times that all cases run where a change is drawn at random, 1 to 1,000."
         ),
@@ -208,7 +212,7 @@ def stress(given: Given, run: RunArgument) -> None:
     given.print(api.stress(run, **given.written))
 
 
-@app.verb(options=OF_RECORDED)
+@app.verb(options=OF_RECORDED, own={"vut": VUT_AGAIN})
 def explain(
     given: Given,
     run: RunArgument,
@@ -242,6 +246,7 @@ def explain(
 @app.verb(
     options=OF_RECORDED,
     own={
+        "vut": VUT_AGAIN,
         "cases": optional(
             int,
             "Cases that drive there. Fewer than recorded: those with the lowest scores, mostly "

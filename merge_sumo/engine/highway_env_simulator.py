@@ -23,7 +23,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.world import MAX_SPEED_MPS
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, Scenario
-from merge_sumo.vuts.registry import VutFactory, kind_of
+from merge_sumo.vuts.registry import KINDS, VutFactory, kind_of
 
 PACKAGE: Final = "highway-env"
 LANE_WIDTH_M: Final = 4.0
@@ -61,7 +61,7 @@ def why_sumo_alone(plan: SimulationPlan) -> str | None:
             continue
         if driver.vut.vut_type is not None:
             return f"the {name} {driver.spec} is a model of SUMO, which drives in SUMO alone"
-        if kind_of(driver.spec).by_command:
+        if kind_of(driver.spec) is KINDS["traci"]:
             return f"the {name} {driver.spec} asks SUMO, by TraCI"
     return None
 

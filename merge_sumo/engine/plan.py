@@ -101,7 +101,6 @@ class SimulationPlan:
         own = self.povs.own if level == OWN else None
         return plan_key(
             vut=self.vut.spec,
-            vut_command=self.vut.options.command,
             deadline_s=self.vut.options.deadline_s,
             pov=None if own is None else own.spec,
             policies_sha256=self.policies_sha256,
@@ -173,7 +172,6 @@ class SimulationPlan:
 def plan_key(
     *,
     vut: str,
-    vut_command: str | None,
     deadline_s: float,
     pov: str | None,
     policies_sha256: Mapping[str, str],
@@ -188,10 +186,9 @@ def plan_key(
     under a key has their hashes beside it. Instead the working folder counts where a user's code
     runs, because the same name may be another file in another folder.
     """
-    code = runs_code(vut, vut_command) or (pov is not None and runs_code(pov, None))
+    code = runs_code(vut) or (pov is not None and runs_code(pov))
     return {
         "vut": vut,
-        "vut_command": vut_command,
         "deadline_s": deadline_s,
         "pov": pov,
         "folder": str(Path.cwd()) if code else None,

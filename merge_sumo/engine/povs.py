@@ -152,7 +152,7 @@ def own_pov(spec: str, options: VutOptions) -> VutFactory:
     if why := kind_of(spec).no_pov:
         raise UserError(f"--pov {spec}: {why}")
     try:
-        return VutFactory(spec, replace(options, command=None))
+        return VutFactory(spec, options)
     except UserError as error:
         raise UserError(f"--pov {spec}: {error}") from error
 

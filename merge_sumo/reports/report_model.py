@@ -201,7 +201,6 @@ def kept_truth(run: Run, road: Corridor, level: int) -> tuple[Truth, Path] | Non
         return None
     plan = plan_key(
         vut=str(settings.get("vut")),
-        vut_command=settings.get("vut_command"),
         deadline_s=settings.get("deadline_s", DEADLINE_S),
         pov=settings.get("pov") if level == OWN else None,
         policies_sha256=policies,

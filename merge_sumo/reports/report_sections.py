@@ -20,6 +20,7 @@ from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns import repeats
+from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
@@ -95,7 +96,7 @@ def head_words(model: ReportModel) -> dict[str, Any]:
         "lost": in_words(lost) if lost else "",
         "notes": [*notes_on(model.cases, run.criterion), *filter(None, [run.ran_again_in_words])],
         "interruption": run.interruption,
-        "resume": f"merge-sumo campaign --resume {quoted(run.folder)}",
+        "resume": f"merge-sumo campaign --resume {quoted(run.folder)}{named_again(run.settings)}",
         "wanted": run.settings.get("cases"),
     }
 

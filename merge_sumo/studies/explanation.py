@@ -28,6 +28,7 @@ from msgspec import Meta
 
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
@@ -189,6 +190,7 @@ class ExplanationResult(Result):
         if self.found.nearest_start is not None:
             name, value = self.found.nearest_start
             at = f"--at {name}={value!r}"
+            at += named_again(self.run.settings)
             lines.append(f"look at it: merge-sumo run --case {folder} {outcome.index} {at}")
         return [*lines, f"written: {self.file}; in the report: merge-sumo report {folder}"]
 

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.store import FILES, Run
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
+from merge_sumo.system.hashing import files_now
+from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
 
 
@@ -45,3 +48,23 @@ class RunStudy:
         ):
             if run.settings.get(name) != today[name]:
                 raise UserError(f"{run.folder} was run with {difference}")
+        notice_changes(run, self.plan)
+
+
+def notice_changes(run: Run, plan: SimulationPlan) -> None:
+    """Warn with a `Notice` where a controller that a campaign ran is not as it was then."""
+    pov = plan.povs.own
+    specs = plan.vut.spec, None if pov is None else pov.spec
+    loaded = plan.vut.files or {}, plan.povs.files or {}
+    for name, setting, spec, files in zip(FILES, ("vut", "pov"), specs, loaded, strict=True):
+        known = run.settings.get(name)
+        if spec is None or spec != run.settings.get(setting) or not isinstance(known, dict):
+            continue
+        now = files_now(known, files)
+        if differing := [file for file, sha256 in known.items() if now[file] != sha256]:
+            warnings.warn(
+                f"note: {printable(differing[0])} is not as it was in {run.folder}: {spec} may "
+                "drive otherwise than it did there",
+                Notice,
+                stacklevel=4,
+            )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
+import stat
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from numbers import Integral
@@ -22,7 +22,7 @@ from merge_sumo.system.folders import check_own, check_place, make_place, replac
 from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
-from merge_sumo.system.signature import CACHE, signed, user_key, verified
+from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.chance import MOST_RUNS, check_tolerated, is_decided
@@ -207,7 +207,7 @@ def ground_truth(
     path = kept.path(cache)
     check_place(path.parent, CACHE)
     check_own(path)
-    key = user_key()
+    check_private(path.parent)
     dims = len(plan.scenario.dimensions(level))
     points = np.random.default_rng([seed, level]).random((count, dims))
     told = _Told(count, on_cases)
@@ -219,8 +219,10 @@ def ground_truth(
     names = COLUMNS if truth.runs is None else (*COLUMNS, *COUNTS)
     arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in names}
     np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
-    make_place(path.parent, CACHE)
-    replace_own(path, signed(arrays.getvalue(), path.stem, key))
+    if not path.parent.is_dir():
+        make_place(path.parent, CACHE)
+        path.parent.chmod(stat.S_IRWXU)
+    replace_own(path, arrays.getvalue())
     return truth
 
 
@@ -368,15 +370,15 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     """Return what a file of the cache holds.
 
     None where there is none, or it is torn or something else, such as another truth under this
-    name, it was not signed by this user, or a file that the VUT loaded is not what it was.
+    name, others can write the cache, or a file that the VUT loaded is not what it was.
     """
     dims = len(scenario.dimensions(level))
     try:
         numbers_bytes = 8 * cases * (dims + 1 + len(COUNTS))
-        content = _signed_content(path, most_bytes=numbers_bytes + MOST_FILES_BYTES)
-        if content is None:
+        check_private(path.parent)
+        if regular(path).stat().st_size > numbers_bytes + MOST_FILES_BYTES:
             return None
-        data = read_arrays(io.BytesIO(content))
+        data = read_arrays(path)
         points, score, in_sumo = (data[name] for name in COLUMNS)
         counts = [data[name] for name in COUNTS if name in data]
         files = decode(str(data["files"]), dict[str, str | None])
@@ -396,19 +398,6 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         return None
     truth = Truth(points, score, int(in_sumo), *counts)
     return truth if truth.in_sumo <= truth.all_runs else None
-
-
-def _signed_content(path: Path, most_bytes: int) -> bytes | None:
-    """Return what a file of the cache holds; None where this user has not signed it.
-
-    Raises OSError where there is no file that can be read, or a giant one.
-    """
-    if regular(path).stat().st_size > most_bytes:
-        raise OSError(errno.EFBIG, "it is no truth, but a giant file", str(path))
-    try:
-        return verified(path.read_bytes(), path.stem, user_key())
-    except UserError:  # without a key of this user's nothing in a cache can be known
-        return None
 
 
 def _scores(results: CaseResults) -> list[tuple[float, bool, Files]]:

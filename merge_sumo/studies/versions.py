@@ -25,7 +25,7 @@ from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.against import earlier_run
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.repeats import cause
-from merge_sumo.campaigns.settings import CampaignSettings, same_pov, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, same_pov, settings_of
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import versions
@@ -420,8 +420,7 @@ def compare_runs(
     b: Run,
     *,
     rerun: bool = True,
-    given: Mapping[str, object] | None = None,
-    trust: bool = False,
+    given: tuple[Mapping[str, object], Mapping[str, object]] = ({}, {}),
     on_motion: OnMotion = lambda _run, _index, _trajectory: None,
 ) -> RunComparison:
     """Compare the campaigns of two VUTs, A before and B after, level by level.
@@ -433,8 +432,8 @@ def compare_runs(
         a: campaign of A.
         b: campaign of B.
         rerun: run the failures, errors and timeouts of each with the VUT of the other.
-        given: settings in the place of what the folders name: policies that are elsewhere.
-        trust: run the controllers that the folders name although they may be a stranger's.
+        given: settings of A and of B in the place of what their folders name: policies that are
+            elsewhere, controllers that are code.
         on_motion: told what a VUT did in a case of the other's campaign.
     """
     levels = sorted(set(a.levels) & set(b.levels))
@@ -457,8 +456,8 @@ def compare_runs(
                     f"{run.folder} was run on another net than {road.path} is now: put that "
                     "back, or compare the records with --no-rerun"
                 )
-        again_b = _run_again(b, a, telling_a, given, partial(on_motion, "A"), trust=trust)
-        again_a = _run_again(a, b, telling_b, given, partial(on_motion, "B"), trust=trust)
+        again_b = _run_again(b, a, telling_a, given[1], partial(on_motion, "A"))
+        again_a = _run_again(a, b, telling_b, given[0], partial(on_motion, "B"))
     runs_a, runs_b = (_repeated(run.outcomes) for run in (a, b))
     cases = [
         *(
@@ -534,10 +533,8 @@ def _run_again(
     run: Run,
     other: Run,
     telling: Sequence[Outcome],
-    given: Mapping[str, object] | None,
+    given: Mapping[str, object],
     on_motion: Callable[[int, Trajectory], None],
-    *,
-    trust: bool,
 ) -> _RunAgain:
     """Run a campaign's VUT in the other's telling cases, if it is still the same VUT.
 
@@ -546,12 +543,15 @@ def _run_again(
     """
     if not telling:
         return _RunAgain("had nothing to run")
+    unnamed = controllers({**run.settings, "against": None}).keys() - given.keys()
+    if unnamed:
+        return _RunAgain("was not run again, as a run folder names no code to run")
     scored = [o for o in run.outcomes if o.score is not None]
     checked = sorted(scored, key=lambda o: (o.score, o.index))[:CHECKED]
     repeated = _repeated(other.outcomes)
     draws = [[o.case for o in _runs_of(o, repeated)] for o in telling]
     cases = [*(o.case for o in checked), *chain.from_iterable(draws)]
-    settings = settings_of(run.folder, run.settings, given, trust=trust)
+    settings = settings_of(run.folder, run.settings, given)
     plan = resolve(settings).for_cases(len(cases))
     shows_chance = any(one.varies for one in _repeated(run.outcomes).values())
     results = [result for _, result in sorted(evaluate(plan, cases), key=itemgetter(0))]
@@ -691,17 +691,12 @@ class Rerun(Result):
         return text
 
 
-def settings_today(
-    run: Run, given: Mapping[str, object] | None = None, *, trust: bool = False
-) -> CampaignSettings:
+def settings_today(run: Run, given: Mapping[str, object] | None = None) -> CampaignSettings:
     """Return the settings of a campaign with what is given in the place of what it recorded.
 
     A VUT that is not given is that of the campaign, as its files are today (`settings_of`).
     """
-    wanted = dict(given or {})
-    if "vut" in wanted:
-        wanted.setdefault("vut_command", None)  # the recorded command is of the recorded VUT
-    return settings_of(run.folder, run.settings, wanted, trust=trust)
+    return settings_of(run.folder, run.settings, given)
 
 
 def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Rerun:
@@ -751,8 +746,7 @@ def _same_vut(run: Run, settings: CampaignSettings) -> bool:
     recorded, files = run.settings, run.settings.get("vut_files")
     return (
         not is_built_in(settings.vut)
-        and (settings.vut, settings.vut_command)
-        == (recorded.get("vut"), recorded.get("vut_command"))
+        and settings.vut == recorded.get("vut")
         and recorded.get("versions") == versions()
         and isinstance(files, dict)
         and not changed(files)

@@ -205,7 +205,7 @@ def _differences(
 def _why(plan: SimulationPlan, difference: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
     spec = plan.vut.spec
-    if is_here(spec) or waits_for_client(spec, plan.vut.options.command):
+    if is_here(spec) or waits_for_client(spec):
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import BinaryIO, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.anchors import Anchor, anchored
 
 TEMPORARY: Final = ".merge-sumo-"
 """How the name begins under which a folder or file is written; the name has 28 bytes."""
@@ -122,25 +121,20 @@ def check_own(*paths: Path) -> None:
 def new_folder(path: Path) -> Iterator[Path]:
     """Give an empty folder to fill; it is at `path` in the end, or nowhere.
 
-    What is given leads to the folder whatever somebody puts into its place meanwhile.
-
     Raises `UserError` where `path` exists, or when something cannot be written. Then what was made
     here is gone again, folders above `path` included.
     """
     check_new(path)
-    with ExitStack() as held, ExitStack() as undo:
+    with ExitStack() as undo:
         try:
             _make_above(path, undo)
-            parent = Anchor(path.parent)
-            held.callback(parent.close)
-            name = f"{TEMPORARY}{secrets.token_hex(8)}"
-            new = parent.new_folder(name)
-            held.callback(new.close)
-            undo.callback(_remove_if_empty, parent.path / name)
-            undo.callback(_remove_all_in, new.path)
-            yield new.path
-            _take_name(parent.path / name, parent.path / path.name, path)
-            sync_folder(parent.path)
+            new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
+            new.mkdir()
+            undo.callback(_remove_if_empty, new)
+            undo.callback(_remove_all_in, new)
+            yield new
+            _take_name(new, path)
+            sync_folder(path.parent)
         except OSError as error:
             raise cannot_write(path, error) from error
         undo.pop_all()
@@ -198,7 +192,7 @@ def _remove_all_in(folder: Path) -> None:
                 path.unlink(missing_ok=True)
 
 
-def _take_name(new: Path, path: Path, shown: Path) -> None:
+def _take_name(new: Path, path: Path) -> None:
     """Rename a folder, and never over another one: a rename replaces one that is empty."""
     if sys.platform == "win32":  # a rename replaces nothing there
         new.rename(path)
@@ -206,7 +200,7 @@ def _take_name(new: Path, path: Path, shown: Path) -> None:
     try:
         path.mkdir()
     except FileExistsError as error:
-        raise _exists(shown) from error
+        raise _exists(path) from error
     try:
         new.replace(path)
     except BaseException:
@@ -223,10 +217,10 @@ def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[B
     try:
         if _is_there(path):
             raise _exists(path, option)
-        with anchored(path.parent) as parent, _temporary(parent / path.name, mode) as (new, file):
+        with _temporary(path, mode) as (new, file):
             yield file
             file.flush()
-            _name_file(new, parent / path.name, mode)
+            _name_file(new, path, mode)
     except FileExistsError as error:
         raise _exists(path, option) from error
     except OSError as error:
@@ -268,22 +262,19 @@ def write_new(path: Path, content: bytes, option: str = "--out") -> None:
         file.write(content)
 
 
-def replace_own(path: Path, content: bytes, *, place: Path | None = None) -> None:
+def replace_own(path: Path, content: bytes) -> None:
     """Write a file of ours, in the place of an older one, whole or not at all; sync it.
-
-    `place` leads to its folder where that is held (`anchors`), whatever has its name now.
 
     Raises `UserError` when a link is there or it cannot be written.
     """
-    check_own(path if place is None else place / path.name)
+    check_own(path)
     try:
-        with anchored(place or path.parent) as parent:
-            with _temporary(parent / path.name) as (new, file):
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-                new.replace(parent / path.name)
-            sync_folder(parent)
+        with _temporary(path) as (new, file):
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+            new.replace(path)
+        sync_folder(path.parent)
     except OSError as error:
         raise cannot_write(path, error) from error
 
@@ -295,12 +286,11 @@ def add_to(path: Path, content: bytes, *, new: bool) -> None:
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK | (os.O_EXCL if new else 0)
     try:
-        with anchored(path.parent) as parent:
-            descriptor = os.open(parent / path.name, flags, 0o666)
-            with os.fdopen(descriptor, "ab") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(descriptor)
+        descriptor = os.open(path, flags, 0o666)
+        with os.fdopen(descriptor, "ab") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(descriptor)
     except OSError as error:
         raise cannot_write(path, error) from error
 

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
+from merge_sumo.errors import UserError
+
 Files = dict[str, str | None]
 """SHA-256 by path, relative to the working folder where it lies below; None of a lost file."""
 
@@ -20,6 +22,28 @@ def hashed(paths: Iterable[Path]) -> Files:
         name = path.relative_to(folder) if path.is_relative_to(folder) else path
         files[name.as_posix()] = sha256_of(path)
     return files
+
+
+def files_now(recorded: Files, loaded: Files) -> Files:
+    """Return recorded files with the hashes that they have now, then what is `loaded` besides.
+
+    A name in a record is relative to where it was written, which may be elsewhere: a file that is
+    not there is that of its name among those that are loaded, or beside them.
+    """
+    now: Files = {}
+    for name in recorded:
+        try:
+            now[name] = sha256_of(Path(name))
+        except ValueError as error:
+            raise UserError(f"a record has a file that no file can be named: {error}") from error
+        moved = [other for other in loaded if Path(other).name == Path(name).name]
+        if now[name] is None and moved:
+            now[name] = loaded[moved[0]]
+            loaded = {other: sha256 for other, sha256 in loaded.items() if other != moved[0]}
+        elif now[name] is None:
+            beside = (Path(other).with_name(Path(name).name) for other in loaded)
+            now[name] = next(filter(None, map(sha256_of, beside)), None)
+    return now | loaded
 
 
 def changed(files: Files) -> list[str]:

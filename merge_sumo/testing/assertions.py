@@ -9,6 +9,7 @@ from merge_sumo import api
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.api.keywords import Settings
 from merge_sumo.api.results import CampaignRun
+from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.system.printable import printable, quoted
@@ -79,5 +80,6 @@ def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
         f"    {verdict_of(outcome, run.trajectory(index))}",
         f"    replay it: merge-sumo replay {quoted(run.folder)} {index} --gui",
-        f"    run it again: merge-sumo run --case {quoted(run.folder)} {index}",
+        f"    run it again: merge-sumo run --case {quoted(run.folder)} {index}"
+        f"{named_again(run.settings)}",
     ]

@@ -35,8 +35,6 @@ from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 class VutOptions:
     """How a VUT is hosted; `UserError` for values out of their range."""
 
-    command: str | None = None
-    """Command line of a controller that is a program of its own, else None."""
     deadline_s: float = DEADLINE_S  # time for one step, and for one reset
     connect_s: float = 60.0  # time for a program to start and connect
     in_process: bool = False

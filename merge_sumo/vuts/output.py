@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
-from merge_sumo.system.anchors import anchored
 from merge_sumo.system.printable import printable
 from merge_sumo.values.trajectory import as_reason
 
@@ -89,9 +88,8 @@ def end_of(log: Path) -> str:
 
 def append(log: Path, content: bytes) -> None:
     """Add to a log, from whichever of several processes; OSError when that cannot be done."""
-    with anchored(log.parent) as place:
-        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _CAREFUL
-        descriptor = os.open(place / log.name, flags, 0o644)
+    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _CAREFUL
+    descriptor = os.open(log, flags, 0o644)
     with os.fdopen(descriptor, "r+b", buffering=0) as file:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             return

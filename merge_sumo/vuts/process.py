@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shlex
 import shutil
 import signal
@@ -17,7 +16,6 @@ from merge_sumo.vuts.output import Output
 
 PORT_FIELD: Final = "{port}"
 PORT_VARIABLE: Final = "MERGE_SUMO_PORT"
-TOKEN_VARIABLE: Final = "MERGE_SUMO_TOKEN"  # noqa: S105 (its name)
 GRACE_S: Final = 2.0
 """Time that a program has to end by itself before it is killed."""
 
@@ -27,11 +25,11 @@ def split_command(command: str) -> list[str]:
     try:
         arguments = shlex.split(command)
     except ValueError as error:
-        raise UserError(f"--vut-command cannot be read: {error}") from error
+        raise UserError(f"the command {command!r} cannot be read: {error}") from error
     if not arguments or shutil.which(arguments[0]) is None:
         raise UserError(
-            f"--vut-command {command!r}: there is no program {(arguments or [''])[0]!r}; write it "
-            "as you would in a terminal"
+            f"the command {command!r}: there is no program {(arguments or [''])[0]!r}; write it as "
+            "you would in a terminal"
         )
     return arguments
 
@@ -40,22 +38,20 @@ class Program:
     """A running program in a process group of its own; what it prints goes to a log."""
 
     def __init__(self, arguments: list[str], port: int, log: Path | None = None) -> None:
-        """Start it, told the port as `{port}` in its arguments and by the environment.
-
-        The environment has a token, too, by which a client can show that it is this program's.
-        """
-        self.token = os.environ.get(TOKEN_VARIABLE) or secrets.token_hex(16)
+        """Start it, told the port as `{port}` in its arguments and by the environment."""
         try:
             self._process = subprocess.Popen(
                 [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, PORT_VARIABLE: str(port), TOKEN_VARIABLE: self.token},
+                env={**os.environ, PORT_VARIABLE: str(port)},
                 start_new_session=True,
             )
         except OSError as error:
-            raise UserError(f"--vut-command cannot be started: {error.strerror}") from error
+            raise UserError(
+                f"the command {arguments[0]!r} cannot be started: {error.strerror}"
+            ) from error
         assert self._process.stdout is not None, "piped"  # noqa: S101
         self._output = Output(self._process.stdout, log)
 

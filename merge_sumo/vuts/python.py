@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib
+import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLost
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.system.source_files import module_of_file
+from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, lane_of
 from merge_sumo.vuts.base import (
@@ -389,7 +391,12 @@ def _load_module(name: str) -> ModuleType:
     if folder not in sys.path:
         sys.path.append(folder)
     try:
+        found = importlib.util.find_spec(name.partition(".")[0])
+        if found is not None and found.has_location and found.origin is not None:
+            check_code(Path(found.origin))
         return importlib.import_module(name)
+    except UserError:
+        raise
     except (Exception, SystemExit) as error:
         raise UserError(_cannot_load(name, error)) from error
 

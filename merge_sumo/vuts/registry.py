@@ -22,6 +22,7 @@ from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.system.suggestions import meant
+from merge_sumo.system.trust import check_code
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import Vut, VutOptions, numbers_of, split_options
 from merge_sumo.vuts.fmu import fmu_vut
@@ -31,7 +32,7 @@ from merge_sumo.vuts.onnx import onnx_vut
 from merge_sumo.vuts.parameters import Range, spec_with, unknown_parameter
 from merge_sumo.vuts.python import installed_vut, installed_vuts, python_vut
 from merge_sumo.vuts.sumo_model import sumo_vut
-from merge_sumo.vuts.traci.vut import traci_vut
+from merge_sumo.vuts.traci.vut import is_port, traci_vut
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -48,8 +49,8 @@ class VutKind:
     """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
     own_code: bool = True
     """Whether to test it is to run code that is neither of this package nor of SUMO."""
-    by_command: bool = False
-    """Whether it is a program that `--vut-command` starts; without, a person does."""
+    waits: Callable[[str], bool] = lambda _: False
+    """Returns whether the controller of an argument is a program that a person starts."""
     file_of: Callable[[str], str] = lambda _: ""
     """Returns the file that an argument names; "" for none."""
     no_pov: str = ""  # why it cannot drive a POV; "" where it can
@@ -141,11 +142,12 @@ KINDS: Final[Registry[VutKind]] = Registry(
     "kind of VUT",
     {
         "traci": VutKind(
-            form="traci[:PORT]",
-            what="a program in any language that drives `vut` by TraCI, started by --vut-command",
-            example='--vut traci --vut-command "python my_controller.py {port}"',
+            form="traci:COMMAND or traci[:PORT]",
+            what="a program in any language that drives `vut` by TraCI; started by you where no "
+            "command is given",
+            example='--vut "traci:python my_controller.py {port}"',
             prepare=traci_vut,
-            by_command=True,
+            waits=is_port,
             no_parameters="a TraCI client is a program with parameters of its own",
             no_pov=(
                 "a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
@@ -258,15 +260,22 @@ def kind_of(spec: str) -> VutKind:
     return PYTHON if colon else INSTALLED
 
 
-def runs_code(spec: str, command: str | None) -> bool:
+def runs_code(spec: str) -> bool:
     """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
-    kind = kind_of(spec)
-    return kind.own_code and not (kind.by_command and command is None)
+    return kind_of(spec).own_code and not waits_for_client(spec)
 
 
-def waits_for_client(spec: str, command: str | None) -> bool:
+def names_code(spec: str) -> bool:
+    """Return whether who writes a spec says which code of a user's is run.
+
+    An object of this process was put there by who runs it.
+    """
+    return runs_code(spec) and object_of(spec) is None
+
+
+def waits_for_client(spec: str) -> bool:
     """Return whether a person starts the VUT's program, which then cannot be begun anew."""
-    return kind_of(spec).by_command and command is None
+    return kind_of(spec).waits(_argument(spec))
 
 
 def file_named(spec: str) -> str:
@@ -327,10 +336,10 @@ def find_vut(spec: str, options: VutOptions) -> Vut:
     Raises `UserError` for an unknown name, and for a VUT that cannot be loaded.
     """
     kind = kind_of(spec)
-    if options.command is not None and not kind.by_command:
-        raise UserError(f"--vut-command goes with --vut traci, not with {spec}")
     if kind is INSTALLED and spec.partition("?")[0] not in installed_vuts():
         raise UserError(_why_unknown(spec))
+    if file := file_named(spec):
+        check_code(Path(file))
     if kind.hosted and not options.in_process and SUPPORTED:
         # Facts of a Python controller do not depend on the values of its parameters.
         alike = _without_values(spec) if kind in (PYTHON, INSTALLED) else spec

@@ -84,16 +84,12 @@ class TestAVutFile:
         code, _, err = call("campaign", "--vut", f"{'x' * 250}.py:drive", *options)
         assert code == 0, err
 
-    @pytest.mark.parametrize("given", ["--vut", "--vut-command"])
-    def test_with_a_name_that_is_no_text_is_refused_before_it_is_loaded(
-        self, call, tmp_path, given
-    ):
+    @pytest.mark.parametrize("vut", [f"{NOT_UTF8}.py:drive", f"traci:{NOT_UTF8} {{port}}"])
+    def test_with_a_name_that_is_no_text_is_refused_before_it_is_loaded(self, call, tmp_path, vut):
         (tmp_path / f"{NOT_UTF8}.py").write_text("raise SystemExit('it was loaded')")
-        vut = f"{NOT_UTF8}.py:drive" if given == "--vut" else "traci"
-        options = () if given == "--vut" else ("--vut-command", f"{NOT_UTF8} {{port}}")
         assert_refused(
-            call("campaign", "--vut", vut, *options, "--cases", 2),
-            f"merge-sumo: {given} is ",
+            call("campaign", "--vut", vut, "--cases", 2),
+            "merge-sumo: --vut is ",
             "it is not UTF-8",
         )
         assert [path.suffix for path in tmp_path.iterdir()] == [".py"]

@@ -128,14 +128,14 @@ class TestBytes:
         shutil.rmtree(Path("run") / TRAJECTORIES)
         (Path("run") / TRAJECTORIES).mkdir()
         (Path("run") / OUTCOMES).write_bytes(b"")
-        resume_campaign(Path("run"), trust=True)
+        resume_campaign(Path("run"))
         assert lines(Path("run")) == whole
 
     def test_are_the_same_after_a_torn_line_of_the_old_version(self, whole):
         shutil.copytree("whole", "run")
         for folder in (Path("run"), Path("run") / AGAINST):
             (folder / OUTCOMES).write_bytes((folder / OUTCOMES).read_bytes()[:-30])
-        resume_campaign(Path("run"), trust=True)
+        resume_campaign(Path("run"))
         assert lines(Path("run")) == whole
 
 
@@ -155,7 +155,7 @@ class TestRefuses:
         [
             ({"in_flight": 4}, "--in-flight does not go with --against"),
             ({"learn_from": ("run",)}, "--learn-from does not go with --against"),
-            ({"against": "traci"}, "name an earlier version that needs no command"),
+            ({"against": "traci"}, "name an earlier version that needs none"),
             ({"against": "new.py:f"}, "name two versions"),
         ],
     )

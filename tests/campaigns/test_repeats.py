@@ -21,7 +21,7 @@ from merge_sumo.campaigns.repeats import (
     spread_places,
     unrepeatable,
 )
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.settings import CampaignSettings, controllers
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
@@ -173,7 +173,9 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     checked = CliRunner().invoke(cli.app, ["check-vut", spec])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
-    again = rerun(RunStudy(run, today := settings_today(run, trust=True), resolve(today)))
+    again = rerun(
+        RunStudy(run, today := settings_today(run, controllers(run.settings)), resolve(today))
+    )
     assert again.unrepeated
     assert "no file of the VUT has changed" in str(again)
 
@@ -222,7 +224,7 @@ def Vut(seen):
 def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
     settings = campaign_settings(vut="traci")
     assert chosen_again(run.outcomes, settings) == []
-    started = campaign_settings(vut="traci", vut_command="python3 client.py {port}")
+    started = campaign_settings(vut="traci:python3 client.py {port}")
     assert len(chosen_again(run.outcomes, started)) == 8
 
 
@@ -237,7 +239,7 @@ def test_a_campaign_that_went_on_says_the_same_as_one_that_never_stopped(vut, tm
     whole = campaign(spec, tmp_path / "whole", cases=40, batch=10)
     folder = tmp_path / "run"
     campaign(spec, folder, cases=20, batch=10)
-    resume_campaign(folder, given={"cases": 40}, trust=True)
+    resume_campaign(folder, given={"cases": 40})
     assert (folder / REPEATS).read_bytes() == (whole.folder / REPEATS).read_bytes()
 
 

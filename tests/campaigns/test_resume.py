@@ -202,17 +202,6 @@ class TestWhatDiffers:
             resume_campaign(folder)
         assert contents(folder) == before
 
-    def test_is_recorded_when_it_is_forced(self, whole, folder):
-        edit(folder, ("versions", "numpy"), "1.0")
-        resume_campaign(folder, force=True)
-        assert outcomes(folder) == outcomes(whole)
-        record = json.loads((folder / SETTINGS).read_text())
-        now = json.loads((whole / SETTINGS).read_text())["versions"]["numpy"]
-        (forced,) = record["forced"]
-        assert forced == {"from_case": 16, "differs": {"versions.numpy": ["1.0", now]}}
-        assert record["versions"]["numpy"] == now
-        resume_campaign(folder)  # it is settled
-
     def test_may_be_a_larger_number_of_cases(self, whole, tmp_path):
         longer = Path(shutil.copytree(whole, tmp_path / "run"))
         run = resume_campaign(longer, given={"cases": 36})
@@ -267,10 +256,10 @@ class TestTwoProcessesOnOneFolder:
     def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path, monkeypatch):
         take_name = folders._take_name
 
-        def overtaken(new: Path, path: Path, shown: Path) -> None:
+        def overtaken(new: Path, path: Path) -> None:
             monkeypatch.setattr(folders, "_take_name", take_name)
-            Journal.create(shown, {"first": True})
-            take_name(new, path, shown)
+            Journal.create(path, {"first": True})
+            take_name(new, path)
 
         monkeypatch.setattr(folders, "_take_name", overtaken)
         with pytest.raises(UserError, match="run exists"):
@@ -430,15 +419,6 @@ class TestFromAnotherFolder:
         (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 0.5\n")
         with pytest.raises(UserError, match=r"vut_files\.my_vut\.py differs"):
             resume_campaign(folder)
-
-    def test_says_where_to_go_for_one_beside_which_it_was_begun(self, begun, monkeypatch):
-        folder = begun("my_vut.py:drive")
-        before = contents(folder)
-        with pytest.raises(UserError, match=r"was begun where my_vut\.py is"):
-            resume_campaign(folder)
-        assert contents(folder) == before
-        monkeypatch.chdir(folder.parent)
-        assert len(resume_campaign(folder).outcomes) == 28
 
 
 @pytest.mark.long

@@ -232,14 +232,13 @@ class TestEveryKindOfVut:
     @pytest.mark.slow
     def test_behind_traci(self, tmp_path):
         pytest.importorskip("traci")
-        assert_sees_late(factory("traci", command=program(tmp_path, TRACI_LAW)))
+        assert_sees_late(factory("traci:" + program(tmp_path, TRACI_LAW)))
 
     @pytest.mark.slow
     def test_behind_traci_no_car_is_shown_where_there_is_no_road(self, tmp_path):
         command = program(tmp_path, TRACI_LAW)
         ran = ms.run_case(
-            "traci",
-            vut_command=command,
+            f"traci:{command}",
             x_pov0_m=-250.0,
             v_pov0_mps=29.0,
             sense="occluded_until_m=-60",

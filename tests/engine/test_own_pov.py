@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -467,57 +466,6 @@ class TestResuming:
         other = pov(YIELDS, "other.py")
         with pytest.raises(UserError, match="pov differs"):
             resume_campaign(stopped, given={"pov": other})
-
-    def test_with_force_takes_a_pov_that_was_not_there(self, call, tmp_path):
-        values: dict[str, Any] = {**SMALL, "levels": (0,)}
-        folder = run_campaign(
-            CampaignSettings(**{"scenario": US23, **values}), tmp_path / "run"
-        ).folder
-        pov(YIELDS)
-        forced = ("campaign", "--resume", folder, "--pov", "my_pov.py:Pov", "--level", "own")
-        assert call(*forced)[0] == 2
-        assert call(*forced, "--cases", 24, "--force", "-q")[0] == 0
-        assert [o.case.level for o in Run(folder).outcomes][18:] == [OWN] * 6
-
-
-TELLTALE = """
-import pathlib
-pathlib.Path(__file__).with_name("it-ran").touch()
-def Pov(seen):
-    return 0.0
-"""
-
-
-class TestTrust:
-    @pytest.fixture
-    def theirs(self, tmp_path, monkeypatch) -> Path:
-        """Return a campaign with a POV that somebody sent; nobody here has its key."""
-        few = settings(pov(TELLTALE), cases=4, batch=2)
-        folder = run_campaign(few, tmp_path / "run").folder
-        Path("it-ran").unlink()
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
-        return folder
-
-    def test_the_pov_of_a_received_folder_is_not_run(self, theirs, call, tmp_path):
-        shutil.copytree(theirs, tmp_path / "copy")
-        for command in (
-            ("campaign", "--resume", theirs),
-            ("campaign", "--resume", theirs, "--vut", "design2"),
-            ("probability", theirs, "--cases", 4, "--out", tmp_path / "p.json"),
-            ("failures-per-merge", theirs, "--traffic", "exid-5", "--out", tmp_path / "f.json"),
-        ):
-            assert_refused(call(*command), "my_pov.py:Pov: say --trust-vut")
-        assert call("report", theirs)[0] == 0
-        assert call("export", theirs, 0)[0] == 0
-        assert call("compare-runs", theirs, tmp_path / "copy", "--no-rerun")[0] == 0
-        assert not Path("it-ran").exists()
-
-    def test_a_person_may_trust_it_or_name_it_again(self, theirs):
-        resume_campaign(theirs, trust=True)
-        assert Path("it-ran").exists()
-        Path("it-ran").unlink()
-        resume_campaign(theirs, given={"pov": "my_pov.py:Pov"})
-        assert Path("it-ran").exists()
 
 
 class TestOtherCommands:

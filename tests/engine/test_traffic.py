@@ -291,7 +291,7 @@ class TestARunInTraffic:
         )
         scenario = replace(TRAFFIC, pov_length_m=6.0, vut_length_m=4.0)
         command = f"{sys.executable} {script} {{port}}"
-        trajectories = run("traci", cases_of(0, 2, scenario), command=command)
+        trajectories = run(f"traci:{command}", cases_of(0, 2, scenario))
         assert [t.error for t in trajectories] == [None, None]
         assert [t.end for t in trajectories] == [End.MERGED] * 2
 

@@ -16,7 +16,7 @@ from plans import plan_for
 
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
@@ -46,7 +46,7 @@ LONG = pytest.mark.long
 
 
 def avoidance_of(run, workers=None, **other):
-    settings = settings_of(run.folder, run.settings, trust=True)
+    settings = settings_of(run.folder, run.settings, controllers(run.settings))
     return avoidance(run, resolve(settings), workers=workers, **other)
 
 
@@ -249,6 +249,14 @@ class TestTheFile:
         path.write_text("\n".join(lines) + "\n")
         with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
             read_avoidance(Run(folder))
+
+    def test_of_an_older_version_is_read(self, folder, found):
+        write_avoidance(folder, found)
+        path = folder / AVOIDANCE
+        path.write_text(path.read_text().replace("latest_takeover_s", "careful_until_s"))
+        # In that version another driver took over.
+        without = [replace(one, latest_takeover_s=None) for one in found]
+        assert list(read_avoidance(Run(folder)).values()) == without
 
     def test_has_no_failure_twice(self, folder, found):
         write_avoidance(folder, [found[0], found[0]])

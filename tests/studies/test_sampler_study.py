@@ -62,7 +62,6 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
         {"level": 1},
         {"cases": 301},
         {"seed": 1},
-        {"vut_command": "./controller"},
         {"deadline_s": 1.0},
     ],
 )
@@ -134,11 +133,11 @@ def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_na
     controller = tmp_path / "controller.py"
     shutil.copy(Path(__file__).parents[1] / "support" / "raw_traci.py", controller)
     command = f"{shlex.quote(sys.executable)} {shlex.quote(str(controller))} {{port}}"
-    assert truth_of("traci", tmp_path / "cache", command=command) == 4
-    assert truth_of("traci", tmp_path / "cache", command=command) == 0
-    assert truth_of("traci", tmp_path / "cache", command=command + " ") == 4
+    assert truth_of(f"traci:{command}", tmp_path / "cache") == 4
+    assert truth_of(f"traci:{command}", tmp_path / "cache") == 0
+    assert truth_of(f"traci:{command} ", tmp_path / "cache") == 4
     controller.write_text(controller.read_text() + "# changed")
-    assert truth_of("traci", tmp_path / "cache", command=command) == 4
+    assert truth_of(f"traci:{command}", tmp_path / "cache") == 4
 
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import controllers
 from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.versions import Change, ComparedCase, compare_runs, rerun, settings_today
@@ -101,7 +102,7 @@ def test_campaigns_with_repeats_compare_case_by_case(campaigns):
     a, b = campaigns
     assert [len(run.outcomes) for run in (a, b)] == [60, 60]
     assert [len(run.cases) for run in (a, b)] == [6, 6]
-    found = compare_runs(a, b, trust=True)
+    found = compare_runs(a, b, given=(controllers(a.settings), controllers(b.settings)))
     assert "was run again" in found.evidence
     telling = sum(outcome.failed for run in (a, b) for outcome in run.cases)
     assert len(found.cases) == telling
@@ -114,7 +115,7 @@ def test_campaigns_with_repeats_compare_case_by_case(campaigns):
 
 def test_a_rerun_of_repeats_is_judged_by_case(campaigns):
     run = campaigns[0]
-    today = settings_today(run, trust=True)
+    today = settings_today(run, controllers(run.settings))
     again = rerun(RunStudy(run, today, resolve(today)))
     assert again.changed == []
     assert [outcome.case for outcome in again.after] == [outcome.case for outcome in run.outcomes]

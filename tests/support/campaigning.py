@@ -8,7 +8,7 @@ from typing import Any
 
 from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.campaigns.store import Run, read_settings
 from merge_sumo.values.scenario import US23
 
@@ -22,12 +22,9 @@ def run_campaign(settings: CampaignSettings, folder: Path, **other: Any) -> Run:
     return campaign.run_campaign(settings, resolve(settings), folder, **other)
 
 
-def resume_campaign(
-    folder: Path,
-    given: Mapping[str, object] | None = None,
-    *,
-    trust: bool = False,
-    **other: Any,
-) -> Run:
-    settings = settings_of(folder, read_settings(folder), given, trust=trust, goes_on=True)
+def resume_campaign(folder: Path, given: Mapping[str, object] | None = None, **other: Any) -> Run:
+    """Go on with a campaign, with its controllers named again as they were."""
+    recorded = read_settings(folder)
+    named = {**controllers(recorded), **(given or {})}
+    settings = settings_of(folder, recorded, named, goes_on=True)
     return campaign.resume_campaign(settings, resolve(settings), folder, **other)

@@ -42,7 +42,6 @@ def key_of(*, level: int = 0, cases: int = 300, seed: int = 0, **changes: Any) -
     """Return what a truth of design1 is kept under, with some of it changed."""
     values: dict[str, Any] = {
         "vut": "design1",
-        "vut_command": None,
         "deadline_s": 5.0,
         "pov": None,
         "policies_sha256": policies_sha256(policies_of(US23)),

@@ -30,7 +30,6 @@ from merge_sumo.sumo.shadow_sumo import (
     _edges,
     write_files,
 )
-from merge_sumo.system.landlock import lock_in
 from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.session import Session
@@ -122,14 +121,13 @@ def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
         port = server.getsockname()[1]
     files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
     program = sumo_program("sumo")
-    read = [Path(program).parents[2], Path("/usr"), Path("/lib"), Path("/lib64"), Path("/etc")]
     process = subprocess.Popen(
         [program, *files, *SUMO_OPTIONS, "--remote-port", str(port)],
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        preexec_fn=lambda: lock_in([folder], read, ports=True),  # noqa: PLW1509
+        cwd=folder,
     )
     try:
         with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):

@@ -300,8 +300,6 @@ def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
     for deadline in (0.0, -1.0, float("nan")):
         with pytest.raises(UserError, match="--deadline is"):
             in_process("level0", deadline_s=deadline)
-    with pytest.raises(UserError, match="--vut-command goes with --vut traci"):
-        in_process("level0", command="python x.py")
 
 
 def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):

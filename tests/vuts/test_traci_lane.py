@@ -39,7 +39,7 @@ ON_LANE = (
 def drive(tmp_path, source, *, cases=2, **options):
     """Return what became of some cases with a stock client on the lane."""
     command = program(tmp_path, STOCK_CLIENT + source + "\ntraci.close()\n")
-    vut = factory("traci", command=command, deadline_s=20.0, **options)
+    vut = factory("traci:" + command, deadline_s=20.0, **options)
     return run_on(vut, LANE, 0, cases, corridors=1)
 
 
@@ -109,7 +109,7 @@ def test_the_gap_that_a_controller_chooses_by_neighbours_is_the_one_it_gets(tmp_
 def test_the_controller_of_the_tutorial_merges_into_a_gap(tmp_path):
     page = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text("utf-8")
     _, source = re.findall(r"```python\n(import sys, traci.*?)```", page, flags=re.DOTALL)
-    vut = factory("traci", command=program(tmp_path, source), deadline_s=20.0)
+    vut = factory("traci:" + program(tmp_path, source), deadline_s=20.0)
     *_, behind_the_pov = run_on(vut, LANE, 0, 4, corridors=1)
     assert behind_the_pov.error is None
     assert -60.0 < behind_the_pov.x_vut_m[-1] < 20.0

@@ -1,14 +1,12 @@
 """The port at which TraCI clients connect: the controller's are served, and no others.
 
 On Linux the kernel says to which user and process the other end of a connection on this machine
-belongs. Elsewhere that cannot be known, and a token decides alone where one is asked for.
+belongs. Elsewhere that cannot be known, and whoever comes first is served.
 """
 
 from __future__ import annotations
 
-import hmac
 import os
-import selectors
 import socket
 import struct
 import sys
@@ -18,39 +16,22 @@ from ipaddress import ip_address
 from itertools import chain
 from pathlib import Path
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.vuts.process import TOKEN_VARIABLE
-from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.protocol import ProtocolError, Reader
 
 HOST: Final = "127.0.0.1"
 BACKLOG: Final = 128
 KNOWN_HERE: Final = sys.platform == "linux"
 """Whether the system says whose a connection is."""
-TOKEN_KEY: Final = "merge-sumo.token"  # noqa: S105 (its name)
-"""`traci.simulation.setParameter("", "merge-sumo.token", TOKEN)` gives it."""
-MOST_BYTES: Final = 4096
-"""What a connection may send before it has given the token."""
-MOST_STRANGERS: Final = 16
-"""Connections that may still give a token; the oldest goes where more come."""
-STRANGER_S: Final = 10.0
-"""Time in which a connection has to give it."""
-
-
-class Peer(NamedTuple):
-    """The process whose connections are served."""
-
-    program: int | None
-    """Its id; None for all processes of this user."""
-    token: str | None
-    """What shows that another connection is to be served, too; without a program, what every one
-    has to give."""
 
 
 class Door:
-    """A listening socket on the loopback interface, and connections that may give a token."""
+    """A listening socket on the loopback interface.
+
+    The `peer` of its methods is the process that is served, with those that it has started; None
+    is any process of this user.
+    """
 
     def __init__(self, port: int, note: Callable[[str], None]) -> None:
         """Listen on a port, 0 for any; `note` is told in a sentence of each refused connection.
@@ -69,9 +50,6 @@ class Door:
                 "--vut traci:PORT"
             ) from error
         self._note = note
-        self._strangers: dict[Stranger, float] = {}
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listener, selectors.EVENT_READ)
         self.refused = ""
         """Whose connections were refused last."""
 
@@ -80,20 +58,26 @@ class Door:
         """Number of the port."""
         return int(self._listener.getsockname()[1])
 
-    def accept(self, peer: Peer, patience_s: float) -> socket.socket | None:
+    def accept(self, peer: int | None, patience_s: float) -> socket.socket | None:
         """Return a connection that is to be served; None where none came within `patience_s`."""
         until = monotonic() + patience_s
-        while True:
-            for key, _ in self._selector.select(max(until - monotonic(), 0.0)):
-                is_new = key.fileobj is self._listener
-                connection = self._next(peer) if is_new else self._proved(key.data)
-                if connection is not None:
-                    return connection
-            self._drop(lambda since_s: monotonic() - since_s > STRANGER_S)
-            if monotonic() >= until:
-                return None
+        while (left_s := until - monotonic()) > 0.0:
+            self._listener.settimeout(left_s)
+            try:
+                connection = self._listener.accept()[0]
+            except OSError:
+                continue
+            refusal = _refusal(connection, peer)
+            if refusal is None:
+                connection.settimeout(None)
+                return connection
+            connection.close()
+            if refusal:
+                self.refused = f"{refusal} did"
+                self._note(f"{refusal} connected to the port of the controller and was not served")
+        return None
 
-    def another_waits(self, peer: Peer) -> bool:
+    def another_waits(self, peer: int | None) -> bool:
         """Return whether a client that would be served has connected besides the one that is."""
         with suppress(OSError):
             self._listener.settimeout(0.0)
@@ -105,64 +89,12 @@ class Door:
         return False
 
     def close(self) -> None:
-        """Close it, and the connections that wait at it."""
-        self._drop(lambda _: True)
-        self._selector.close()
+        """Close it."""
         self._listener.close()
 
-    def _next(self, peer: Peer) -> socket.socket | None:
-        """Take the next connection; return it where it is to be served as it is."""
-        try:
-            self._listener.settimeout(0.0)
-            connection = self._listener.accept()[0]
-        except OSError:
-            return None
-        connection.settimeout(None)
-        refusal = _refusal(connection, peer)
-        if refusal is None:
-            return connection
-        if refusal:
-            self.refused = f"{refusal} did"
-            self._note(
-                f"{refusal} connected to the port of the controller and was not served; a client "
-                f"in another place gives the token in {TOKEN_VARIABLE}"
-            )
-        if peer.token is None:
-            connection.close()
-            return None
-        if len(self._strangers) >= MOST_STRANGERS:
-            oldest = min(self._strangers.values())
-            self._drop(lambda since_s: since_s == oldest)
-        stranger = Stranger(connection, peer.token)
-        self._strangers[stranger] = monotonic()
-        self._selector.register(connection, selectors.EVENT_READ, stranger)
-        return None
 
-    def _proved(self, stranger: Stranger) -> socket.socket | None:
-        """Read what a connection sends; return it where it has given the token."""
-        proved = stranger.gives_token() if stranger in self._strangers else None
-        if proved is None:
-            return None
-        del self._strangers[stranger]
-        self._selector.unregister(stranger.connection)
-        if proved:
-            return stranger.connection
-        stranger.connection.close()
-        return None
-
-    def _drop(self, due: Callable[[float], bool]) -> None:
-        """Close the connections without token whose time of coming is due."""
-        for stranger, since_s in list(self._strangers.items()):
-            if due(since_s):
-                del self._strangers[stranger]
-                self._selector.unregister(stranger.connection)
-                stranger.connection.close()
-
-
-def _refusal(connection: socket.socket, peer: Peer) -> str | None:
-    """Return whose a connection is that is not served as it is; "" if unknown, None if served."""
-    if peer.program is None and peer.token is not None:
-        return ""  # the token decides
+def _refusal(connection: socket.socket, peer: int | None) -> str | None:
+    """Return whose a connection is that is not served; "" if unknown, None if it is served."""
     if not KNOWN_HERE:
         return None
     owner = owner_of(connection)
@@ -171,68 +103,9 @@ def _refusal(connection: socket.socket, peer: Peer) -> str | None:
     user, inode = owner
     if user != os.geteuid():
         return f"a process of the user {user}"
-    if peer.program is not None and not descends(inode, peer.program):
-        return "a process that --vut-command did not start"
+    if peer is not None and not descends(inode, peer):
+        return "a process that the command did not start"
     return None
-
-
-class Stranger:
-    """A connection that may still give the token; what it sends is read as far as it came."""
-
-    def __init__(self, connection: socket.socket, token: str) -> None:
-        connection.setblocking(False)
-        self.connection, self._token = connection, token
-        self._unread, self._received_bytes = bytearray(), 0
-
-    def gives_token(self) -> bool | None:
-        """Return whether it gave the token; None while it may still do so.
-
-        The question for the version and `setOrder` are answered before; all else is not.
-        """
-        try:
-            part = self.connection.recv(MOST_BYTES)
-        except BlockingIOError:
-            return None
-        except OSError:
-            return False
-        self._unread += part
-        self._received_bytes += len(part)
-        if not part or self._received_bytes > MOST_BYTES:
-            return False
-        try:
-            return self._read_messages()
-        except (ProtocolError, OSError):
-            return False
-
-    def _read_messages(self) -> bool | None:
-        while len(self._unread) >= 4:
-            end = 4 + tp.message_length(bytes(self._unread[:4]))
-            if len(self._unread) < end:
-                return None
-            (command, *more) = tp.commands_of(bytes(self._unread[4:end]))
-            del self._unread[:end]
-            proves = command.identifier == tp.SET_SIMULATION
-            if more or (proves and (self._unread or not self._is_token(Reader(command.payload)))):
-                return False
-            if not proves and command.identifier not in (tp.GET_VERSION, tp.SET_ORDER):
-                return False
-            answer = tp.status(command.identifier)
-            if command.identifier == tp.GET_VERSION:
-                answer += tp.version_answer()
-            self.connection.send(tp.message(answer))
-            if proves:
-                self.connection.setblocking(True)
-                return True
-        return None
-
-    def _is_token(self, reader: Reader) -> bool:
-        variable, _ = reader.ubyte(), reader.string()
-        if variable != tp.PARAMETER:
-            return False
-        values = reader.arguments()
-        if len(values) != 2 or values[0] != TOKEN_KEY or not isinstance(values[1], str):
-            return False
-        return hmac.compare_digest(values[1].encode(), self._token.encode())
 
 
 def owner_of(connection: socket.socket) -> tuple[int, int] | None:

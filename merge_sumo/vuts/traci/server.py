@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import math
 import socket
-import sys
-import sysconfig
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -18,11 +16,8 @@ from time import monotonic
 from typing import Any, Final, TypeVar
 
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.child import Channel, channel_of
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, ShadowSumo, State
-from merge_sumo.sumo.traci_names import named
-from merge_sumo.system.landlock import lock_in
 from merge_sumo.system.limits import lower_limits
 from merge_sumo.vuts.process import GRACE_S
 from merge_sumo.vuts.traci import protocol as tp
@@ -32,8 +27,6 @@ from merge_sumo.vuts.traci.session import Session
 
 T = TypeVar("T")
 
-PACKAGE: Final = Path(__file__).resolve().parents[2]
-INSTALLED: Final = ("site-packages", "dist-packages")
 FAREWELL_STEPS: Final = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
 MOST_MEMORY_BYTES: Final = 4 << 30
@@ -65,18 +58,9 @@ def main(settings: Mapping[str, Any]) -> None:
     except UserError as error:
         channel.send({"refused": str(error)})
         return
-    named()  # what the client's commands are called is looked up before files are locked
-    channel.send({"locked": lock_in([folder], _folders_to_read())})
+    channel.send({})
     with suppress(EOFError, OSError):
         _serve(channel, sumo)
-
-
-def _folders_to_read() -> list[Path]:
-    """Return where modules and SUMO's data are, which may be loaded late."""
-    paths = sysconfig.get_paths()
-    modules = {Path(paths[name]) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    modules |= {Path(folder) for folder in sys.path if Path(folder).name in INSTALLED}
-    return [*modules, Path(sumo_program("sumo")).parents[1], PACKAGE]
 
 
 def _serve(channel: Channel, sumo: ShadowSumo) -> None:

@@ -11,7 +11,6 @@ has made it. Between two episodes the road is empty for one step.
 from __future__ import annotations
 
 import math
-import os
 import socket
 import sys
 from collections.abc import Mapping
@@ -31,12 +30,13 @@ from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.child import ChildDiedError, SumoChild
 from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
+from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.vuts.base import Vut, VutOptions
-from merge_sumo.vuts.process import TOKEN_VARIABLE, Program, split_command
+from merge_sumo.vuts.process import Program, split_command
 from merge_sumo.vuts.traci import server
-from merge_sumo.vuts.traci.door import HOST, Door, Peer
+from merge_sumo.vuts.traci.door import HOST, Door
 from merge_sumo.vuts.traci.server import FaultError
 
 DEFAULT_PORT: Final = 8813
@@ -48,21 +48,34 @@ WORK_S: Final = 10.0
 
 
 def traci_vut(argument: str, options: VutOptions) -> Vut:
-    """Return the VUT of `traci` or `traci:PORT`; `UserError` for a port or command that is none."""
-    if argument and not (argument.isdecimal() and 1 <= int(argument) <= 65535):
-        raise UserError(f"--vut traci:{argument}: the port is a number from 1 to 65535")
-    # A command gets its port as an argument: any free one will do, and several can run at a time.
-    port = int(argument) if argument else (0 if options.command else DEFAULT_PORT)
-    command = None if options.command is None else split_command(options.command)
+    """Return the VUT of `traci`, `traci:PORT` or `traci:COMMAND`.
+
+    A command gets its port as an argument: any free one will do, and several can run at a time.
+    Raises `UserError` for a port or a command that is none, and for code that others may write.
+    """
+    command, port = None, 0
+    if is_port(argument):
+        port = int(argument or DEFAULT_PORT)
+        if not 1 <= port <= 65535:
+            raise UserError(f"--vut traci:{argument}: the port is a number from 1 to 65535")
+    else:
+        command = split_command(argument)
+    files = tuple(Path(word) for word in command or () if Path(word).is_file())
+    for file in files:
+        check_code(file)
 
     def make(corridors: int, world: World | None) -> Driver:
         if world is None:
             raise UserError("--vut traci drives in a SUMO world only")
         return TraciVut(corridors, world.road, world.scenario, port, command, options)
 
-    files = tuple(Path(word) for word in command or () if Path(word).is_file())
-    workers = None if port == 0 else 1
+    workers = None if command else 1
     return Vut(make=make, max_corridors=1, max_workers=workers, files=files, named_only=True)
+
+
+def is_port(argument: str) -> bool:
+    """Return whether an argument names the port at which a person's client is waited for."""
+    return not argument or argument.isdecimal()
 
 
 class TraciVut(Driver):
@@ -205,15 +218,14 @@ class TraciVut(Driver):
         text = str(answer["fault"])
         if answer["gone"] and self._program is not None and (ended := self._program.ended(0.5)):
             text += f"; {ended}"
-        if answer["late"] and self._door is not None and self._door.another_waits(self._peer()):
+        if answer["late"] and self._door is not None and self._door.another_waits(self._peer):
             text += "; another client waits, but one at a time is served"
         raise FaultError(text)
 
-    def _peer(self) -> Peer:
-        """Return the process whose connections are served."""
-        if self._program is None:
-            return Peer(None, os.environ.get(TOKEN_VARIABLE) or None)
-        return Peer(self._program.process, self._program.token)
+    @property
+    def _peer(self) -> int | None:
+        """The process whose connections are served; None for all of this user."""
+        return None if self._program is None else self._program.process
 
     def _connect(self) -> None:
         """Wait for a client, with a program started anew if there is a command.
@@ -262,14 +274,14 @@ class TraciVut(Driver):
             late += f" but {refused}"
         if self._command is not None:
             late += (
-                ": --vut-command is told the port as {port} and in MERGE_SUMO_PORT, "
+                ": the command is told the port as {port} and in MERGE_SUMO_PORT, "
                 "for traci.init(PORT) or traci.start(..., port=PORT)"
             )
         return late
 
     def _accept(self, door: Door, patience_s: float) -> socket.socket | None:
         """Return the connection to serve; None when none comes, or the program has ended."""
-        until, peer = monotonic() + patience_s, self._peer()
+        until, peer = monotonic() + patience_s, self._peer
         while True:
             # A program that ended will not connect any more, which is checked in between.
             connection = door.accept(peer, max(min(0.1, until - monotonic()), 0.001))

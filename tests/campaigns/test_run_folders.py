@@ -1,0 +1,220 @@
+"""A run folder is data: it may come from anywhere, and never says which code is run."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+from calling import Said, assert_refused
+from campaigning import campaign_settings, run_campaign
+from conftest import require
+
+from merge_sumo.campaigns.settings import named_again
+from merge_sumo.campaigns.store import OUTCOMES, Run, read_settings
+from merge_sumo.errors import UserError
+from merge_sumo.system.hashing import files_now
+from merge_sumo.vuts.registry import VutFactory, names_code
+
+VUT = """
+import pathlib
+from helper import GAIN
+pathlib.Path(__file__).with_name("it-ran").touch()
+def Vut(seen):
+    return GAIN
+"""
+SPEC = "my_vut.py:Vut"
+FEW: Final[dict[str, Any]] = {
+    "vut": SPEC,
+    "batch": 6,
+    "sampler": "uniform",
+    "seed": 1,
+    "fail_when": "t_end_s > 2",
+}
+"""Settings of a campaign in which every case fails."""
+Call = Callable[..., Said]
+
+
+def project(folder: Path) -> Path:
+    """Make a folder with a VUT that leaves a file where it is loaded."""
+    folder.mkdir()
+    (folder / "my_vut.py").write_text(VUT)
+    (folder / "helper.py").write_text("GAIN = 1.0\n")
+    return folder
+
+
+def ran(folder: Path) -> bool:
+    """Return whether the VUT was loaded since this was asked last."""
+    found = (folder / "it-ran").exists()
+    (folder / "it-ran").unlink(missing_ok=True)
+    return found
+
+
+@pytest.fixture
+def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a project in which a campaign has run, of 6 of 12 cases."""
+    folder = project(tmp_path / "mine")
+    monkeypatch.chdir(folder)
+    run_campaign(campaign_settings(**FEW, cases=6), Path("run"))
+    assert ran(folder)
+    return folder
+
+
+def verbs(run: Path, out: Path) -> list[tuple[object, ...]]:
+    """Return the commands that drive by the controller of a recorded campaign."""
+    return [
+        ("campaign", "--resume", run, "--cases", 12, "-q"),
+        ("run", "--case", run, 0),
+        ("rerun", run, 0, "-q"),
+        ("explain", run, "-q"),
+        ("probability", run, "--cases", 10, "--out", out / "p.json", "-q"),
+        ("repair", run, "--param", "gain=0..2", "--out", out / "repair", "-q"),
+    ]
+
+
+class TestARunFolder:
+    def test_has_no_code_run_by_any_command(
+        self, mine: Path, tmp_path: Path, command_line: Call
+    ) -> None:
+        for command in verbs(mine / "run", tmp_path):
+            said = command_line(*command)
+            assert_refused(said, "a run folder names no code to run: name it again, --vut SPEC")
+        for command in (("report", "run"), ("replay", "run", 0)):
+            assert command_line(*command)[0] == 0
+        code, out, _ = command_line("compare-runs", "run", "run")
+        assert code == 0
+        assert "was not run again" in out or "had nothing to run" in out
+        assert not ran(mine)
+
+    @pytest.mark.parametrize("by", ["copied", "moved"])
+    def test_works_elsewhere_with_its_controller_named_again(
+        self,
+        mine: Path,
+        by: str,
+        tmp_path: Path,
+        command_line: Call,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        """As in CI, where another machine has another checkout."""
+        run_campaign(campaign_settings(**FEW, cases=12), Path("whole"))
+        there = project(tmp_path / "there")
+        (shutil.copytree if by == "copied" else shutil.move)(mine / "run", there / "results")
+        monkeypatch.chdir(there)
+        ran(there)
+        assert command_line("run", "--case", "results", 0, "--vut", SPEC)[0] in (0, 1)
+        assert command_line("rerun", "results", 0, "--vut", SPEC, "-q")[0] == 0
+        resume = ("campaign", "--resume", "results", "--vut", SPEC, "--cases", 12, "-q")
+        code, _, err = command_line(*resume)
+        assert code == 0, err
+        assert ran(there)
+        expected = (mine / "whole" / OUTCOMES).read_bytes()
+        assert Path("results", OUTCOMES).read_bytes() == expected
+
+    def test_of_a_controller_of_the_package_names_it(
+        self, tmp_path: Path, command_line: Call
+    ) -> None:
+        for number, vut in enumerate(("design2", "sumo:IDM?tau=1.2")):
+            folder = tmp_path / str(number)
+            run_campaign(campaign_settings(vut=vut, cases=4, batch=2, sampler="uniform"), folder)
+            assert named_again(read_settings(folder)) == ""
+            assert command_line("rerun", folder, 0, "-q")[0] == 0
+
+    def test_has_no_pov_and_no_earlier_version_run(self, mine: Path, command_line: Call) -> None:
+        Path("pov.py").write_text(VUT)
+        of_pov = {"vut": "design2", "pov": "pov.py:Vut", "levels": (3,)}
+        for name, given in (("pov", of_pov), ("against", {"vut": "design2", "against": SPEC})):
+            few = {"cases": 4, "batch": 2, "sampler": "uniform"}
+            run_campaign(campaign_settings(**given, **few), Path(name))
+            ran(mine)
+            assert_refused(command_line("campaign", "--resume", name, "-q"), f"--{name} SPEC")
+            assert not ran(mine)
+
+    @pytest.mark.parametrize("options", [(), ("--gate", "errors")])
+    def test_is_gone_on_with_by_what_is_printed(
+        self, mine: Path, options: tuple[str, ...], command_line: Call
+    ) -> None:
+        given = ("--vut", SPEC, "--level", 0, "--cases", 4, "--sampler", "uniform", "-q")
+        code, out, _ = command_line("campaign", *given, *options, "--out", "new")
+        assert code == 0
+        (again,) = [line for line in out.splitlines() if line.startswith("run it again: ")]
+        assert command_line(*shlex.split(again.partition("merge-sumo ")[2]), "-q")[0] == 0
+
+
+class TestAChangedController:
+    @pytest.mark.parametrize("file", ["my_vut.py", "helper.py"])
+    def test_begins_a_new_campaign_and_is_noticed(
+        self, mine: Path, file: str, command_line: Call
+    ) -> None:
+        before = (mine / "run" / OUTCOMES).read_bytes()
+        (mine / file).write_text((mine / file).read_text() + "# changed\n")
+        said = command_line("campaign", "--resume", "run", "--vut", SPEC, "--cases", 12, "-q")
+        assert_refused(said, f"vut_files.{file} differs", "or begin a new campaign")
+        assert (mine / "run" / OUTCOMES).read_bytes() == before
+        _, _, err = command_line("run", "--case", "run", 0, "--vut", SPEC)
+        assert f"note: {file} is not as it was in run" in err
+        code, _, err = command_line("rerun", "run", 0, "--vut", SPEC, "-q")
+        assert (code, err) == (0, "")
+
+    def test_is_known_by_its_files_wherever_they_are(self, mine: Path, tmp_path: Path) -> None:
+        recorded = Run(mine / "run").settings["vut_files"]
+        assert set(recorded) == {"my_vut.py", "helper.py"}
+        there = project(tmp_path / "there")
+        loaded = {str(there / "my_vut.py"): recorded["my_vut.py"]}
+        os.chdir(tmp_path)
+        assert files_now(recorded, loaded) == recorded
+        (there / "helper.py").unlink()
+        assert files_now(recorded, loaded) == {**recorded, "helper.py": None}
+
+
+class TestCodeThatOthersMayWrite:
+    @pytest.mark.parametrize("what", ["my_vut.py", "."])
+    def test_is_not_run(self, mine: Path, what: str, command_line: Call) -> None:
+        (mine / what).chmod(0o777)
+        for vut in (SPEC, "my_vut:Vut", f"traci:{sys.executable} my_vut.py {{port}}"):
+            said = command_line("campaign", "--vut", vut, "--cases", 2, "-q")
+            assert_refused(said, "my_vut.py is not run: others can write", "chmod go-w")
+        assert not ran(mine)
+
+    def test_behind_a_link_is_not_run(self, mine: Path, tmp_path: Path) -> None:
+        theirs = project(tmp_path / "theirs")
+        theirs.chmod(0o777)
+        (mine / "link.py").symlink_to(theirs / "my_vut.py")
+        with pytest.raises(UserError, match=r"link\.py is not run"):
+            VutFactory("link.py:Vut")
+        assert not ran(theirs)
+
+    def test_in_a_folder_in_which_each_has_his_own_files_is_run(self, mine: Path) -> None:
+        mine.chmod(0o1777)
+        assert VutFactory(SPEC).files
+
+    def test_of_another_user_is_not_run(self, mine: Path) -> None:
+        require(os.geteuid() == 0, "needs root to give a file away")
+        os.chown(mine / "my_vut.py", 12345, 12345)
+        with pytest.raises(UserError, match=r"my_vut\.py belongs to the user 12345"):
+            VutFactory(SPEC)
+        assert not ran(mine)
+
+
+@pytest.mark.parametrize(
+    ("spec", "code"),
+    [
+        ("design2?a_brake_mps2=-4", False),
+        ("sumo:IDM", False),
+        ("traci", False),
+        ("traci:8813", False),
+        ("traci:python my.py {port}", True),
+        ("my_vut.py:Vut", True),
+        ("package.module:Vut", True),
+        ("installed", True),
+        ("onnx:policy.onnx", True),
+        ("fmu:unit.fmu", True),
+        ("here:Object", True),
+    ],
+)
+def test_what_names_code(spec: str, code: bool) -> None:
+    assert names_code(spec) == code
