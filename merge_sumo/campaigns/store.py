@@ -16,7 +16,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -50,9 +49,6 @@ OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
 NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
-_FORMER: Final = {"collision": PAPER_CRITERION.fail_when}
-_FORMER_NAME: Final = re.compile(r"\bgap_m\b")
-"""What release 0.1 called the paper's criterion, and the measure `bumper_gap_m`."""
 RAN_AGAIN: Final = "ran_again"
 """Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
 FILES: Final = ("vut_files", "pov_files")
@@ -278,7 +274,7 @@ def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
     require = settings.get("require")
     if not (require is None or isinstance(require, str)):
         raise UserError(f"{path} has something else than a formula as require")
-    return Criterion(_FORMER_NAME.sub("bumper_gap_m", _FORMER.get(fail_when, fail_when)), require)
+    return Criterion(fail_when, require)
 
 
 def _absent_packages(settings: Mapping[str, Any]) -> str:

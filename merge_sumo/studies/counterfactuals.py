@@ -146,15 +146,7 @@ def read_avoidance(run: Run) -> dict[int, Avoidance]:
     Empty where it says nothing. Raises `UserError` for a line that is not of one of its failures.
     """
     failing = {outcome.index for outcome in run.cases if outcome.failed}
-    return read_indexed(run.folder / AVOIDANCE, Avoidance, failing, _upgrade_from_0_1)
-
-
-def _upgrade_from_0_1(record: dict[str, Any]) -> dict[str, Any]:
-    # Another driver took over in that release, so the time says nothing of this one.
-    if "careful_until_s" in record:
-        record["latest_takeover_s"] = None
-        del record["careful_until_s"]
-    return record
+    return read_indexed(run.folder / AVOIDANCE, Avoidance, failing)
 
 
 # The failures of a campaign.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Container, Sequence
 from dataclasses import is_dataclass
 from enum import Enum
 from functools import cache
@@ -137,16 +137,13 @@ def check_fields(value: Any) -> None:
             raise RecordError(_not_a_value(name, known, hint, str(error))) from error
 
 
-def read_indexed(
-    path: Path, kind: type[T], indices: Container[int], upgrade: Callable[[Any], Any] = lambda r: r
-) -> dict[int, T]:
+def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
     """Return the lines of a JSON-lines file by their `index`; nothing without the file.
 
     Args:
         path: the file.
         kind: a dataclass with an `index`.
         indices: the indices that lines may have, each at most once.
-        upgrade: gives the record of an older version the fields of today.
 
     Raises:
         RecordError: with the number of a line that is something else.
@@ -160,7 +157,7 @@ def read_indexed(
     values: dict[int, T] = {}
     for number, line in enumerate(lines, start=1):
         try:
-            value: Any = convert(upgrade(decode(line, dict[str, Any])), kind)
+            value: Any = convert(decode(line, dict[str, Any]), kind)
             if value.index not in indices or value.index in values:
                 raise RecordError(f"index is {value.index}")
         except UserError as error:

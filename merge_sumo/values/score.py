@@ -38,7 +38,6 @@ from merge_sumo.values.merge import (
     on_lane,
     place_of_merge_m,
 )
-from merge_sumo.values.migration import upgrade_from_0_1
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import (
     DT_S,
@@ -250,10 +249,7 @@ class Outcome:
     def from_json(cls, line: bytes | str, scenario: Scenario) -> Outcome:
         """Return the outcome of a line of `outcomes.jsonl`; `UserError` where it is none."""
         case_names, measure_names, flat = record_fields(scenario)
-        record = decode(line)
-        if isinstance(record, dict) and "severity" not in record:
-            upgrade_from_0_1(record, scenario)
-        known = convert(record, flat)
+        known = convert(decode(line), flat)
         coordinates = {name: getattr(known, name) for name in case_names}
         case = scenario.case_type(**coordinates, draw=known.draw, scenario=scenario)
         measures = Measures(
@@ -263,8 +259,6 @@ class Outcome:
         return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 
-LATER: Final = ("pov_sustained_brake_mps2", "pov_slowdown_mps")
-"""Measures that records of the last release do not have: they are None there."""
 FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
 """Measures of the follow-up."""
 ON_LANE: Final = (
@@ -299,11 +293,9 @@ def _record_fields(
     not_fields = {"further", *left_out}
     measure_names = tuple(name for name in Measures.__slots__ if name not in not_fields)
     types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
-    always = [name for name in measure_names if name not in LATER]
-    required = [(name, types[name]) for name in ("index", "batch", *case_names, *always)]
+    required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
     further = [(name, float | None, None) for name in further_measures()]
     optional = [
-        *((name, types[name], None) for name in LATER),
         *further,
         ("draw", int, 0),
         ("margin", float | None, None),

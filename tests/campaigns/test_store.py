@@ -209,15 +209,6 @@ class TestReading:
             read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1", field)
 
-    def test_of_the_last_release_says_less_of_the_pov(self):
-        outcome, _ = episode(0)
-        record = outcome.to_record()
-        later = "pov_sustained_brake_mps2", "pov_slowdown_mps"
-        assert all(record.pop(name) > 0.0 for name in later)
-        lines = json.dumps(record).encode() + b"\n"
-        (read,), _ = read_outcomes(lines, "outcomes.jsonl", scenario=US23)
-        assert read.measures == replace(outcome.measures, **dict.fromkeys(later))
-
     def test_refuses_a_record_with_a_field_that_nobody_knows(self):
         record = {**episode(0)[0].to_record(), "scroe": -1.0}
         with pytest.raises(UserError) as error:

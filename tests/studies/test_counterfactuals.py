@@ -250,14 +250,6 @@ class TestTheFile:
         with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
             read_avoidance(Run(folder))
 
-    def test_of_an_older_version_is_read(self, folder, found):
-        write_avoidance(folder, found)
-        path = folder / AVOIDANCE
-        path.write_text(path.read_text().replace("latest_takeover_s", "careful_until_s"))
-        # In that version another driver took over.
-        without = [replace(one, latest_takeover_s=None) for one in found]
-        assert list(read_avoidance(Run(folder)).values()) == without
-
     def test_has_no_failure_twice(self, folder, found):
         write_avoidance(folder, [found[0], found[0]])
         with pytest.raises(UserError, match="line 2"):

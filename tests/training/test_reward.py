@@ -21,20 +21,11 @@ def of(term, *numbers):
     return float(term(*(np.array([n]) if isinstance(n, float) else n for n in numbers))[0])
 
 
-def test_acceleration_costs_its_square_whatever_its_sign():
-    assert of(reward.phi_acc, -3.0) == of(reward.phi_acc, 3.0) == -9.0
-
-
 @pytest.mark.parametrize(
     ("v", "cost"), [(24.6, 0.0), (30.0, 0.0), (35.0, 0.0), (22.6, -2.0), (36.5, -1.5)]
 )
 def test_speed_outside_the_highways_range_costs_its_distance(v, cost):
     assert of(R.phi_v_hw, v) == pytest.approx(cost)
-
-
-def test_a_vut_slower_than_12_is_penalised():
-    assert of(R.phi_v_min, 12.0) == 0.0
-    assert of(R.phi_v_min, 9.5) == -2.5
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -54,10 +45,6 @@ def test_a_wide_gap_is_rewarded_and_a_critical_one_is_penalised(sign):
     assert of(R.phi_dx, sign * 5.0) == pytest.approx(0.05 - 0.6)
 
 
-def test_a_crash_is_a_gap_below_6_m():
-    assert [of(R.phi_crash, dx) for dx in (5.99, -5.99, 6.0, -6.0)] == [-1.0, -1.0, 0.0, 0.0]
-
-
 def test_the_parts_of_the_reward_by_hand():
     # 21 m ahead, closing at 6 m/s: -1.4 / 2 + 0.6 * 21 / 60
     assert of(R.safety, 21.0, -6.0) == pytest.approx(-0.7 + 0.21)
@@ -75,10 +62,6 @@ def test_orientation_turns_from_egoistic_to_altruistic():
     assert reward.RewardParts(*parts).of("pov", np.array([math.pi / 6])) == pytest.approx(
         [-1.0 - 2.0 * math.sqrt(0.75) - 1.5]
     )
-
-
-def test_the_paper_s_weights_are_those_of_its_scenario_to_the_last_bit():
-    assert reward.RewardWeights.of(US23) == reward.RewardWeights()
 
 
 def test_a_merge_of_half_the_size_pays_the_same_to_the_last_bit():
@@ -102,11 +85,3 @@ def test_the_weights_of_a_short_and_slow_merge_by_hand():
     assert found.vut_v_end == pytest.approx(1.5 / speed)
     assert found.gap_full_m == pytest.approx(12.0 + 45.0 * 9.0 / 28.0)
     assert (found.ttc, found.gap, found.critical, found.crash) == (0.2, 1.0, 0.5, 20.0)
-
-
-def test_what_is_slow_near_or_short_is_said_by_the_scenario():
-    found = reward.Reward.of(LIKE_A_ROUNDABOUT)
-    assert of(found.phi_v_min, 1.5) == -0.5
-    assert [of(found.phi_v_hw, v) for v in (4.0, 5.0, 12.0, 13.5)] == [-1.0, 0.0, 0.0, -1.5]
-    assert of(found.phi_ttc, 3.0, -2.0) == -0.5
-    assert of(found.phi_dx, 6.0) == pytest.approx(6.0 / found.weights.gap_full_m - 0.25)

@@ -18,11 +18,10 @@ from gymnasium.wrappers import vector as vector_wrappers
 from merges import HALF, LIKE_A_ROUNDABOUT
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import (
     ACTIONS,
     FEATURES,
-    SVO_FEATURES,
     QNetwork,
     actions_mps2,
 )
@@ -30,13 +29,13 @@ from merge_sumo.drivers.policies import MANIFEST, load_network, plays_as, read_m
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
-from merge_sumo.training.check import QuickRegret, check_cases, play, returns_of
+from merge_sumo.training.check import QuickRegret, play, returns_of
 from merge_sumo.training.env import MergeGame, MergeVectorEnv, exploring_starts, pool_starts
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.values.scenario import US23
 from merge_sumo.vuts.onnx_export import export_onnx
 
 WEIGHTS = reward.RewardWeights()
@@ -60,15 +59,6 @@ class TestEnvironments:
         made = gymnasium.make(ENV_ID, role=role, opponent="level0")
         try:
             check_env(made.unwrapped, skip_render_check=True)
-        finally:
-            made.close()
-
-    def test_psi_is_part_of_what_a_pov_with_an_orientation_sees(self):
-        made = gymnasium.make(ENV_ID, role="pov", opponent="level0", svo=0.6)
-        try:
-            observation, _ = made.reset(seed=3)
-            assert observation.shape == (5,)
-            assert observation[4] == 0.6
         finally:
             made.close()
 
@@ -151,51 +141,11 @@ class TestEnvironments:
             finally:
                 games.close()
 
-    def test_a_shorter_game_is_truncated_alike_by_make_and_make_vec(self):
-        one = gymnasium.make(ENV_ID, role="vut", max_episode_steps=3)
-        several = gymnasium.make_vec(ENV_ID, num_envs=2, role="vut", max_episode_steps=3)
-        for games, keep in ((one, 4), (several, np.full(2, 4))):
-            try:
-                games.reset(seed=0)
-                truncated = [np.all(games.step(keep)[3]) for _ in range(3)]
-                assert [bool(t) for t in truncated] == [False, False, True]
-            finally:
-                games.close()
-
-    def test_same_seed_same_starts(self):
-        for starts in (pool_starts, exploring_starts):
-            one, two = (starts(50, np.random.default_rng(7), scenario=US23) for _ in range(2))
-            assert np.array_equal(one, two)
-
     def test_starts_of_half_the_size_are_half_of_the_paper_s(self):
         for starts in (pool_starts, exploring_starts):
             one = starts(500, np.random.default_rng(7), scenario=US23)
             half = starts(500, np.random.default_rng(7), scenario=HALF)
             assert half == pytest.approx(one / 2, rel=1e-12)
-
-    def test_a_pool_with_a_range_of_speeds_of_the_vut_starts_in_all_of_it(self):
-        ranged = dataclasses.replace(LIKE_A_ROUNDABOUT, v_vut0_mps=(3.0, 9.0))
-        speeds = pool_starts(500, np.random.default_rng(7), ranged)[:, 3]
-        assert 3.0 <= speeds.min() < 3.1
-        assert 8.9 < speeds.max() < 9.0
-
-    def test_another_scenario_is_played_in_its_units(self):
-        games = MergeVectorEnv(2, role="vut", opponent="level0", scenario=LIKE_A_ROUNDABOUT)
-        try:
-            start, _ = games.reset(seed=0)
-            assert start[:, 2:] == pytest.approx(np.array([[-40.02, 8.0]] * 2))
-            state, r, _, _, _ = games.step(np.full(2, 6))  # +2 m/s2
-            assert state[:, 3] == pytest.approx(9.0)
-            weights = reward.RewardWeights.of(LIKE_A_ROUNDABOUT)
-            assert r == pytest.approx(-0.5 * 4.0 * weights.vut_acc)
-        finally:
-            games.close()
-
-    def test_exploring_starts_are_in_the_game_and_near_conflict(self):
-        starts = exploring_starts(4000, np.random.default_rng(0), scenario=US23)
-        assert (starts[:, 2] < 0.0).all()
-        assert (starts[:, 1] > 0.0).all()
-        assert 0.55 < (starts[:, 2] > -181.9).mean() < 0.65
 
     @pytest.mark.parametrize(
         ("settings", "sentence"),
@@ -264,45 +214,6 @@ class TestDdqn:
 
 
 class TestBestResponse:
-    def replayed(self, role, case, actions):
-        """Return the return of an action sequence of 0.5 s holds by eq. (4)."""
-        xp, vp, xv, vv = case.x_pov0_m, case.v_pov0_mps, -182.0, 18.0
-        total = 0.0
-        for step in range(300):
-            hold = actions[min(step // 5, len(actions) - 1)]
-            level0 = float(
-                level0_acceleration(np.array([vv]), US23.level0_a_mps2, US23.level0_v_mps)[0]
-            )
-            ap, av = (hold, level0) if role == "pov" else (0.0, hold)
-            ego = REWARD.pov_step(np.array([vp]), np.array([ap]))
-            if role == "vut":
-                ego = REWARD.vut_step(np.array([vv]), np.array([av]))
-            total += float(ego[0])
-            xp, vp = xp + vp * DT_S, max(vp + ap * DT_S, 0.0)
-            xv, vv = xv + vv * DT_S, max(vv + av * DT_S, 0.0)
-            if xv >= 0.0:
-                total += float(REWARD.safety(np.array([xp - xv]), np.array([vp - vv]))[0])
-                if role == "vut":
-                    total += float(REWARD.vut_end(np.array([vv]))[0])
-                return total
-        return -np.inf
-
-    @pytest.mark.parametrize("role", ["pov", "vut"])
-    def test_no_sequence_that_changes_twice_beats_it_and_it_beats_level0(self, role):
-        rng = np.random.default_rng(4)
-        x, v = rng.uniform(-340, -180, 2), rng.uniform(25, 35, 2)
-        starts = np.stack([x, v, np.full(2, -182.0), np.full(2, 18.0)], axis=1)
-        best = best_response.best_response(Game(role, None, REWARD), starts)
-        for x0, v0, bound in zip(x.tolist(), v.tolist(), best.tolist(), strict=True):
-            case = MergeCase(level=1, x_pov0_m=x0, v_pov0_mps=v0, scenario=US23)
-            tried = [
-                self.replayed(role, case, [a] * n + [b] * m + [1.0 if role == "vut" else 0.0])
-                for a, b in itertools.product(ACTIONS_MPS2.tolist(), repeat=2)
-                for n, m in itertools.product((0, 1, 4, 8), (0, 3))
-            ]
-            assert max(tried) <= bound + 1e-5
-            assert max(tried) > bound - 0.3, "the bound is near what simple sequences reach"
-
     @pytest.mark.parametrize("role", ["pov", "vut"])
     @pytest.mark.parametrize("v_vut0", [6.0, (5.0, 7.0)])
     def test_it_is_the_best_of_all_sequences_also_where_actions_have_no_common_unit(
@@ -332,13 +243,6 @@ class TestBestResponse:
         every = returns.reshape(len(start), -1)
         assert best_response.best_response(game, start) == pytest.approx(every.max(axis=1))
         assert (every.argmax(axis=1) > 0).any()
-
-    def test_that_of_half_the_size_is_the_same(self):
-        start = pool_starts(8, np.random.default_rng(3), scenario=US23)
-        for role in ("pov", "vut"):
-            one = best_response.best_response(Game(role, None, reward.Reward.of(US23)), start)
-            half = best_response.best_response(Game(role, None, reward.Reward.of(HALF)), start / 2)
-            assert one == pytest.approx(half, rel=1e-12)
 
     def test_a_beam_search_against_a_driver_that_ignores_it_finds_the_exact_answer(self):
         # A network whose action +1 is always the best is the level-0 VUT until 28 m/s.
@@ -427,20 +331,6 @@ class TestGame:
         assert (after >= before - 1e-9).all()
         assert after.mean() > before.mean() + 0.1
 
-    def test_an_action_is_held_as_long_as_asked_before_the_policy_goes_on(self, policy):
-        game, held = Game("pov", None, REWARD), 3
-        start, svo_rad = pool_starts(4, np.random.default_rng(5), scenario=US23), np.zeros(4)
-        of_actions = game.action_returns(start, svo_rad, policy, held)
-        for action in range(ACTIONS):
-            state, gained = start, np.zeros(4)
-            for _ in range(held):
-                a_mps2 = np.full(4, game.actions_mps2[action])
-                state, reward_of_decision, over = game.advance(state, svo_rad, a_mps2)
-                gained += reward_of_decision
-                assert not over.any()
-            after = game.play(state, svo_rad, policy)
-            assert of_actions[:, action] == pytest.approx(gained + after, abs=1e-9)
-
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
@@ -464,36 +354,6 @@ class TestRefinement:
         enough = dataclasses.replace(QUICK, starts=40, searched=10, beam=8, updates=200)
         before, after = map(regret, self.refined(seed=0, settings=enough))
         assert after < 0.5 * before
-
-    def test_the_regret_of_a_network_that_is_worse_than_level0_is_not_negative(self):
-        zeros = np.zeros((ACTIONS, FEATURES))
-        always_brakes = QNetwork([(zeros, (ACTIONS_MPS2 == -4.0).astype(float))])
-        regret = QuickRegret(Game("vut", None, REWARD), sees_svo=False)
-        assert regret(always_brakes) > 1.0
-
-    def test_states_are_labelled_where_two_actions_are_nearly_equal_or_a_better_game_was(self):
-        values = np.zeros((1000, ACTIONS), dtype=np.float32)
-        values[:, 2], values[:100, 4] = 1.0, 0.98
-        better = np.arange(1000) >= 900
-        rng = np.random.default_rng(0)
-        few = dataclasses.replace(QUICK, sure_share=0.0)
-        kept = refine._worth_labels(values, better, rng, few)
-        assert kept.tolist() == [*range(100), *range(900, 1000)]
-        kept = refine._worth_labels(values, better, rng, QUICK)
-        assert 0.1 < (len(kept) - 200) / 800 < 0.2
-
-    def test_some_searched_starts_are_near_those_where_the_last_search_found_most(self):
-        torch.manual_seed(0)
-        network = ddqn.export(ddqn.make_network(FEATURES + SVO_FEATURES, 32))
-        game, rng = Game("pov", None, REWARD), np.random.default_rng(0)
-        s = dataclasses.replace(QUICK, searched=20, starts=200, midway=0.0)
-        hard = refine._Starts(np.array([[-300.0, 30.0, -182.0, 18.0]]), np.array([0.7]))
-        starts = refine._starts(game, network, hard, rng, s)
-        near = np.abs(starts.state - hard.state)[:, :2] < [10.0, 0.5]
-        assert near[:10].all()
-        assert near[10:].all(axis=1).mean() < 0.1
-        assert (starts.state[:10, 2:] == hard.state[:, 2:]).all()
-        assert np.abs(starts.svo_rad[:10] - 0.7).max() < 0.1
 
     @pytest.mark.slow
     def test_same_seed_same_weights_and_another_seed_other_weights(self):
@@ -539,13 +399,6 @@ class TestHelix:
         assert (library / "pov1.safetensors").stat().st_mtime_ns == before
 
     @pytest.mark.slow
-    def test_another_seed_does_not_overwrite_a_network(self, library):
-        before = (library / "pov1.safetensors").read_bytes()
-        with pytest.raises(UserError, match=r"has a pov1 of another scenario, seed.*--out"):
-            train_library(library, ("pov1",), seed=1, settings=SMALL, scenario=US23)
-        assert (library / "pov1.safetensors").read_bytes() == before
-
-    @pytest.mark.slow
     def test_a_pov_with_a_limit_of_braking_keeps_it_in_its_file(self, tmp_path):
         train_library(tmp_path, ("pov1",), settings=SMALL, scenario=US23, a_min_mps2=-2.0)
         entry = read_manifest(tmp_path)["pov1"]
@@ -575,21 +428,6 @@ class TestHelix:
         (tmp_path / "pov1.safetensors").write_bytes(altered)
         with pytest.raises(UserError, match="is not the file that its manifest describes"):
             load_network("pov1", tmp_path)
-
-    def test_a_file_that_is_no_network_is_refused_even_with_its_own_hash(self, library, tmp_path):
-        import hashlib
-
-        content = b"\x08\x00\x00\x00\x00\x00\x00\x00not json"
-        manifest = json.loads((library / MANIFEST).read_text())
-        manifest["networks"]["pov1"]["sha256"] = hashlib.sha256(content).hexdigest()
-        (tmp_path / MANIFEST).write_text(json.dumps(manifest))
-        (tmp_path / "pov1.safetensors").write_bytes(content)
-        with pytest.raises(UserError, match="holds no action-value network"):
-            load_network("pov1", tmp_path)
-
-    def test_a_missing_network_says_how_to_make_it(self, tmp_path):
-        with pytest.raises(UserError, match="run `merge-sumo train --out"):
-            load_network("vut1", tmp_path)
 
 
 class TestTrainingForAnotherScenario:
@@ -644,16 +482,6 @@ class TestTrainingForAnotherScenario:
     def test_a_check_without_the_scenario_says_what_is_missing(self, trained):
         done = invoke("train", "--check", "--out", trained[0], "--only", "pov1")
         assert "was trained for ring: say with --scenario" in str(done.exception)
-
-    def test_other_cars_are_not_trained_for(self):
-        traffic = dataclasses.replace(US23, headway_ahead_s=(1.0, 3.0), headway_behind_s=(1.0, 3.0))
-        assert plays_as(traffic, US23)
-        assert unseen(traffic) == []
-        assert {len(case.starts()) for case in check_cases("pov2", 3, scenario=traffic)} == {2}
-
-    def test_without_a_folder_nothing_is_written_into_the_shipped_policies(self, ring):
-        done = invoke("train", "--scenario", ring)
-        assert "the shipped policies are for us23: say with --out" in str(done.exception)
 
     def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
         with pytest.raises(UserError, match=r"pov1 .* was trained for another scenario, ring"):

@@ -17,7 +17,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.chance import (
     by_case,
-    check_tolerated,
     failing_cases,
     fails_above,
     is_decided,
@@ -110,12 +109,6 @@ def test_the_interval_is_that_of_clopper_and_pearson():
     (one,) = by_case(outcomes(runs))
     assert one.interval() == pytest.approx((0.0667, 0.6525), abs=1e-4)
     assert by_case(outcomes(runs[3:4]))[0].interval() == pytest.approx((0.0, 0.975))
-
-
-@pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
-def test_what_is_no_share_is_not_tolerated(share):
-    with pytest.raises(UserError, match="--tolerate is"):
-        check_tolerated(share)
 
 
 def test_the_run_that_stands_for_a_case_fails_as_the_case_does():

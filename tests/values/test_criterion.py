@@ -8,24 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigning import campaign_settings, resume_campaign, run_campaign
+from campaigning import campaign_settings, run_campaign
 from hypothesis import given
 from hypothesis import strategies as st
 from plans import key_of, plan_for
 from test_score import CASE, ending
 
-from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.truth import ground_truth
-from merge_sumo.studies.versions import compare_runs, rerun
-from merge_sumo.values import score
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion, vocabulary
@@ -89,14 +83,6 @@ class TestMargins:
         assert margin("x < 1 or y > 4", x=2.0, y=3.0) == 0.25
         assert margin("x < 1 and y > 4", x=2.0, y=3.0) == 1.0
         assert margin("x < 1 and y > 4", x=0.5, y=5.0) == -0.25
-
-    def test_a_chain_is_all_of_its_links(self):
-        assert margin("1 < x < 2", x=1.5) == -0.25
-        assert margin("1 < x < 2", x=3.0) == 0.5
-
-    def test_not_turns_the_sign(self):
-        assert margin("not x < 1.5", x=3.0) == -1.0
-        assert margin("not (x < 1 or y > 4)", x=2.0, y=3.0) == -0.25
 
     def test_texts_are_met_or_not(self):
         assert margin('who == "A"') == -1.0
@@ -186,14 +172,6 @@ class TestRefused:
     def test_nesting_as_deep_as_it_may_be_is_read(self):
         assert of("not " * 240 + "ttc_s < 1", ending(20.0)) == MOST_MARGIN
 
-    def test_the_command_line_says_it_and_exits_with_2(self, command_line):
-        code, out, err = command_line("campaign", "--vut", "design1", "--fail-when", "tcc_s < 1")
-        assert (code, out) == (2, "")
-        assert err == (
-            "merge-sumo: --fail-when 'tcc_s < 1': at character 1, near 'tcc_s < 1': there is no "
-            "measure 'tcc_s': did you mean ttc_s, pet_s or t_end_s?\n"
-        )
-
 
 class TestMeasures:
     def test_every_name_has_a_value_in_every_episode(self):
@@ -267,24 +245,6 @@ class TestRecords:
         record = PAPER_CRITERION.outcome(0, 0, episode).to_record()
         assert set(vocabulary()) - {"nearest"} <= set(record)
 
-    def test_of_release_0_1_are_read(self):
-        record = PAPER_CRITERION.outcome(0, 0, ending(5.5, v_pov=20.0, v_vut=22.0)).to_record()
-        for name in (
-            "severity",
-            "bumper_gap_m",
-            "clearance_m",
-            "before_clearance_m",
-            "brake_after_mps2",
-        ):
-            del record[name]
-        record |= {"end": "COLLISION", "impact_speed_mps": 2.0, "after_merge": "forced"}
-        read = Outcome.from_json(json.dumps(record), scenario=US23).measures
-        assert (read.end, read.severity, read.is_close) == (End.MERGED, "contact", True)
-        assert (read.bumper_gap_m, read.brake_after_mps2) == (0.5, None)
-        record |= {"dx_m": 30.0, "score": -10.0, "end": "MERGED"}
-        read = Outcome.from_json(json.dumps(record), scenario=US23).measures
-        assert (read.severity, read.bumper_gap_m, read.impact_speed_mps) == ("safe", 25.0, None)
-
     def test_that_say_something_else_are_refused(self):
         record = PAPER_CRITERION.outcome(0, 0, ending(20.0)).to_record()
         with pytest.raises(UserError, match="severity"):
@@ -292,12 +252,6 @@ class TestRecords:
 
 
 class TestNamed:
-    def test_the_papers_needs_no_margin(self):
-        for dx in (0.0, 5.9, 6.1, 80.0):
-            outcome = PAPER_CRITERION.outcome(0, 0, ending(dx))
-            assert outcome == Outcome(0, 0, CASE, measure(ending(dx)))
-            assert "margin" not in outcome.to_record()
-
     def test_contact_is_of_bodies_and_not_of_points(self):
         # 5 m long: at 5.5 m between the fronts, a failure of the paper, they do not touch.
         assert PAPER_CRITERION.outcome(0, 0, ending(5.5)).failed
@@ -333,14 +287,6 @@ class TestTheVerdictAlone:
         whole, alone = Criterion(text).outcome(0, 0, episode), Criterion(text).judged(episode)
         assert (alone.failed, alone.margin) == (whole.failed, whole.margin)
         assert alone.signed_gap_m == whole.signed_gap_m
-
-    def test_looks_for_a_way_out_where_the_criterion_speaks_of_it_alone(self, monkeypatch):
-        asked = []
-        monkeypatch.setattr(score, "last_avoidable_s", lambda _: asked.append(1))
-        Criterion("ttc_s < 1.5").judged(ending(0.0))
-        assert not asked
-        Criterion("last_avoidable_s < 2").judged(ending(0.0))
-        assert asked
 
 
 def lines(apart_m, ends_m=-20.0):
@@ -418,14 +364,6 @@ class TestOutcomes:
         assert fails.signed_gap_m == pytest.approx(6.0 / 1.5)
         assert PAPER_CRITERION.outcome(0, 0, ending(-21.0)).signed_gap_m == pytest.approx(-21.0)
 
-    def test_that_time_out_are_tested_where_that_is_the_failure(self):
-        ended = [ending(9.0, end=End.TIMEOUT), ending(9.0)]
-        by_paper = judge(PAPER_CRITERION.outcome(n, 0, t) for n, t in enumerate(ended))
-        criterion = Criterion('end == "TIMEOUT"')
-        by_end = judge(criterion.outcome(n, 0, t) for n, t in enumerate(ended))
-        assert (by_paper.tested, by_paper.timeouts, by_paper.failures) == (1, 1, 0)
-        assert (by_end.tested, by_end.timeouts, by_end.failures) == (2, 0, 1)
-
 
 def settings(**other):
     return campaign_settings(**{"vut": "design2", "cases": 40, "batch": 20, **other})
@@ -458,26 +396,6 @@ class TestCampaigns:
                    == o.margin for o in harsh.outcomes)  # fmt: skip
         assert any(o.measures.end is End.MERGED for o in failing)
 
-    def test_record_the_condition_as_python_writes_it(self, harsh):
-        assert harsh.settings["fail_when"] == "brake_after_mps2 > 2"
-        assert harsh.criterion == Criterion(" brake_after_mps2  > 2")
-
-    def test_have_a_report_that_says_what_fails(self, harsh, command_line):
-        code, _, _ = command_line("report", harsh.folder)
-        page = (harsh.folder / "report.html").read_text(encoding="utf-8")
-        assert code == 0
-        assert "A case fails when brake_after_mps2 &gt; 2" in page
-        assert "(brake_after_mps2 &gt; 2; " in page
-        assert "within 6 m at M; " not in page
-        assert '"margin"' in page
-
-    def test_go_on_with_the_same_criterion_only(self, harsh):
-        same = resume_campaign(harsh.folder, given={"fail_when": "brake_after_mps2 > 2"})
-        assert same.outcomes == harsh.outcomes
-        for force in (False, True):
-            with pytest.raises(UserError, match="one criterion"):
-                resume_campaign(harsh.folder, given={"fail_when": "ttc_s < 2"}, force=force)
-
     def test_with_margins_of_another_criterion_are_refused(self, harsh, tmp_path):
         (tmp_path / "trajectories").mkdir()
         record = {**harsh.settings, "fail_when": "paper"}
@@ -487,40 +405,12 @@ class TestCampaigns:
         with pytest.raises(UserError, match="not judged by the criterion"):
             Run(tmp_path)
 
-    def test_are_kept_where_recorded_cases_run_again(self, harsh):
-        today = settings_of(harsh.folder, harsh.settings)
-        again = rerun(RunStudy(harsh, today, resolve(today)), (0, 1, 2))
-        assert [o.margin for o in again.after] == [o.margin for o in harsh.outcomes[:3]]
-        assert not again.changed
-
     def test_decide_on_one_case_of_theirs(self, harsh, command_line):
         ends = {o.failed: o for o in harsh.outcomes if o.measures.end is End.MERGED}
         for failed, outcome in ends.items():
             code, _, _ = command_line("run", "--case", harsh.folder, outcome.index)
             assert code == int(failed)
         assert set(ends) == {True, False}
-
-    def test_of_different_criteria_are_not_compared(self, harsh, tmp_path):
-        other = run_campaign(settings(vut="design1", cases=20), tmp_path / "other")
-        with pytest.raises(UserError, match="same --fail-when"):
-            compare_runs(harsh, other)
-
-    def test_of_one_criterion_are_compared_by_it(self, harsh):
-        compared = compare_runs(harsh, harsh)
-        assert compared.evidence.count("was run again") == 2
-        assert compared.levels[0].fmc_a == compared.levels[0].fmc_b > 0.0
-        assert compared.levels[0].changes["both fail"] == 2 * judge(harsh.outcomes).failures
-
-    def test_that_name_no_criterion_were_the_papers(self, tmp_path):
-        run_campaign(settings(cases=20), tmp_path / "run")
-        path = tmp_path / "run" / "campaign.json"
-        record = json.loads(path.read_text(encoding="utf-8"))
-        del record["sha256"], record["fail_when"]
-        path.write_text(json.dumps(record), encoding="utf-8")
-        assert resume_campaign(tmp_path / "run").criterion == PAPER_CRITERION
-        path.write_text(json.dumps(record | {"fail_when": 3}), encoding="utf-8")
-        with pytest.raises(UserError, match="no fail_when"):
-            Run(tmp_path / "run")
 
 
 class TestTruth:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import fields, replace
 
 import numpy as np
@@ -89,12 +88,6 @@ class TestAFile:
         with pytest.raises(UserError, match=said):
             named_scenario(str(tmp_path / "no.toml"))
 
-    def test_that_nobody_knows_by_name_is_refused(self):
-        with pytest.raises(
-            UserError, match=r"no scenario 'us24': did you mean us23.* choose us23, .*, or a file"
-        ):
-            named_scenario("us24")
-
     def test_without_room_for_its_starts_is_refused(self):
         far = replace(US23, x_vut0_m=-430.0)
         with pytest.raises(UserError, match=r"ramp .*begins 425\.0 m before"):
@@ -118,13 +111,6 @@ OTHER = replace(
 
 
 class TestACase:
-    def test_keeps_what_it_always_had(self):
-        case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-        assert case.scenario is US23
-        assert case == MergeCase(
-            level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, v_vut0_mps=18.0, scenario=US23
-        )
-
     def test_is_a_point_of_the_pool_of_its_scenario(self):
         pool = Pool(levels=(2,), scenario=OTHER)
         points = np.random.default_rng(0).random((5, 3))
@@ -162,24 +148,12 @@ def elsewhere(tmp_path_factory) -> Run:
 
 
 class TestACampaign:
-    def test_starts_where_its_scenario_says(self, elsewhere):
-        for outcome in elsewhere.outcomes:
-            motion = elsewhere.trajectory(outcome.index).motion
-            assert tuple(motion[0, 1, :2]) == (-100.0, 10.0)
-            assert -300.0 <= motion[0, 0, 0] <= -100.0
-            assert 10.0 <= motion[0, 0, 1] <= 20.0
-
     def test_is_driven_by_the_profile_of_its_scenario(self, elsewhere):
         motion = elsewhere.trajectory(0).motion
         assert motion[:-1, 1, 2].max() == 0.5
         assert motion[:, 1, 1].max() == pytest.approx(14.0)
         due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
         assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
-
-    def test_records_its_scenario_and_is_read_with_it(self, elsewhere):
-        assert elsewhere.settings["scenario"] == json.loads(json.dumps(OTHER.to_record()))
-        assert Run(elsewhere.folder).scenario == OTHER
-        assert all(outcome.case.scenario == OTHER for outcome in Run(elsewhere.folder).outcomes)
 
     def test_clips_at_the_limits_of_its_scenario(self, tmp_path):
         (tmp_path / "hard.py").write_text("def vut(seen):\n    return 2.0\n")
@@ -207,12 +181,6 @@ class TestACampaign:
         )
         (outcome,) = run_campaign(settings, tmp_path / "run").outcomes
         assert (outcome.measures.end, outcome.measures.t_end_s) == (End.TIMEOUT, 12.0)
-
-
-def test_a_campaign_of_the_paper_is_recorded_with_all_numbers(run):
-    names = {field.name for field in fields(MergeScenario)} - {"lane_m", "lane_end", "sense", "act"}
-    assert names == set(run.settings["scenario"])
-    assert run.scenario == US23
 
 
 @pytest.mark.parametrize("name", some(SIX, "curved", "lane drop", "OpenDRIVE"))

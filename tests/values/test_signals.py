@@ -87,19 +87,6 @@ def test_every_step_has_what_was_left_at_it(campaign, source):
             )
 
 
-@pytest.mark.long
-def test_any_number_of_workers_leaves_the_same_bytes(campaign):
-    one, two = campaign(LEAVES), campaign(LEAVES, workers=2)
-    for name in ("00000.npz", "00001.npz"):
-        files = [(run.folder / "trajectories" / name).read_bytes() for run in (one, two)]
-        assert files[0] == files[1]
-
-
-def test_what_leaves_nothing_takes_no_place(run):
-    assert "signals" not in read_arrays(run.folder / "trajectories" / "00000.npz")
-    assert run.trajectory(0).signals is None
-
-
 def test_run_prints_them_beside_the_motion(tmp_path):
     (tmp_path / "my_vut.py").write_text(LEAVES)
     given = ["run", "--vut", f"{tmp_path}/my_vut.py:Vut", "--x", "-250", "--v", "30"]
@@ -176,11 +163,6 @@ def test_new_names_at_every_step_do_not_grow_a_case():
 )
 def test_what_is_no_number_and_no_word_is_dropped(left):
     assert as_signals(left) == {}
-
-
-def test_numbers_of_numpy_are_numbers():
-    left = {"a": np.float32(0.5), "b": np.int64(3), "c": np.bool_(False)}
-    assert as_signals(left) == {"a": 0.5, "b": 3.0, "c": "false"}
 
 
 @pytest.mark.parametrize(
