@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from merge_sumo.system.printable import counted
 from merge_sumo.values.chance import MOST_RUNS, by_case, fails_above, is_decided
 from merge_sumo.values.score import Outcome
 
@@ -38,23 +37,6 @@ class ChanceSummary:
     def to_record(self) -> dict[str, Any]:
         """Return what JSON shows."""
         return asdict(self)
-
-    @property
-    def sentence(self) -> str:
-        """What it says, in a line."""
-        said = (
-            f"{counted(self.runs, 'run')} of {counted(self.cases, 'case')}: {self.repeated} ran "
-            "more than once, "
-        )
-        if not self.varied:
-            return f"{said}each time alike: no chance was seen"
-        said += f"{self.varied} of them not alike, and {self.both_ways} both failed and passed"
-        if self.tolerated:
-            said += f"; a case fails where more than {self.tolerated:.0%} of its runs do"
-        if self.undecided:
-            said += f", which {self.undecided} of {counted(self.failures, 'failure')} ran too "
-            said += "seldom to tell"
-        return said
 
 
 def chance_in(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> ChanceSummary | None:

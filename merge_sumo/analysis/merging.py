@@ -15,9 +15,6 @@ from merge_sumo.system.printable import counted
 from merge_sumo.values.scenario import lane_of, level_name
 from merge_sumo.values.score import Outcome
 
-BINS: Final = 20
-"""Bins of a histogram over the lane."""
-
 
 @dataclass(frozen=True, slots=True)
 class Site:
@@ -47,8 +44,6 @@ class MergeStatistics:
         stood: cases in which the VUT stood on the lane.
         time_gap_ahead_s: median time gap to the car ahead; None without one.
         time_gap_behind_s: the same of the car behind.
-        failing: failures by place, in bins of equal width over the lane, (BINS,).
-        others: the other merges by place.
     """
 
     cases: int
@@ -58,8 +53,6 @@ class MergeStatistics:
     stood: int
     time_gap_ahead_s: float | None
     time_gap_behind_s: float | None
-    failing: tuple[int, ...]
-    others: tuple[int, ...]
 
     @property
     def sentence(self) -> str:
@@ -92,18 +85,15 @@ def merging_of(outcomes: Iterable[Outcome]) -> MergeStatistics | None:
     ran = list(outcomes)
     if not ran or lane_of(ran[0].case.scenario) is None:
         return None
-    placed = [(share, o.failed) for o in ran if (share := o.measures.lane_share) is not None]
-    shares = [share for share, _ in placed]
+    shares = [share for o in ran if (share := o.measures.lane_share) is not None]
     return MergeStatistics(
         cases=len(ran),
-        merges=len(placed),
+        merges=len(shares),
         lane_share=_median(shares),
         forced=sum(share >= 1.0 for share in shares),
         stood=sum(o.measures.stood_s > 0.0 for o in ran),
         time_gap_ahead_s=_median(o.measures.time_gap_ahead_s for o in ran),
         time_gap_behind_s=_median(o.measures.time_gap_behind_s for o in ran),
-        failing=_binned(share for share, failed in placed if failed),
-        others=_binned(share for share, failed in placed if not failed),
     )
 
 
@@ -130,11 +120,3 @@ def place_in_words(lane_share: float) -> str:
 def _median(values: Iterable[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return median(known) if known else None
-
-
-def _binned(shares: Iterable[float]) -> tuple[int, ...]:
-    """Return how many shares lie in each bin; the merges where the lane ends are in the last."""
-    counts = [0] * BINS
-    for share in shares:
-        counts[min(int(share * BINS), BINS - 1)] += 1
-    return tuple(counts)

@@ -21,14 +21,10 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.trajectory import End
 
-ERRORS: Final = {End.VUT_ERROR: "a VUT error", End.SIM_ERROR: "an error of the simulation"}
-"""Ends of an episode that went wrong, in words."""
 MESSAGE_CHARACTERS: Final = 300
 """Of a message that is shown; `outcomes.jsonl` has the whole."""
 MOST_MESSAGES: Final = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
-QUOTED_CHARACTERS: Final = 120
-"""Of a message within a sentence."""
 _VARYING: Final = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
 """Measured values and addresses: messages that differ in them alone are one."""
 
@@ -102,29 +98,6 @@ class Verdict:
         contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
         return f"{in_words(counts)}{contacts} in {counted(self.cases, 'case')}"
 
-    @property
-    def sentences(self) -> list[str]:
-        """Return what went wrong, and how often; empty where every case was tested."""
-        said = []
-        for end, name in ERRORS.items():
-            groups = [trouble for trouble in self.troubles if trouble.end is end]
-            if groups:
-                number = sum(trouble.count for trouble in groups)
-                most = groups[0]
-                some = "" if len(groups) == 1 else f", {most.count} of them"
-                said.append(
-                    f"{self._cases(number)} ended in {name}{some}: "
-                    f"“{shortened(most.message, QUOTED_CHARACTERS)}”."
-                )
-        if self.timeouts:
-            there = "" if self.timeouts == self.cases else "there "
-            said.append(
-                f"{self._cases(self.timeouts)} timed out: {there}the VUT never reached {self.goal}."
-            )
-        if self.cases and not self.tested:
-            said.append("Nothing was tested.")
-        return said
-
     def trouble_lines(self) -> list[str]:
         """Return what ended in an error or a timeout, by message; empty where nothing did."""
         said = [
@@ -137,11 +110,6 @@ class Verdict:
             number = sum(trouble.count for trouble in others)
             said.append(f"  {number} with {len(others)} other messages")
         return said
-
-    def _cases(self, number: int) -> str:
-        if number < self.cases:
-            return f"{number} of {self.cases} cases"
-        return "The only case" if self.cases == 1 else f"All {self.cases} cases"
 
     def to_record(self) -> dict[str, Any]:
         """Return what JSON shows of contacts, errors and timeouts."""

@@ -88,7 +88,7 @@ from merge_sumo.reports import exports, figures
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import check_junit, write_junit
-from merge_sumo.reports.progress import Bars, CampaignBars, TrainingBars
+from merge_sumo.reports.progress import Bars, CampaignBars
 from merge_sumo.reports.repair_page import repair_page
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
@@ -294,7 +294,7 @@ def _write_findings(
         bars.counted("careful drivers", count, total, "failures")
 
     def page(count: int, total: int) -> None:
-        bars.counted("report", count, total, "")
+        bars.counted("surrogates of the report", count, total, "levels")
 
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
@@ -1288,16 +1288,23 @@ def train(
                 "`pip install 'merge-sumo[train]'`"
             )
     from merge_sumo.training.check import PolicyCheck, check_policy
-    from merge_sumo.training.helix import train_library
+    from merge_sumo.training.helix import TrainingProgress, train_library
 
     if not check:
-        with TrainingBars(shown=progress) as bars:
+        with Bars(shown=progress) as bars:
+
+            def progressed(now: TrainingProgress) -> None:
+                title = f"{now.network} {now.stage}"
+                bars.counted(title, now.done, now.total, "updates", now.note)
+
             train_library(
                 *(folder, names, seed),
                 scenario=played,
                 a_min_mps2=a_min,
-                on_progress=bars.progressed,
-                on_done=bars.done,
+                on_progress=progressed,
+                on_done=lambda name, check: bars.say(
+                    f"{name} is {'there already' if check is None else 'ready'}"
+                ),
             )
     manifest = _manifest_for(folder, names, scenario)
     if check:

@@ -6,8 +6,9 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
@@ -17,10 +18,6 @@ from merge_sumo.reports.report import REPORT, RunningReport
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.score import Outcome
-
-if TYPE_CHECKING:
-    from merge_sumo.training.check import PolicyCheck
-    from merge_sumo.training.helix import TrainingProgress
 
 PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
@@ -39,13 +36,6 @@ def rate_text(count: float, elapsed_s: float, unit: str) -> str:
     rates = [(count / elapsed_s * seconds, name) for seconds, name in PER]
     rate, per = next(((rate, name) for rate, name in rates if rate >= 1.0), rates[-1])
     return f"{rate:,.0f} {unit}/{per}" if rate >= 10.0 else f"{rate:.1f} {unit}/{per}"
-
-
-def clock_text(duration_s: float) -> str:
-    """Return a duration as a clock shows it: "0:05", "12:30", "2:00:00"."""
-    whole_s = round(duration_s)
-    hours, minutes = divmod(whole_s // 60, 60)
-    return f"{hours}:{minutes:02d}:{whole_s % 60:02d}" if hours else f"{minutes}:{whole_s % 60:02d}"
 
 
 def is_watched() -> bool:
@@ -78,13 +68,13 @@ class _Work:
         return False
 
     def note(self, done: int, unit: str) -> str:
-        """Return the rate, if it has a unit, and the time that is left at it."""
+        """Return the rate, and the time that is left at it."""
         counted, elapsed_s = done - self.before, time.monotonic() - self.start_s
-        rate = rate_text(counted, elapsed_s, unit) if unit else ""
+        rate = rate_text(counted, elapsed_s, unit)
         if done >= self.total or counted <= 0:
             return rate
-        left = clock_text((self.total - done) * elapsed_s / counted)
-        return f"{rate}  {left} left".strip()
+        left = timedelta(seconds=round((self.total - done) * elapsed_s / counted))
+        return f"{rate}  {left} left"
 
 
 class Bars:
@@ -210,31 +200,3 @@ class CampaignBars(Bars):
         super().__exit__(kind, error, trace)
         if error is not None:
             self._report.stopped()
-
-
-class TrainingBars(Bars):
-    """A bar per network with return and share of crashes, and its regret when it is finished."""
-
-    def __init__(self, *, shown: bool | None = True) -> None:
-        super().__init__(shown=shown)
-        self._regret: dict[str, str] = {}
-
-    def progressed(self, now: TrainingProgress) -> None:
-        """Show where a network is."""
-        note = f"return {now.mean_return:.3f}"
-        if now.crash_share is not None:
-            note += f"  crashes {now.crash_share:.2%}"
-        if now.regret is not None:
-            self._regret[now.network] = f"  regret at least {now.regret:.2%}"
-        note += self._regret.get(now.network, "")
-        self.counted(f"{now.network} {now.stage}", now.done, now.total, "updates", note)
-
-    def done(self, name: str, check: PolicyCheck | None) -> None:
-        """Say how a network turned out, or that it was there already."""
-        if check is None:
-            self.say(f"{name} is there already: same seed, settings, opponent")
-        else:
-            self.say(
-                f"{name}: mean regret {check.mean_regret:.2%}, "
-                f"{check.avoidable_collisions} avoidable collisions in {check.cases} cases"
-            )

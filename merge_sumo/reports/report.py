@@ -133,11 +133,9 @@ def report_page(
     model = ReportModel(run, summary, workers, on_part, learns=learns)
     words = shared_words(model)
     sections = sections_of(model, words)
-    model.part_ended()
     data = json.dumps(page_data(model), allow_nan=False, separators=(",", ":"))
     # No "<" in the JSON: nothing in it can end its element.
     data = data.replace("<", "\\u003c")
-    model.part_ended()
     return page(
         "report.html.jinja",
         styles=("report.css",),

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final
 
 from merge_sumo.analysis.chance import chance_in
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
@@ -42,8 +39,7 @@ ERROR_CHARACTERS: Final = 2000
 """Of the message of a case; `outcomes.jsonl` has the whole."""
 
 OnPart = Callable[[int, int], None]
-"""Told how many parts of a report are ready, and how many there are."""
-T = TypeVar("T")
+"""Told of how many levels the surrogates are learned, and how many levels there are."""
 
 
 class ReportModel:
@@ -67,8 +63,7 @@ class ReportModel:
         """Read what the page shows; `UserError` where settings have no list of levels.
 
         `summary` is that of the run, where it is known; on several `workers` its surrogates are
-        asked. `on_part` is told how many parts of the report are ready, and how many there are,
-        from 0 on; also from another thread. Without `learns` there are no surrogates.
+        asked. Without `learns` there are no surrogates.
         """
         self.run = run
         self.road = road_of_run(run)
@@ -80,13 +75,15 @@ class ReportModel:
         self.verdict = judge(self.cases)
         self.facts = facts_of(run, self.summary, self.verdict)
         self.levels = list(self.summary.levels)
-        # The surrogate of each level; the cases; the text; the data.
-        self._on_part, self._parts, self._ready = on_part, len(self.levels) + 3, 0
-        self._counting = threading.Lock()
-        on_part(0, self._parts)
         self.learns = learns
-        levels = self.levels if learns else []
-        self._surfaces = _meanwhile(partial(_surfaces, run, levels, workers, self.part_ended))
+        self.surfaces: dict[int, Surface | None] = dict.fromkeys(self.levels)
+        for done, level in enumerate(self.levels if learns else ()):
+            surface = self.surfaces[level] = learn_surface(
+                run.outcomes, level, workers, run.tolerated
+            )
+            if surface is not None:
+                surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
+            on_part(done + 1, len(self.levels))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.worst = failures(self.cases)
         self.regions = regions_of(self.worst)
@@ -126,18 +123,6 @@ class ReportModel:
             for box in failure_boxes(self.worst + self.near, level, self.kinds)
         ]
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
-        self.part_ended()
-
-    def part_ended(self) -> None:
-        """Count a part of the report that is ready."""
-        with self._counting:
-            self._ready += 1
-            self._on_part(self._ready, self._parts)
-
-    @property
-    def surfaces(self) -> dict[int, Surface | None]:
-        """What a surrogate says of each level; they are learned while the rest is read."""
-        return {**dict.fromkeys(self.levels), **self._surfaces.result()}
 
     def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
         """Return the coordinates of a level, in the pool's order."""
@@ -150,28 +135,6 @@ class ReportModel:
     def examples_of(self, trouble: Trouble) -> list[Outcome]:
         """Return the cases that are listed for a message."""
         return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
-
-
-def _meanwhile(work: Callable[[], T]) -> Future[T]:
-    """Do some work in a thread of its own."""
-    thread = ThreadPoolExecutor(1)
-    try:
-        return thread.submit(work)
-    finally:
-        thread.shutdown(wait=False)
-
-
-def _surfaces(
-    run: Run, levels: Sequence[int], workers: Workers | None, on_level: Callable[[], None]
-) -> dict[int, Surface | None]:
-    """Return the surrogate of each level; what its map shows is worked out."""
-    surfaces = {}
-    for level in levels:
-        surface = surfaces[level] = learn_surface(run.outcomes, level, workers, run.tolerated)
-        if surface is not None:
-            surface.work_out(GRID.get(len(run.scenario.dimensions(level))))
-        on_level()
-    return surfaces
 
 
 def _is_told(outcome: Outcome) -> bool:

@@ -25,7 +25,6 @@ from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import by_level
-from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
@@ -131,16 +130,15 @@ def _maps(model: ReportModel) -> dict[str, Any]:
 
 
 def _merging(model: ReportModel) -> dict[str, Any] | None:
-    outcomes, lane_m = model.cases, lane_of(model.run.scenario)
+    outcomes = model.cases
     found = merging_of(outcomes)
-    if found is None or lane_m is None:
+    if found is None:
         return None
     levels = {
         f"level {level_name(level)}": merging_of(o for o in outcomes if o.case.level == level)
         for level in model.levels
     }
     return {
-        "picture": picture_of(found, lane_m),
         "rows": [("all", found), *((name, one) for name, one in levels.items() if one)],
         "sites": SITES,
         "headway_s": REAR_HEADWAY_S,

@@ -20,7 +20,6 @@ from merge_sumo.analysis.merging import SOURCE, MergeStatistics
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns.against import AGAINST, earlier_run
 from merge_sumo.campaigns.store import Run
-from merge_sumo.reports.lane_picture import picture_of
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.history import History, LevelOfVersion, RegionChange
@@ -191,11 +190,7 @@ def comparison_page(
         meaning=MEANING,
         more=len(compared.cases) - len(shown),
         lane_m=lane_m,
-        places={
-            name: (found, picture_of(found, lane_m))
-            for name, found in compared.merging.items()
-            if lane_m is not None
-        },
+        places={name: found for name, found in compared.merging.items() if lane_m is not None},
         source=SOURCE,
     )
 

@@ -106,6 +106,13 @@ class TrainingProgress:
     crash_share: float | None  # share of collisions among them; None while refining
     regret: float | None  # a lower bound, `check.QuickRegret`; None where it was not measured
 
+    @property
+    def note(self) -> str:
+        """What was measured, for a bar."""
+        crashes = "" if self.crash_share is None else f"  crashes {self.crash_share:.2%}"
+        regret = "" if self.regret is None else f"  regret at least {self.regret:.2%}"
+        return f"return {self.mean_return:.3f}{crashes}{regret}"
+
 
 @dataclass(frozen=True, slots=True)
 class _Task:
