@@ -32,6 +32,7 @@ import numpy as np
 import traci
 from bench_record import add_record_option, append_record
 from build_fmu import build_fmu
+from export_policy import export_onnx
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
@@ -39,7 +40,6 @@ from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.onnx_export import export_onnx
 from merge_sumo.vuts.registry import VutFactory
 
 STEPS = 80

@@ -49,7 +49,6 @@ from merge_sumo.api.keywords import (
 from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
-    CrosscheckResult,
     PerMergeResult,
     PolicyChecks,
     ProbabilityResult,
@@ -78,7 +77,6 @@ from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
-from merge_sumo.engine.highway_env_simulator import peer_name
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import ONE as ONE_LEVEL
 from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
@@ -99,7 +97,6 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies import crosscheck as peers
 from merge_sumo.studies import (
     explanation,
     reproduction,
@@ -140,7 +137,6 @@ from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
-from merge_sumo.vuts.onnx_export import export_onnx
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.python import SeenBatch, installed_vuts
 from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS, PYTHON
@@ -150,11 +146,10 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
 __all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign"]
-__all__ += ["check_scenario", "check_vut", "compare_runs", "crosscheck", "dated"]
+__all__ += ["check_scenario", "check_vut", "compare_runs", "dated"]
 __all__ += ["benchmark", "export"]
 __all__ += [
     "explain",
-    "export_policy",
     "failures_per_merge",
     "history",
     "new_scenario",
@@ -552,7 +547,7 @@ def export(
     Args:
         run: the campaign, or its folder.
         indices: its cases; of a table all of them when left out.
-        file_format: "sumo", "openscenario" or "commonroad" for folders, "csv" or "parquet" for one
+        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one
             table, or the name of a format that an installed package brings.
         out: folder; `scenarios` or `exports` in that of the campaign when left out.
     """
@@ -923,35 +918,6 @@ def stress(
     with _study_of(before, given, "cases again", cases, engine=None) as study:
         found = ladder.stress(study, draws=draws, seed=seed)
     return StressResult(found, before.folder / ladder.STRESS)
-
-
-def crosscheck(
-    run: AnyRun,
-    *,
-    cases: int | None = None,
-    seed: int = 0,
-    crime: AnyPath | None = None,
-    **given: Unpack[RerunKeywords],
-) -> CrosscheckResult:
-    """Let another simulator run a campaign, and compare; the same as `merge-sumo crosscheck`.
-
-    Writes `crosscheck.json` into the folder of the campaign. Needs the extra `peers`.
-
-    Args:
-        run: the campaign, or its folder.
-        cases: cases that drive there: those recorded, and fresh uniform ones where there are fewer;
-            of more, those with the lowest scores. By default those recorded.
-        seed: of the fresh cases.
-        crime: Python of an environment with commonroad-crime, which then measures merges, too.
-        given: how the drivers run, where it is to change, and where the cases run: see
-            `RerunKeywords`.
-    """
-    check_keywords("crosscheck", given, RerunKeywords)
-    before = _opened(run).run
-    total = len(before.outcomes) if cases is None else cases
-    with _study_of(before, given, peer_name(), total) as study:
-        found = peers.crosscheck(study, cases=cases, seed=seed, crime=_path(crime))
-    return CrosscheckResult(found, before.folder / peers.CROSSCHECK)
 
 
 def repair(
@@ -1337,24 +1303,3 @@ def _manifest_for(
             f"check it, or --scenario {US23.name}"
         )
     return manifest
-
-
-def export_policy(
-    network: str,
-    out: AnyPath,
-    *,
-    policies: AnyPath | None = None,
-    scenario: Scenario | AnyPath | None = None,
-) -> Path:
-    """Write a learned driver as an ONNX network and return its path; as `policies export`.
-
-    Args:
-        network: "pov1", "vut1", "pov2" or "vut2".
-        out: ONNX file to write.
-        policies: folder of learned drivers instead of the shipped ones.
-        scenario: scenario to drive in; by default that of the training.
-    """
-    played = None if scenario is None else scenario_of(scenario)
-    folder = policies_of(played or US23) if policies is None else policies_in(policies)
-    export_onnx(network, Path(out), folder, played)
-    return Path(out)

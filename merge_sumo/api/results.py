@@ -35,7 +35,6 @@ from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.crosscheck import Crosscheck, Verdicts
 from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
 from merge_sumo.studies.stratified import Estimate
@@ -628,69 +627,6 @@ class StressResult(Result):
             drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
             lines.append(f"{found.share(rung) or 0.0:8.1%}{numbers}  {rung.about}{drawn}")
         return [*lines, found.sentence, f"written: {self.file}"]
-
-
-@dataclass(frozen=True, repr=False)
-class CrosscheckResult(Result):
-    """What other simulators say of a campaign.
-
-    Attributes:
-        found: `motion`, `verdicts` and `measured`.
-        file: `crosscheck.json` in the folder of the campaign.
-    """
-
-    found: Crosscheck
-    file: Path
-
-    @property
-    def agrees(self) -> bool:
-        """Whether both simulators move vehicles alike, and each other verdict has its reason."""
-        return self.found.agrees
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {**to_plain(self.found), "agrees": self.agrees, "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return a table of what was compared, and the cases with other verdicts."""
-        found, motion = self.found, self.found.motion
-        lines = [
-            f"{found.vut} in {found.peer} beside SUMO:",
-            f"  motion    {counted(motion.cases, 'recorded case')}, {motion.steps:,} steps: "
-            + motion.in_words,
-        ]
-        if found.verdicts is None:
-            lines.append(f"  verdicts  not compared: {found.why_no_verdicts}")
-        else:
-            lines += _verdict_lines(found.verdicts)
-        if found.measured is not None:
-            lines.append(f"  measures  {found.measured.tool}, {found.measured.cases} merges:")
-            lines += [f"            {one.sentence}" for one in found.measured.measures]
-        return [*lines, f"written: {self.file}"]
-
-
-def _verdict_lines(verdicts: Verdicts) -> list[str]:
-    """Return how many verdicts are the same, and the first of the others."""
-    lines = [
-        f"  verdicts  {counted(verdicts.recorded, 'recorded case')}"
-        f"{', those with the lowest scores,' if verdicts.lowest_only else ''} and "
-        f"{counted(verdicts.fresh, 'fresh case')}, {counted(verdicts.failures, 'failure')} in "
-        f"SUMO: {verdicts.same:,} of {verdicts.cases:,} the same"
-    ]
-    if verdicts.other_motion:
-        lines.append(
-            f"            {counted(verdicts.other_motion, 'case')} of them by another motion, "
-            "where a rounding error decides what a driver answers"
-        )
-    for one in verdicts.differences[:MOST_ROWS]:
-        since = "" if one.time_s is None else f", from {one.time_s:g} s on"
-        lines.append(
-            f"            {'fresh case' if one.fresh else 'case'} {one.index}, level "
-            f"{level_name(one.level)}: {one.in_sumo} in SUMO, {one.in_peer} there: "
-            f"{one.reason}{since}"
-        )
-    more = len(verdicts.differences) - MOST_ROWS
-    return [*lines, f"            and {more} more"] if more > 0 else lines
 
 
 @dataclass(frozen=True, repr=False)

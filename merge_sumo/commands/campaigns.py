@@ -235,7 +235,7 @@ def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
             str,
             "sumo",
             "Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
-            "OpenSCENARIO and OpenDRIVE. commonroad: folders with CommonRoad XML. csv, parquet: "
+            "OpenSCENARIO and OpenDRIVE. csv, parquet: "
             "one table of motion.",
             "--format",
             autocompletion=complete.formats,

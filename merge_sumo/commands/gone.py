@@ -9,6 +9,8 @@ from merge_sumo.errors import UserError
 
 COMMANDS: Final[Mapping[str, str]] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
+    "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
+    "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
     "bounds how much of the pool can fail",
 }
@@ -17,6 +19,8 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--audit": "`merge-sumo probability RUN` bounds, with fresh cases, how much fails where the "
     "campaign expects no failure",
     "--certificate": "`merge-sumo probability RUN --cases 100000` says more than a certificate",
+    "--crime": "measures are not compared with those of CommonRoad-CriMe any more: "
+    "docs/reference/measures.md has their definitions",
     "--in-process": "`merge-sumo run --debug` runs one case within reach of a debugger",
     "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "

@@ -10,12 +10,9 @@ import typer
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import Commands, Given, app
 from merge_sumo.commands.options import HOSTING, PANEL_OF, Shared, flag, option, optional
-from merge_sumo.commands.printing import print_json, show
 
 scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
-policies = Commands(help="The learned drivers as files for others.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario", rich_help_panel=PANEL_OF["scenario"])
-app.add_typer(policies, name="policies")
 
 
 def _scenario_option(help: str, show_default: str) -> Shared:
@@ -152,32 +149,3 @@ def train(given: Given) -> None:
     from merge_sumo import api
 
     given.print(api.train(**given.keywords))
-
-
-@policies.verb(
-    "export",
-    options=["policies"],
-    own={
-        "out": option(Path, ..., "ONNX file to write."),
-        "scenario": _scenario_option(
-            "Scenario that it is to drive in.", "the one it was trained for"
-        ),
-    },
-)
-def export_policy(
-    given: Given,
-    name: Annotated[
-        str, typer.Argument(help="pov1, vut1, pov2 or vut2.", autocompletion=complete.networks)
-    ],
-) -> None:
-    """Write a learned driver as an ONNX network, from the state to the action values.
-
-    Example:  merge-sumo policies export vut1 --out vut1.onnx
-    """
-    from merge_sumo import api
-
-    path = api.export_policy(name, **given.keywords)
-    if given.as_json:
-        print_json({"written": [str(path)]})
-    else:
-        show(path)

@@ -47,7 +47,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Verdict": (*("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),),
     "Where it runs, and what it writes": (
-        *("out", "resume", "crime", "workers", "dask", "junit", "figure"),
+        *("out", "resume", "workers", "dask", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
     "Limits": ("vut_memory",),

@@ -246,43 +246,6 @@ def explain(
 @app.verb(
     options=OF_RECORDED,
     own={
-        "vut": VUT_AGAIN,
-        "cases": optional(
-            int,
-            "Cases that drive there. Fewer than recorded: those with the lowest scores, mostly "
-            "failures. More: fresh uniform ones, too.",
-            show_default="those recorded",
-        ),
-        "seed": SEED,
-        "crime": optional(
-            Path,
-            "Python of an environment with commonroad-crime, to compare measures, too.",
-            metavar="PYTHON",
-        ),
-    },
-)
-def crosscheck(given: Given, run: RunArgument) -> None:
-    """Let another simulator, HighwayEnv, run a campaign, and compare with SUMO.
-
-    Its vehicles are given the recorded accelerations, and must be where SUMO had them; then VUT and
-    POVs drive them, and the criterion of the campaign must give the same verdicts. Writes
-    crosscheck.json into the folder of the campaign, for the report. Needs the extra peers. With
-    --crime, CommonRoad-CriMe measures 20 of the merges.
-
-    Exit code 0 when both agree, 1 where vehicles move otherwise there.
-
-    Example:  merge-sumo crosscheck runs/design2 --cases 1000
-    """
-    from merge_sumo import api
-
-    result = api.crosscheck(run, **given.written)
-    given.print(result)
-    raise typer.Exit(0 if result.agrees else 1)
-
-
-@app.verb(
-    options=OF_RECORDED,
-    own={
         "vut": optional(
             str,
             "The controller to repair.",

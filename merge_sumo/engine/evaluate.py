@@ -14,7 +14,6 @@ from typing import Any, Final, TypeVar, overload
 
 import numpy as np
 
-from merge_sumo.engine.highway_env_simulator import HighwayEnvSimulator
 from merge_sumo.engine.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.simulator import Simulator
@@ -274,7 +273,6 @@ def _open_simulator(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[N
 SIMULATORS: Final[Mapping[Engine, Callable[[SimulationPlan], Simulator]]] = {
     Engine.SUMO: Simulator,
     Engine.KINEMATIC: KinematicSimulator,
-    Engine.HIGHWAY_ENV: HighwayEnvSimulator,
 }
 """What carries out the plans of an engine."""
 

@@ -30,12 +30,6 @@ class Engine(StrEnum):
     SUMO = "sumo"
     KINEMATIC = "kinematic"
     """Eq. (4) alone, with a share of the cases in SUMO, too (`kinematic_simulator.py`)."""
-    HIGHWAY_ENV = "highway-env"
-    """HighwayEnv, which crosschecks compare with SUMO (`highway_env_simulator.py`)."""
-
-
-CHOICES: Final = (Engine.SUMO, Engine.KINEMATIC)
-"""Engines that a person may choose; the outcomes of both are SUMO's."""
 
 
 def versions() -> dict[str, str]:
@@ -124,8 +118,8 @@ class SimulationPlan:
         if engine is None:
             kinematic = self.needs_sumo is None
             return replace(self, engine=Engine.KINEMATIC if kinematic else Engine.SUMO)
-        if engine not in CHOICES:
-            raise UserError(f"there is no engine {engine!r}: choose {' or '.join(CHOICES)}")
+        if engine not in list(Engine):
+            raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
         if engine == Engine.KINEMATIC and self.needs_sumo is not None:
             raise UserError(f"--engine kinematic: {self.needs_sumo}; choose --engine sumo")
         return replace(self, engine=Engine(engine))

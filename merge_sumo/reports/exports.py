@@ -1,4 +1,4 @@
-"""Cases of a campaign for others: SUMO folders, OpenSCENARIO, CommonRoad, tables of motion.
+"""Cases of a campaign for others: SUMO folders, OpenSCENARIO, tables of motion.
 
 Nothing here loads libsumo. Parquet is written by polars and not by pyarrow: libsumo is linked with
 an Arrow of its own and warns wherever a pyarrow is installed.
@@ -22,7 +22,6 @@ from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
-from merge_sumo.road.commonroad import commonroad
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -204,23 +203,6 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     return folder / f"{name}.xosc"
 
 
-def write_commonroad(run: Run, index: int, folder: Path, road: Corridor) -> Path:
-    """Write a case as CommonRoad XML, twice; return the path of the first.
-
-    In the first all cars follow their recorded trajectories; in the second, `...-free.xml`, there
-    is no VUT, whose start is the planning problem of both. Raises `UserError` when the folder
-    exists, or the case has no step.
-    """
-    trajectory, name = run.trajectory(index), case_name(index)
-    if len(trajectory.motion) < 2:
-        raise UserError(f"{name} ended before its first step: there is no motion to write")
-    with new_folder(folder) as new:
-        for suffix, free in (("", False), ("-free", True)):
-            made = commonroad(trajectory, road, number=index + 1, source=run.vut, free=free)
-            (new / f"{name}{suffix}.xml").write_bytes(made)
-    return folder / f"{name}.xml"
-
-
 def _scenario(
     xosc: Any, trajectory: Trajectory, road: Corridor, name: str, title: str, *, free: bool
 ) -> Any:
@@ -367,9 +349,6 @@ SUMO: Final = ExportFormat(
 )
 OPENSCENARIO: Final = ExportFormat(
     about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
-)
-COMMONROAD: Final = ExportFormat(
-    about="folders with CommonRoad scenarios", write_case=write_commonroad
 )
 CSV: Final = ExportFormat(
     about="one table of motion", write_table=partial(write_table, file_format="csv")

@@ -13,7 +13,6 @@ FORMATS: Final[Registry[ExportFormat]] = Registry(
     {
         "sumo": "merge_sumo.reports.exports:SUMO",
         "openscenario": "merge_sumo.reports.exports:OPENSCENARIO",
-        "commonroad": "merge_sumo.reports.exports:COMMONROAD",
         "csv": "merge_sumo.reports.exports:CSV",
         "parquet": "merge_sumo.reports.exports:PARQUET",
     },

@@ -29,7 +29,6 @@ from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.crosscheck import crosscheck_of
 from merge_sumo.studies.stress import NOTHING
 from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
@@ -165,30 +164,6 @@ def _in_words(model: ReportModel) -> dict[str, Any] | None:
     }
 
 
-def _peers(model: ReportModel) -> dict[str, Any] | None:
-    found = crosscheck_of(model.run.folder)
-    if found is None:
-        return None
-    verdicts = found.verdicts
-    differences = () if verdicts is None else verdicts.differences
-    reasons = Counter(_shown(one.reason) for one in differences)
-    return {
-        "found": found,
-        "peer": _shown(found.peer),
-        "why": _shown(found.why_no_verdicts),
-        "reasons": reasons.most_common(LISTED),
-        "measures": [
-            {
-                "title": f"{_shown(one.name)} beside {_shown(one.peer_name)}",
-                "definition": _shown(one.definition),
-                "of": one,
-            }
-            for one in (() if found.measured is None else found.measured.measures)
-        ],
-        "tool": "" if found.measured is None else _shown(found.measured.tool),
-    }
-
-
 def _stress(model: ReportModel) -> dict[str, Any] | None:
     found = model.stress
     if found is None:
@@ -296,7 +271,6 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "merging": ReportSection(template=_own("merging"), words=_merging),
         "words": ReportSection(template=_own("words"), words=_in_words),
         "stress": ReportSection(template=_own("stress"), words=_stress),
-        "peers": ReportSection(template=_own("peers"), words=_peers),
         "cases": ReportSection(template=_own("cases"), words=_cases),
         "all": ReportSection(template=_own("all")),
         "about": ReportSection(template=_own("about"), words=_about),

@@ -67,7 +67,7 @@ class TestOptions:
             for option in ("as_json", "quiet", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
-        again = {"crosscheck", "explain", "repair", "stress"}
+        again = {"explain", "repair", "stress"}
         fresh = {*again, "failures-per-merge", "probability"}
         runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
@@ -77,7 +77,7 @@ class TestOptions:
 
 class TestHelp:
     @pytest.mark.parametrize("columns", [80, 100])
-    @pytest.mark.parametrize("name", ["", "scenario", "policies", *COMMANDS])
+    @pytest.mark.parametrize("name", ["", "scenario", *COMMANDS])
     def test_wraps_no_paragraph_twice(self, name, columns):
         shown = help_of(name, columns)
         above = shown.split("╭")[0].splitlines()
@@ -130,7 +130,6 @@ class TestCompletion:
             ("campaign --sampler co", "coverage"),
             ("campaign --level o", "own"),
             ("check-vut des", "design1"),
-            ("policies export vu", "vut1"),
         ],
     )
     def test_answers_a_shell(self, typed, wanted):

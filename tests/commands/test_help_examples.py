@@ -62,8 +62,6 @@ def test_there_are_examples_of_every_command():
 def test_runs(example, place, monkeypatch, tmp_path):
     monkeypatch.chdir(place)
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
-    if example.split()[1] == "crosscheck":
-        require(find_spec("highway_env") is not None, "highway-env is not installed")
     if example.split()[1] == "repair":
         require(find_spec("optuna") is not None, "optuna is not installed")
     words = [word for word in shlex.split(example) if word != "--gui"]

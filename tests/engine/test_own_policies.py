@@ -243,13 +243,9 @@ class TestOtherCommands:
         said = call("vuts", "--policies", one)[1]
         assert "built in: level0, design1, design2, gap, roundabout, careful, " in said
 
-    def test_a_check_and_an_export_take_them(self, call, swapped, one):
+    def test_a_check_takes_them(self, call, swapped, one):
         assert call("check-vut", "level1", "--policies", swapped)[0] == 0
         assert_refused(call("check-vut", "level1", "--policies", one), f"no policy 'vut1' in {one}")
-        pytest.importorskip("onnx")
-        for name, folder in (("vut1", swapped), ("pov1", policies_of(scenario=US23))):
-            assert call("policies", "export", name, "--out", name, "--policies", folder)[0] == 0
-        assert Path("vut1").read_bytes().replace(b"vut1", b"pov1") == Path("pov1").read_bytes()
 
     @pytest.mark.parametrize(
         "command",
@@ -260,7 +256,6 @@ class TestOtherCommands:
             ("reproduce", "--quick"),
             ("vuts",),
             ("check-vut", "design1"),
-            ("policies", "export", "vut1", "--out", "vut1.onnx"),
         ],
         ids=lambda command: command[0],
     )

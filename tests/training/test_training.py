@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from calling import invoke
+from export_policy import export_onnx
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector as vector_wrappers
 from merges import HALF, LIKE_A_ROUNDABOUT
@@ -36,7 +37,6 @@ from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.scenario import US23
-from merge_sumo.vuts.onnx_export import export_onnx
 
 WEIGHTS = reward.RewardWeights()
 REWARD = reward.Reward(WEIGHTS, US23)

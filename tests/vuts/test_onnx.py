@@ -8,13 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from export_policy import export_onnx
 from merges import HALF, SMALLER
 from networks import constant_network as network
 from plans import plan_for
-from typer.testing import CliRunner
 from vut_contract import begin, cases_of, in_process, on_lane, run_cases
 
-from merge_sumo.cli import app
 from merge_sumo.drivers.base import MERGE, STAY
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.policies import NETWORKS, load_network
@@ -23,7 +22,6 @@ from merge_sumo.studies.truth import ground_truth
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
-from merge_sumo.vuts.onnx_export import export_onnx
 
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
@@ -63,8 +61,7 @@ def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenar
 
 
 def test_an_export_says_for_which_scenario_it_is_and_what_its_actions_are(exported, tmp_path):
-    done = CliRunner().invoke(app, ["policies", "export", "vut1", "--out", str(tmp_path / "a")])
-    assert done.exit_code == 0, done.output
+    export_onnx("vut1", tmp_path / "a")
     assert (tmp_path / "a").read_bytes() == (exported / "vut1.onnx").read_bytes()
     export_onnx("vut1", tmp_path / "b", scenario=HALF)
     for path, expected in (("a", "-4 -3 -2 -1 0 1 2"), ("b", "-2 -1.5 -1 -0.5 0 0.5 1")):

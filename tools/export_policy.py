@@ -1,4 +1,6 @@
-"""Learned drivers as ONNX networks, from the state to the action values.
+"""Write a learned driver as an ONNX network: `python tools/export_policy.py vut1 vut1.onnx`.
+
+The network takes the state and gives the action values. `--policies DIR` names another library.
 
 The features are part of the graph. They are not written down a second time: the very function that
 computes them runs on columns that record what is done to them.
@@ -6,6 +8,8 @@ computes them runs on columns that record what is done to them.
 
 from __future__ import annotations
 
+import argparse
+import sys
 from pathlib import Path
 from typing import Any, Final
 
@@ -152,3 +156,22 @@ class _Column(NDArrayOperatorsMixin):
             raise TypeError(f"{function.__name__} has no ONNX operator here")
         (name,) = self._graph.node("Concat", *(c.name for c in arguments[0]), axis=1)
         return _Column(self._graph, name)
+
+
+def main() -> int:
+    """Export the policy of the command line; return the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("name", help=" or ".join(NETWORKS))
+    parser.add_argument("out", type=Path, help="new ONNX file")
+    parser.add_argument("--policies", type=Path, help="folder of learned drivers")
+    options = parser.parse_args()
+    try:
+        export_onnx(options.name, options.out, options.policies)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
