@@ -6,7 +6,6 @@ with any kind of colour vision (Okabe and Ito, 2008).
 
 from __future__ import annotations
 
-import html
 import importlib
 import io
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,7 +35,7 @@ LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9", OWN: "#009E73"
 LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^", OWN: "D"}
 SAFE_COLOUR: Final = "#c4c9cf"
 DPI: Final = 150
-KINDS: Final = (".png", ".svg", ".html")
+KINDS: Final = (".png", ".svg")
 STYLE: Final[Any] = {
     "font.size": 10,
     "axes.titlesize": 11,
@@ -55,7 +54,7 @@ STYLE: Final[Any] = {
 def check_figure(path: Path) -> None:
     """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
     if path.suffix not in KINDS:
-        raise UserError(f"--figure is {path}: end it in {', '.join(KINDS[:-1])} or {KINDS[-1]}")
+        raise UserError(f"--figure is {path}: end it in {' or '.join(KINDS)}")
     check_new_file(path, "--figure")
     require_matplotlib()
 
@@ -69,31 +68,15 @@ def require_matplotlib() -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG, SVG or a page that needs no network, by the end of the file's name.
-
-    Raises `UserError` when the file exists or cannot be written.
-    """
-    if path.suffix == ".html":
-        with io.StringIO() as text:
-            _write(figure, text, "svg")
-            svg = text.getvalue()
-        title = html.escape(figure.get_suptitle())
-        page = f'<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n<title>{title}'
-        content = f"{page}</title>\n{svg[svg.index('<svg') :]}".encode(errors="backslashreplace")
-    else:
-        with io.BytesIO() as picture:
-            _write(figure, picture, path.suffix[1:])
-            content = picture.getvalue()
-    write_new(path, content, "--figure")
-
-
-def _write(figure: Figure, file: Any, kind: str) -> None:
+    """Write a figure as PNG or SVG; `UserError` when the file exists or cannot be written."""
     import matplotlib
 
     # No date: the same numbers give the same file.
+    kind = path.suffix[1:]
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(file, format=kind, dpi=DPI, metadata=metadata)
+    with io.BytesIO() as picture, matplotlib.rc_context(STYLE):
+        figure.savefig(picture, format=kind, dpi=DPI, metadata=metadata)
+        write_new(path, picture.getvalue(), "--figure")
 
 
 @contextmanager
@@ -164,24 +147,21 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
 def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
     """Draw where cases were run and where they failed, a panel per sampler, in the pool's units.
 
-    The pale discs around failures are what FMC counts. At level 2 the panels are boxes.
+    The pale discs around failures are what FMC counts; of three coordinates the first two are
+    drawn, without discs.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    solid = level == 2
-    with _drawing(3.6 * columns, (3.5 if solid else 3.1) * rows + 0.4) as figure:
+    with _drawing(3.6 * columns, 3.1 * rows + 0.4) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
         for place, (name, panel) in enumerate(panels.items(), start=1):
-            kind = {"projection": "3d"} if solid else {}
-            axes: Any = figure.add_subplot(rows, columns, place, **kind)
-            (_box if solid else _map)(axes, panel, level, colour(name))
-            if not solid:
-                axes.label_outer()
-            say = axes.text2D if solid else axes.text
+            axes = figure.add_subplot(rows, columns, place)
+            _map(axes, panel, level, colour(name))
+            axes.label_outer()
             found = f"{int(np.sum(panel.failed))} of {len(panel.points)} fail"
             line: Any = {"transform": axes.transAxes, "va": "bottom"}
-            say(0.0, 1.02, name, color=colour(name), fontweight="bold", fontsize=11, **line)
-            say(1.0, 1.02, f"{found}, FMC {panel.fmc:.4f}", ha="right", fontsize=8.5, **line)
+            axes.text(0.0, 1.02, name, color=colour(name), fontweight="bold", fontsize=11, **line)
+            axes.text(1.0, 1.02, f"{found}, FMC {panel.fmc:.4f}", ha="right", fontsize=8.5, **line)
     return figure
 
 
@@ -196,7 +176,7 @@ def _physical(points: FloatArray, level: int) -> FloatArray:
 def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
     from matplotlib.collections import EllipseCollection
 
-    x, v = dimensions(level)
+    x, v, *more = dimensions(level)
     failing = _physical(panel.points[panel.failed], level)
     safe = _physical(panel.points[~panel.failed], level)
     size = 3.0 if len(panel.points) > 2000 else 8.0
@@ -207,12 +187,13 @@ def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
         [2 * RADIUS * (v.high - v.low)],
         [0.0],
         units="xy",
-        offsets=failing,
+        offsets=failing[:, :2],
         offset_transform=axes.transData,
         facecolor=_pale(ink),
         linewidths=0,
     )
-    axes.add_collection(balls)
+    if not more:
+        axes.add_collection(balls)
     axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
     _pool_axes(axes, x, v)
 
@@ -232,30 +213,6 @@ def _pool_axes(axes: Axes, x: Dimension, y: Dimension) -> None:
     axes.set_xlabel(US23.notation[x.field].symbol)
     axes.set_ylabel(US23.notation[y.field].symbol)
     axes.xaxis.set_major_locator(MaxNLocator(5))
-
-
-def _box(axes: Any, panel: Panel, level: int, ink: str) -> None:
-    failing = _physical(panel.points[panel.failed], level)
-    safe = _physical(panel.points[~panel.failed], level)
-    few = len(panel.points) <= 2000
-    dots: Any = {"linewidths": 0, "depthshade": False}
-    if few:
-        axes.scatter(*safe.T, s=3, color=SAFE_COLOUR, alpha=0.7, **dots)
-    # The shadows on the floor say where in x and v a failure floats.
-    floor = np.full(len(failing), dimensions(level)[2].low)
-    axes.scatter(failing[:, 0], failing[:, 1], floor, s=8, color=_pale(ink), **dots)
-    axes.scatter(*failing.T, s=14 if few else 7, color=ink, **dots)
-    for side, d in zip("xyz", dimensions(level), strict=True):
-        getattr(axes, f"set_{side}lim")(d.low, d.high)
-        getattr(axes, f"set_{side}label")(US23.notation[d.field].symbol)
-        axis = getattr(axes, f"{side}axis")
-        axis.set_pane_color((0.97, 0.97, 0.98, 1.0))
-        axis.line.set_color("#57606a")
-        axis._axinfo["grid"].update(color="#dfe3e8", linewidth=0.6)
-    axes.locator_params(nbins=4)
-    axes.view_init(elev=22, azim=-60)
-    axes.set_box_aspect(None, zoom=0.86)
-    axes.tick_params(labelsize=7, pad=0)
 
 
 def predicted_scores(

@@ -21,7 +21,7 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
-from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.store import Run, failures, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.report_model import ReportModel
@@ -93,19 +93,9 @@ def shown(browser, file: Path, **options) -> Iterator:
     assert complaints == []
 
 
-@pytest.fixture
-def page(browser, made):
-    with shown(browser, made.folder / report.REPORT) as opened:
-        yield opened
-
-
 def chosen(page) -> int:
     """Return the index of the case that is shown."""
     return int(page.inner_text("#case-title").split()[1])
-
-
-def marks(page, kind: str) -> int:
-    return page.locator(f".map[data-level='2'] {kind}").count()
 
 
 NARROW = {"viewport": {"width": 380, "height": 800}}
@@ -171,38 +161,54 @@ def test_marks_filters_and_table_know_the_four_words(browser, made):
         assert words == sorted(words, key=order.index), "the most severe first"
 
 
-def test_it_starts_with_the_worst_case(page, made):
-    assert chosen(page) == failures(made.outcomes)[0].index
-    worst = failures(made.outcomes)[0].measures.severity
-    assert page.inner_text("#case-words").lower().startswith(worst)
-
-
-def test_the_slider_shows_the_cases_near_a_psi(page, made):
-    third = page.locator(".map[data-level='2'] .third")
-    slider, value = third.locator("input[type=range]"), third.locator("output")
-    slider.fill("0.2")
-    assert value.inner_text() == "0.20 rad (11°)"
-    all_of_level = sum(o.case.level == 2 for o in made.outcomes)
-    near = sum(o.case.level == 2 and abs(o.case.svo_rad - 0.2) <= 0.1 for o in made.outcomes)
-    assert marks(page, ".mark.faint") == all_of_level - near
-    slider.focus()
-    page.keyboard.press("ArrowRight")
-    assert value.inner_text().startswith("0.21 rad")
-    third.locator("input[type=checkbox]").check()
-    assert marks(page, ".mark.faint") == 0
-
-
-def test_a_click_on_a_case_shows_it(page, made):
-    mark = page.locator(".map[data-level='0'] .mark.fail").last
-    mark.scroll_into_view_if_needed()
-    box = mark.bounding_box()
-    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    outcome = made.outcome(chosen(page))
-    assert outcome.failed
-    assert outcome.case.level == 0
-    assert f"x_POV0 \u2212{-outcome.case.x_pov0_m:.1f} m" in page.inner_text("#case-title")
-    command = f"merge-sumo replay {made.folder} {outcome.index} --gui"
-    assert page.inner_text("#command") == command
+def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
+    """One page: the worst case, slider, lists, map, animation, command, zoom, print."""
+    worst = [o.index for o in spread_failures(made.outcomes)]
+    allowed = ["clipboard-read", "clipboard-write"]
+    with shown(browser, made.folder / report.REPORT, permissions=allowed) as page:
+        assert chosen(page) == worst[0]
+        last = len(made.trajectory(worst[0]).motion) - 1
+        assert page.input_value("#time") == str(last), "a failure is shown as it ended"
+        page.locator("#copy").click()
+        page.locator("#copy:text('Copied')").wait_for()
+        command = f"merge-sumo replay {made.folder} {worst[0]} --gui"
+        assert page.evaluate("navigator.clipboard.readText()") == command
+        page.locator("#time").fill("0")
+        before = page.locator("#road").get_attribute("viewBox")
+        page.locator("#play").click()
+        for _ in range(600):
+            if int(page.input_value("#time")) > 3:
+                break
+            page.wait_for_timeout(50)
+        page.locator("#play").click()
+        assert page.locator("#road").get_attribute("viewBox") != before
+        third = page.locator(".map[data-level='2'] .third")
+        third.locator("input[type=range]").fill("0.2")
+        assert third.locator("output").inner_text() == "0.20 rad (11\u00b0)"
+        far = [o for o in made.outcomes if o.case.level == 2 and abs(o.case.svo_rad - 0.2) > 0.1]
+        faint = page.locator(".map[data-level='2'] .mark.faint")
+        assert faint.count() == len(far)
+        third.locator("input[type=checkbox]").check()
+        assert faint.count() == 0
+        page.locator(".list button").first.focus()
+        page.keyboard.press("ArrowDown")
+        assert chosen(page) == worst[1]
+        page.locator(".map[data-level='0'] > svg").focus()
+        page.keyboard.press("ArrowLeft")
+        start = made.outcome(chosen(page)).case
+        page.keyboard.press("ArrowUp")
+        assert made.outcome(chosen(page)).case.v_pov0_mps > start.v_pov0_mps
+        page.keyboard.press("Escape")
+        marks = page.locator(".map[data-level='0'] .mark")
+        whole = marks.count()
+        page.locator(".map[data-level='0'] [aria-label='Zoom in']").click()
+        page.locator(".map[data-level='0'] [aria-label='Zoom in']").click()
+        assert marks.count() < whole
+        page.locator("#about").click()
+        assert page.locator("#chart-fmc .line").first.is_visible()
+        page.emulate_media(media="print")
+        assert not page.locator("#play").is_visible()
+        assert page.locator(".levels").is_visible()
 
 
 def in_sight(page, part: str) -> bool:
@@ -307,34 +313,6 @@ def test_all_cases_sort_and_open(browser, made, size):
         page.keyboard.press("ArrowDown")
         assert chosen(page) == rows(page)[6]
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-
-
-def test_all_cases_are_filtered_by_level_verdict_region_kind_and_measure(browser, made):
-    found = failures(made.outcomes)
-    region = regions_of(found)
-    with shown(browser, made.folder / report.REPORT) as page:
-        filters = page.locator("#filters")
-        filters.locator("[name=verdict]").select_option("failure")
-        assert sorted(rows(page)) == sorted(o.index for o in found)
-        filters.locator("[name=level]").select_option("1")
-        of_level = [o for o in found if o.case.level == 1]
-        assert sorted(rows(page)) == sorted(o.index for o in of_level)
-        filters.locator("[name=region]").select_option("1:0")
-        assert sorted(rows(page)) == sorted(o.index for o in of_level if region[o.index] == 0)
-        assert set(column(page, "region")) == {"1"}
-        filters.locator(".reset").click()
-        page.locator("#matching:text('180 of 180')").wait_for()
-        kind = filters.locator("[name=kind] option").nth(1).get_attribute("value")
-        filters.locator("[name=kind]").select_option(kind)
-        assert set(column(page, "kind")) == {kind}
-        filters.locator(".reset").click()
-        page.locator("#matching:text('180 of 180')").wait_for()
-        filters.locator("[name=measure]").select_option(label="Δx at M m")
-        filters.locator("[name=from]").fill("-8")
-        filters.locator("[name=to]").fill("-6")
-        inside = [o.index for o in made.outcomes if -8 <= round(o.measures.dx_m or 0, 4) <= -6]
-        assert sorted(rows(page)) == inside
-        assert inside
 
 
 def bright(page) -> list[int]:
@@ -465,54 +443,6 @@ def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formul
         assert [int(row["case"]) for row in table] == rows(page)
 
 
-def test_a_map_zooms_about_the_case_and_is_dragged(page, made):
-    index = failures(made.outcomes)[0].index
-    figure = f".map[data-level='{made.outcome(index).case.level}']"
-    mark, whole = f"{figure} [data-case='{index}'].mark", page.locator(f"{figure} .mark").count()
-    click(page, mark)
-    page.keyboard.press("Escape")
-    for _ in range(2):
-        page.locator(f"{figure} [aria-label='Zoom in']").click()
-    assert page.locator(f"{figure} .mark").count() < whole
-    frame, box = (page.locator(part).bounding_box() for part in (f"{figure} .frame", mark))
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    assert frame["x"] <= x <= frame["x"] + frame["width"]
-    page.mouse.move(x, y)
-    page.mouse.down()
-    page.mouse.move(x + 5, y + 5)
-    page.mouse.move(x + 20, y + 10)
-    page.mouse.up()
-    assert chosen(page) == index, "a drag is no click"
-    page.locator(f"{figure} button", has_text="All").click()
-    assert page.locator(f"{figure} .mark").count() == whole
-
-
-@WINDOWS
-def test_two_cases_are_compared(browser, made, size):
-    viewport = {"width": size[0], "height": size[1]}
-    first, second = (o.index for o in spread_failures(made.outcomes)[:2])
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        page.locator("#keep").click()
-        page.locator(f".list [data-case='{second}']").click()
-        assert chosen(page) == second
-        assert page.inner_text("#beside-title").startswith(f"Case {first} ")
-        word = made.outcome(first).measures.severity
-        assert page.inner_text("#beside-words").lower().startswith(word)
-        if size[0] < 1000:
-            assert page.locator("#case").evaluate("(panel) => panel.matches('.docked')")
-        page.evaluate("dock(true)")
-        upper, lower = (page.locator(part).bounding_box() for part in ("#keep", ".case-command"))
-        assert upper["y"] + upper["height"] <= lower["y"]
-        for chart, lines in (("speed", 2), ("position", 2), ("gap", 1)):
-            assert page.locator(f"#chart-{chart} .line.beside").count() == lines
-            assert page.locator(f"#chart-{chart} .line").count() == 2 * lines
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        page.locator("#keep").click()
-        assert page.locator(".line.beside").count() == 0
-        for part in ("#beside", "#view-beside"):
-            assert not page.locator(part).is_visible()
-
-
 def placed(page, view: str, who: str) -> tuple[float, float]:
     """Return where a car is drawn, in metres."""
     moved = page.locator(f"#{view} g:has(> rect.{who})").get_attribute("transform")
@@ -568,82 +498,6 @@ def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, 
         assert 3 < int(page.input_value("#time")) < last
         assert placed(page, "view", "vut") == placed(page, "view-beside", "vut")
         assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-
-
-def test_a_command_breaks_between_words_only(browser, made):
-    viewport = {"width": 390, "height": 800}
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        words = page.locator("#command span")
-        rows = words.evaluate_all("all => all.map((word) => word.getClientRects().length)")
-        assert rows == [1] * len(f"merge-sumo replay {made.folder} 1 --gui".split())
-
-
-def test_arrow_keys_move_through_the_lists(page, made):
-    worst = [o.index for o in spread_failures(made.outcomes)]
-    page.locator(".list button").first.focus()
-    for expected in (worst[1], worst[2]):
-        page.keyboard.press("ArrowDown")
-        assert chosen(page) == expected
-    page.keyboard.press("ArrowUp")
-    assert chosen(page) == worst[1]
-
-
-def test_arrow_keys_move_over_a_map(page, made):
-    page.locator(".map[data-level='0'] > svg").focus()
-    page.keyboard.press("ArrowLeft")
-    start = made.outcome(chosen(page))
-    assert start.case.level == 0
-    page.keyboard.press("ArrowLeft")
-    left = made.outcome(chosen(page))
-    assert left.case.x_pov0_m < start.case.x_pov0_m
-    page.keyboard.press("ArrowUp")
-    assert made.outcome(chosen(page)).case.v_pov0_mps > left.case.v_pov0_mps
-
-
-def test_the_animation_plays_pauses_and_is_scrubbed(page, made):
-    last = len(made.trajectory(chosen(page)).motion) - 1
-    assert page.input_value("#time") == str(last), "a failure is shown as it ended"
-    page.locator("#time").fill("0")
-    assert page.inner_text("#time-value") == "0.0 s"
-    before = page.locator("#road").get_attribute("viewBox")
-    page.locator("#play").focus()
-    page.keyboard.press("Enter")
-    assert page.locator("#play").get_attribute("aria-label") == "Pause"
-    for _ in range(600):
-        if int(page.input_value("#time")) > 3:
-            break
-        page.wait_for_timeout(50)
-    assert int(page.input_value("#time")) > 3
-    page.keyboard.press("Enter")
-    assert page.locator("#play").get_attribute("aria-label") == "Play"
-    assert page.locator("#road").get_attribute("viewBox") != before
-    page.locator("#time").focus()
-    page.keyboard.press("End")
-    assert page.input_value("#time") == str(last)
-
-
-def test_the_command_is_copied(browser, made):
-    with shown(
-        browser, made.folder / report.REPORT, permissions=["clipboard-read", "clipboard-write"]
-    ) as page:
-        page.locator("#copy").click()
-        page.locator("#copy:text('Copied')").wait_for()
-        assert page.evaluate("navigator.clipboard.readText()") == page.inner_text("#command")
-
-
-def test_print_leaves_out_what_cannot_be_pressed(page):
-    page.emulate_media(media="print")
-    assert not page.locator("#play").is_visible()
-    assert page.locator(".map .mark.fail").first.is_visible()
-
-
-def test_nothing_from_outside_runs(browser, tmp_path):
-    run = write_run(tmp_path / "run", per_level=10, vut=EVIL, error=EVIL)
-    report.write_report(run)
-    with shown(browser, run.folder / report.REPORT) as page:
-        assert page.inner_text("h1") == EVIL
-        page.locator(".list button").first.click()
-        assert EVIL in page.inner_text("#case-words")
 
 
 def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(browser, tmp_path):
@@ -725,19 +579,11 @@ def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
     return x - u, y - v
 
 
-@pytest.mark.slow
-@LOOKS
-def test_a_campaign_in_traffic_fits_the_window_too(browser, in_traffic, options):
-    with shown(browser, in_traffic.folder / report.REPORT, **options) as page:
-        width = page.evaluate("document.documentElement.scrollWidth")
-        assert width <= page.viewport_size["width"]
-        assert page.locator(".map .mark").count() == len(in_traffic.outcomes)
-
-
 def test_of_more_coordinates_the_reader_chooses_a_pair(browser, in_traffic):
     worst = failures(in_traffic.outcomes)[0]
     level = worst.case.level
-    with shown(browser, in_traffic.folder / report.REPORT) as page:
+    with shown(browser, in_traffic.folder / report.REPORT, **NARROW) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["viewport"]["width"]
         for choice in page.locator(f".map[data-level='{level}'] option").all_inner_texts():
             page.locator(f".map[data-level='{level}'] select").select_option(choice)
             axes = [name.strip() for name in choice.partition(":")[0].split("×")]

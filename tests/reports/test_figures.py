@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 from matplotlib.text import Annotation
-from mpl_toolkits.mplot3d import Axes3D
 from PIL import Image
 
 from merge_sumo.errors import UserError
@@ -79,12 +78,6 @@ class TestTheMaps:
         assert "(m/s)" in axes.get_ylabel()
         assert "1 of 2 fail, FMC 0.0079" in [text.get_text() for text in axes.texts]
 
-    def test_at_level_2_are_boxes_with_the_social_value_orientation(self):
-        figure = figures.maps("t", {"truth": panel(30, 3), "gpr": panel(30, 3)}, 2)
-        (axes, _) = figure.axes
-        assert isinstance(axes, Axes3D)
-        assert "(rad)" in axes.get_zlabel()
-
     def test_of_no_failures_are_drawn_too(self, tmp_path):
         for dims, level in ((2, 1), (3, 2)):
             safe = Panel(np.full((3, dims), 0.5), np.zeros(3, dtype=bool), 0.0)
@@ -126,7 +119,7 @@ def test_every_sampler_has_a_colour_of_its_own():
 
 
 class TestAFile:
-    @pytest.mark.parametrize("kind", [".png", ".svg", ".html"])
+    @pytest.mark.parametrize("kind", [".png", ".svg"])
     def test_is_the_same_for_the_same_numbers(self, tmp_path, kind):
         first, second = tmp_path / f"first{kind}", tmp_path / f"second{kind}"
         for path in (first, second):
@@ -138,13 +131,6 @@ class TestAFile:
         with Image.open(tmp_path / "f.png") as image:
             assert image.size[0] > 1000
             assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50, "it is not one colour"
-
-    def test_as_a_page_needs_no_network(self, tmp_path):
-        figures.save(curves(), tmp_path / "f.html")
-        page = (tmp_path / "f.html").read_text()
-        assert "<title>design1 v level 0</title>" in page
-        assert page.count("<svg") == 1
-        assert "<script" not in page
 
     def test_without_matplotlib_is_refused_in_a_sentence(self, tmp_path, monkeypatch):
         def refuse(name: str):
