@@ -39,7 +39,7 @@ def cli_page() -> str:
 
 
 SHARED = (
-    *("level", "scenario", "policies", "pov", "fail_when", "deadline", "workers", "dask"),
+    *("level", "scenario", "policies", "pov", "fail_when", "deadline", "workers"),
     *("out", "json", "quiet"),
 )
 """Options that several commands have, as columns of a table."""

@@ -182,7 +182,7 @@ def campaign(
             `seed`, `stop_after_converged`, `learn_from`), how a case is run
             and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
             `deadline_s`, `vut_memory_gib`), where it runs
-            (`workers`, `dask`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
+            (`workers`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);
             see `CampaignKeywords`.
 
     An interrupted campaign goes on with `resume`.
@@ -298,7 +298,11 @@ def _write_findings(
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit. More workers than cores
     # would learn each surrogate more often than that saves time.
-    local = opened if runner.dask is None and opened.count <= workers_or_cores(None) else None
+    local = (
+        opened
+        if not isinstance(runner.workers, str) and opened.count <= workers_or_cores(None)
+        else None
+    )
     write_report(done, result.summary, local, page)
 
 
@@ -1075,7 +1079,7 @@ def reproduce(
     folder = dated("reproduce") if out is None else Path(out)
     figures.require_matplotlib()
     with (
-        evaluation_workers(runner.workers, runner.dask) as opened,
+        evaluation_workers(runner.workers) as opened,
         Bars(shown=runner.progress) as bars,
     ):
         make_folder(folder)

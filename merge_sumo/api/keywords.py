@@ -16,7 +16,7 @@ from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.progress import Counter
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.system.workers import HERE_S, Workers
+from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
 from merge_sumo.values.imperfection import Actuation, Sensing
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
@@ -116,15 +116,13 @@ class Running(TypedDict, total=False):
     """Where the cases of a verb run; the outcomes are the same everywhere.
 
     Attributes:
-        workers: processes that run cases, 1 by default. None is one a core, where a campaign, a
-            rerun or fresh cases begin in this process and go on in those once cases have taken some
-            seconds.
-        dask: address of a Dask scheduler whose workers run the cases instead.
+        workers: processes that run cases, 1 by default, or the address of a Dask scheduler whose
+            workers run them, "tcp://HOST:PORT". None is one a core, where a campaign, a rerun or
+            fresh cases begin in this process and go on in those once cases have taken some seconds.
         progress: show progress; by default in a notebook and on a terminal.
     """
 
-    workers: int | None
-    dask: str | None
+    workers: AnyWorkers
     progress: bool | None
 
 
@@ -167,8 +165,7 @@ class Runner:
     The fields are those of `Running` and the last four of `CampaignKeywords`.
     """
 
-    workers: int | None = 1
-    dask: str | None = None
+    workers: AnyWorkers = 1
     progress: bool | None = None
     on_case: OnCase | None = None
     check: Callable[[], None] | None = None
@@ -186,7 +183,7 @@ class Runner:
         Where nobody says how many, processes are started `at_once`, or as soon as they pay.
         """
         here_s = HERE_S if self.workers is None and not at_once else None
-        return evaluation_workers(plan.workers(self.workers), self.dask, here_s)
+        return evaluation_workers(plan.workers(self.workers), here_s)
 
     def counter(self, title: str, total: int, unit: str = "cases") -> Counter:
         """Return a bar that counts things called `unit`, to be used in `with`."""
@@ -299,7 +296,7 @@ def given_again(
     return fields, replace(runner, workers=workers)
 
 
-def _earlier_of(given: Mapping[str, Any], workers: int | None) -> tuple[dict[str, str], int | None]:
+def _earlier_of(given: Mapping[str, Any], workers: AnyWorkers) -> tuple[dict[str, str], AnyWorkers]:
     """Return the spec of an earlier version that is given, by keyword, and how many workers."""
     if given.get("against") is None:
         return {}, workers

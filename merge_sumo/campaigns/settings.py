@@ -80,7 +80,7 @@ class CampaignSettings:
                 raise UserError(f"--{option} is {number}: it must be 1 or more")
         if self.batch is not None and self.batch > self.cases:
             raise UserError(
-                f"--batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
+                f"batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
                 "cases than the campaign"
             )
         if self.in_flight is not None:
@@ -123,7 +123,7 @@ class CampaignSettings:
     def _check_in_flight(self, in_flight: int) -> None:
         if self.batch is not None:
             raise UserError(
-                f"--in-flight is {in_flight} and --batch is {self.batch}: a search runs in batches "
+                f"--in-flight is {in_flight} and batch is {self.batch}: a search runs in batches "
                 "or with cases in flight; leave one of them away"
             )
         if in_flight > self.cases:

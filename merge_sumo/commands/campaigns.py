@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from merge_sumo.api import CampaignRun, CaseRun, RunComparison
 
 SETTINGS: Final = (
-    *("vut", "against", "level", "sampler", "cases", "batch", "in_flight", "seed", "learn_from"),
+    *("vut", "against", "level", "sampler", "cases", "in_flight", "seed", "learn_from"),
 )
 COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
 
@@ -76,7 +76,7 @@ def campaign(
     Exit code 1 when a --gate is met, and always when the VUT merged in no case: then
     nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
 
-    Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --batch 20 --seed 1
+    Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
     Example:  merge-sumo campaign --vut design1 --against design2 --level 0 --cases 40
     """

@@ -25,6 +25,7 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--net": "a scenario file names its net: `merge-sumo scenario new` writes one",
     "--people": "write a limit of what the POV may do as a criterion, as in --fail-when "
     "'clearance_m <= 0 and pov_sustained_brake_mps2 <= 2.06'",
+    "--dask": "--workers takes the address of a Dask scheduler, too: --workers tcp://HOST:PORT",
     "--dense": "`merge-sumo truth --cases 1000000` makes a dense truth, which is used from then on",
     "--no-dense": "a dense truth is used where `merge-sumo truth --cases 1000000` has made one",
     "--limit": "`python tools/benchmark`, in a checkout, runs the frozen problems",
@@ -37,6 +38,8 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--vut-command": 'the spec has the command, as in --vut "traci:python my.py {port}"',
     "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
+    "campaign --batch": "a sampler chooses the size of its batches; `ms.campaign(batch=20)` in "
+    "Python has another",
     "compare --vut": "`merge-sumo benchmark` compares samplers on a VUT",
 }
 """What replaces an option, by its name with dashes, in every command that does not have it.

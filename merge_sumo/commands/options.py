@@ -47,7 +47,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Verdict": (*("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),),
     "Where it runs, and what it writes": (
-        *("out", "resume", "workers", "dask", "junit", "figure"),
+        *("out", "resume", "workers", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
     ),
     "Limits": ("vut_memory",),
@@ -121,8 +121,20 @@ def _runs_of_a_case(text: str) -> int | str:
     return int(text)
 
 
-CORES: Final = optional(
-    int, "Processes that run cases; the outcomes are the same.", show_default="one a core"
+def _workers(text: str | None) -> int | str | None:
+    """Return a number of processes, or the address of a scheduler, which whoever opens it reads."""
+    try:
+        return None if text is None else int(text)
+    except ValueError:
+        return text
+
+
+def _workers_option(help: str, show_default: str) -> Shared:
+    return optional(str, help, metavar="N|ADDRESS", callback=_workers, show_default=show_default)
+
+
+CORES: Final = _workers_option(
+    "Processes that run cases, or a Dask scheduler, tcp://HOST:PORT.", "one a core"
 )
 SEED: Final = option(int, 0, "Same seed, same cases.")
 OPTIONS: Final[Mapping[str, Shared]] = {
@@ -186,9 +198,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         autocompletion=complete.samplers,
     ),
     "cases": option(int, 800, "Number of test cases."),
-    "batch": optional(
-        int, "Cases per batch.", show_default="few, later more, for coverage; 40 for others"
-    ),
     "in_flight": optional(
         int,
         "Most cases that run or wait for a worker while the sampler is asked for more, instead of "
@@ -248,13 +257,10 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="NAME",
         autocompletion=complete.engines,
     ),
-    "workers": optional(
-        int,
-        "Processes that run cases; the outcomes are the same. By default one a core, as soon as "
-        "cases take longer than starting processes.",
-    ),
-    "dask": optional(
-        str, "Address of a Dask scheduler whose workers run the cases: tcp://HOST:PORT."
+    "workers": _workers_option(
+        "Processes that run cases, or a Dask scheduler, tcp://HOST:PORT; the outcomes are the "
+        "same.",
+        "one a core, as soon as it pays",
     ),
     "quiet": flag("Show no progress.", "--quiet", "-q"),
     "deadline": option(
@@ -277,4 +283,4 @@ VUT_AGAIN: Final = optional(
 HOSTING: Final = ("deadline", "vut_memory")
 OF_SCENARIO: Final = ("follow_up", "sense", "act")
 SETUP: Final = ("scenario", "policies", "pov", "fail_when", "require", *OF_SCENARIO, *HOSTING)
-RUNNING: Final = ("workers", "dask", "quiet")
+RUNNING: Final = ("workers", "quiet")

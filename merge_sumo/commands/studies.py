@@ -31,7 +31,7 @@ TRUTH_CASES: Final = "10000, at level 2 20000"
 
 
 @app.verb(
-    options=("level", *SETUP, "tolerate", "dask", "quiet"),
+    options=("level", *SETUP, "tolerate", "quiet"),
     own={
         "cases": optional(int, "Uniform cases of a level.", show_default=TRUTH_CASES),
         "repeat": optional(
@@ -73,7 +73,7 @@ def truth(given: Given, vut: VutOption) -> None:
 
 
 @app.verb(
-    options=("level", *SETUP, "dask", "quiet"),
+    options=("level", *SETUP, "quiet"),
     own={
         "seeds": option(int, 10, "Runs of each sampler."),
         "cases": option(int, 400, "Cases of each run."),
@@ -312,7 +312,7 @@ def repair(
 
 
 @app.verb(
-    options=["policies", "dask", "quiet"],
+    options=["policies", "quiet"],
     own={
         "seeds": optional(int, "Runs of each sampler.", show_default="10, with --quick 2"),
         "out": optional(Path, "New folder to write.", show_default="runs/reproduce-DATE"),

@@ -22,7 +22,13 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.system.blame import MAX_DEATHS
 from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.pickling import quickly_pickled
-from merge_sumo.system.workers import InProcess, Workers, open_workers, when_worker_ends
+from merge_sumo.system.workers import (
+    AnyWorkers,
+    InProcess,
+    Workers,
+    open_workers,
+    when_worker_ends,
+)
 from merge_sumo.values.case import Case, FloatArray, Pool
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Measures, Outcome, Verdict, measure_all
@@ -220,11 +226,9 @@ def open_simulators(plan: SimulationPlan, workers: Workers, *, first: bool = Fal
             break
 
 
-def evaluation_workers(
-    workers: int | None = None, dask: str | None = None, here_s: float | None = None
-) -> Workers:
+def evaluation_workers(workers: AnyWorkers = None, here_s: float | None = None) -> Workers:
     """Return workers that load what it takes to run cases as they start: see `open_workers`."""
-    return open_workers(workers, dask, preload=__name__, here_s=here_s)
+    return open_workers(workers, preload=__name__, here_s=here_s)
 
 
 @contextmanager

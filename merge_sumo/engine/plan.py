@@ -14,6 +14,7 @@ from typing import Any, Final
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.system.workers import AnyWorkers
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.measures import MEASURES
@@ -133,11 +134,14 @@ class SimulationPlan:
             return f"the VUT {self.vut.spec} is none of this package"
         return None
 
-    def workers(self, requested: int | None) -> int:
+    def workers(self, requested: AnyWorkers) -> int | str:
         """Return the number of processes that run cases: as many as VUT and POV can serve.
 
-        Raises `UserError` where more are requested than that.
+        Those at an address are taken as they are. Raises `UserError` where more are requested than
+        that.
         """
+        if isinstance(requested, str):
+            return requested
         most, own = self.vut.workers(requested), self.povs.own
         return most if own is None else min(most, own.workers(requested))
 

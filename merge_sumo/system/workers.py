@@ -293,6 +293,10 @@ def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:
         first += len(items)
 
 
+AnyWorkers = int | str | None
+"""A number of processes, the address of a Dask scheduler, or None for a process a core."""
+
+
 def workers_or_cores(workers: int | None) -> int:
     """Return the number of workers: as asked, or one for each core."""
     if workers is not None and (not isinstance(workers, Integral) or workers < 1):
@@ -301,22 +305,21 @@ def workers_or_cores(workers: int | None) -> int:
 
 
 def open_workers(
-    workers: int | None = None,
-    dask: str | None = None,
+    workers: AnyWorkers = None,
     *,
     preload: str | None = None,
     here_s: float | None = None,
     apart: bool = False,
 ) -> Workers:
-    """Return the workers of a cluster at the address `dask`, or else local ones.
+    """Return the workers of the cluster at an address, or else local ones.
 
     One local worker is this process itself, unless it is to be `apart`; more are processes of their
     own, which import the module `preload` as they start. None is one a core. With `here_s` they are
     started only when work in this process has taken so many seconds, and where the system lets
     them.
     """
-    if dask is not None:
-        return dask_workers(dask)
+    if isinstance(workers, str):
+        return dask_workers(workers)
     count = workers_or_cores(workers)
     if count == 1 and not apart:
         return Workers(InProcess, 1)
@@ -344,18 +347,25 @@ def open_workers(
 
 def dask_workers(address: str) -> Workers:
     """Return the workers of a running Dask cluster; `UserError` when there are none."""
+    if "://" not in address:
+        raise UserError(
+            f"workers is {address!r}: give a number of processes, or the address of a Dask "
+            "scheduler, tcp://HOST:PORT"
+        )
     try:
         from distributed import Client, KilledWorker
     except ModuleNotFoundError as error:
-        raise UserError("--dask needs Dask: run `pip install merge-sumo[dask]`") from error
+        raise UserError(
+            f"workers at {address} need Dask: run `pip install merge-sumo[dask]`"
+        ) from error
     try:
         client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, TypeError, ImportError) as error:
-        raise UserError(f"--dask: there is no scheduler at {address}: {error}") from error
+        raise UserError(f"there is no Dask scheduler at {address}: {error}") from error
     count = len(client.scheduler_info(n_workers=-1)["workers"])
     if count == 0:
         client.close()
-        raise UserError(f"--dask: the scheduler at {address} has no workers: start `dask worker`")
+        raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
     return Workers(
         lambda: client.get_executor(pure=False),
         count,

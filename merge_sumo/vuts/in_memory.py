@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, SupportsFloat
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.workers import workers_or_cores
+from merge_sumo.system.workers import AnyWorkers, workers_or_cores
 from merge_sumo.vuts.base import Seen, Vut, VutOptions, numbers_of, split_options, text_of
 from merge_sumo.vuts.python import SeenBatch, is_code, vut_of
 
@@ -104,25 +104,25 @@ def travels(spec: str) -> bool:
 
 
 def drivers_of(
-    vut: Any, pov: Any, workers: int | None, *, stacklevel: int = 3
-) -> tuple[str, str | None, int | None]:
-    """Return the specs of what drives, and how many workers can have it; None is one a core.
+    vut: Any, pov: Any, workers: AnyWorkers, *, stacklevel: int = 3
+) -> tuple[str, str | None, AnyWorkers]:
+    """Return the specs of what drives, and which workers can have it.
 
     Says in a sentence where something drives in this process that could do it harm.
     """
-    count = workers_or_cores(workers)
+    several = isinstance(workers, str) or workers_or_cores(workers) > 1
     specs = spec_of(vut), None if pov is None else spec_of(pov)
     for spec in specs:
         if spec is None or object_of(spec) is None:
             continue
         name = spec.partition(":")[2]
         if travels(spec):
-            process = "the processes of the workers" if count > 1 else "this process"
+            process = "the processes of the workers" if several else "this process"
             why = (
                 f"{name} is an object, so it drives in {process}, which what it does wrong may end"
             )
         else:
-            alone = ", and without workers," if count > 1 else ""
+            alone = ", and without workers," if several else ""
             workers = 1
             why = (
                 f"{name} is known to this process alone, so it drives here{alone} where what it "

@@ -46,7 +46,7 @@ def vuts(tmp_path_factory) -> dict[str, str]:
 
 def campaign(vut: str, folder: Path, *options: object) -> Result:
     small = (
-        *("--level", 0, "--cases", 20, "--batch", 10, "--seed", 1, "--sampler", "uniform"),
+        *("--level", 0, "--cases", 20, "--seed", 1, "--sampler", "uniform"),
         "-q",
     )
     return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)

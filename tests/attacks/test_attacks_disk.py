@@ -25,7 +25,7 @@ from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.folders import TEMPORARY
 
 CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
-SMALL = (*CAMPAIGN, "--cases", "60", "--batch", "20", "--seed", "1")
+SMALL = (*CAMPAIGN, "--cases", "60", "--seed", "1")
 TRUTH = ("truth", "--vut", "design1", "--level", "0", "--cases", "300", "--workers", "1")
 COMPARE = (
     "benchmark",

@@ -131,7 +131,7 @@ WAYS: dict[str, tuple[tuple[str, ...], tuple[str, ...], dict[str, str]]] = {
 @pytest.mark.long
 @pytest.mark.parametrize("sampler", SAMPLERS)
 def test_nothing_but_the_settings_decides_outcomes(sampler, cluster, tmp_path):
-    options = ("--vut", "design2", "--sampler", sampler, "--cases", 60, "--batch", 20, "-q")
+    options = ("--vut", "design2", "--sampler", sampler, "--cases", 60, "-q")
     found = {}
     for name, (python, more, environment) in {"usual": ((), (), {}), **WAYS}.items():
         world = World(tmp_path / name.replace(" ", "-"), python, environment)

@@ -102,7 +102,7 @@ def campaign(folder: Path, file: Path, workers: int) -> tuple[subprocess.Complet
     scratch = folder.with_name(f"scratch-{folder.name}")
     scratch.mkdir()
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", f"{file}:Vut"]
-    command += ["--level", "0", "--cases", "12", "--batch", "6", "--sampler", "uniform", "--quiet"]
+    command += ["--level", "0", "--cases", "12", "--sampler", "uniform", "--quiet"]
     command += ["--deadline", str(DEADLINE_S), "--vut-memory", "1", "--out", str(folder)]
     ended = subprocess.run(
         [*command, "--workers", str(workers)],

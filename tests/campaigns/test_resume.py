@@ -304,7 +304,7 @@ class TestADisk:
 
 
 COMMAND = [sys.executable, "-m", "merge_sumo.cli", "campaign"]
-LONG = [*("--vut", "design1", "--level", "0", "--sampler", "uniform"), "--cases", "1000000"]
+LONG = [*("--level", "0", "--sampler", "uniform"), "--cases", "1000000"]
 
 
 class TestASignal:
@@ -312,7 +312,7 @@ class TestASignal:
     @pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
     def test_lets_the_batch_end_and_says_how_to_go_on(self, tmp_path, number):
         folder = tmp_path / "run"
-        process = started(folder, "--batch", "40")
+        process = started(folder)
         process.send_signal(number)
         _, said = process.communicate(timeout=600)
         assert process.returncode == 128 + number
@@ -327,7 +327,9 @@ class TestASignal:
     @pytest.mark.slow
     def test_stops_at_once_when_it_comes_twice_even_with_workers(self, tmp_path):
         folder = tmp_path / "run"
-        process = started(folder, "--batch", "100000", "--workers", "2")
+        slow = tmp_path / "slow.py"
+        slow.write_text("import time\n\ndef act(seen):\n    time.sleep(0.1)\n    return 0.0\n")
+        process = started(folder, "--workers", "2", vut=f"{slow}:act")
         process.send_signal(signal.SIGTERM)
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
@@ -356,10 +358,12 @@ class TestASignal:
         assert signal.getsignal(signal.SIGINT) is before
 
 
-def started(folder: Path, *options: str) -> subprocess.Popen[str]:
+def started(folder: Path, *options: str, vut: str = "design1") -> subprocess.Popen[str]:
     """Start a campaign without an end, and return when it has a folder and is at work."""
     process = subprocess.Popen(
-        [*COMMAND, *LONG, "--out", str(folder), *options], stderr=subprocess.PIPE, text=True
+        [*COMMAND, "--vut", vut, *LONG, "--out", str(folder), *options],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert wait_for(lambda: (folder / OUTCOMES).exists() or process.poll() is not None)
     time.sleep(0.3)

@@ -55,10 +55,7 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
             (("--level", "-1"), ("'-1'", "0, 1, 2 or all")),
             (("--cases", "0"), ("--cases is 0",)),
             (("--cases", "-5"), ("--cases is -5",)),
-            (("--cases", "-5", "--batch", "5"), ("--cases is -5",)),
-            (("--cases", "10", "--batch", "0"), ("--batch is 0",)),
-            (("--cases", "10", "--batch", "-1"), ("--batch is -1",)),
-            (("--cases", "10", "--batch", "11"), ("--batch is 11", "--cases is 10")),
+            (("--workers", "two"), ("'two'", "tcp://HOST:PORT")),
             (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
             (("--seed", "-1"), ("--seed is -1",)),
         ],
@@ -148,7 +145,7 @@ def test_the_debian_packages_are_those_that_the_wheels_need():
 def ended(tmp_path_factory) -> tuple[Path, Said]:
     """Return where a campaign of 80 cases ran in a process of its own, and what it said."""
     folder = tmp_path_factory.mktemp("ended")
-    arguments = ("--cases", 80, "--batch", 20, "--seed", 1, *GPR, "--out", "run", "--json")
+    arguments = ("--cases", 80, "--seed", 1, *GPR, "--out", "run", "--json")
     return folder, run_in_a_process(folder, *SMALL, *arguments)
 
 
@@ -160,7 +157,7 @@ class TestACampaign:
         assert len(run.outcomes) == 80
         assert (folder / "run" / "outcomes.jsonl").read_bytes().count(b"\n") == 80
         assert failures(run.outcomes)
-        assert [o.batch for o in run.outcomes] == [index // 20 for index in range(80)]
+        assert [o.batch for o in run.outcomes] == [index // 40 for index in range(80)]
 
     def test_prints_exactly_one_json_object_with_its_summary(self, ended):
         folder, said = ended
@@ -192,16 +189,16 @@ class TestACampaign:
 
     def test_gives_the_same_bytes_in_another_process(self, ended, call):
         folder, _ = ended
-        # The first two batches know nothing of how many follow.
-        arguments = ("--cases", 40, "--batch", 20, "--seed", 1, *GPR, "--out", "short")
+        # The first batch knows nothing of how many follow.
+        arguments = ("--cases", 40, "--seed", 1, *GPR, "--out", "short")
         assert call(*SMALL, *arguments).code == 0
         short = Path("short", "outcomes.jsonl").read_bytes()
         assert (folder / "run" / "outcomes.jsonl").read_bytes().startswith(short)
 
     def test_tells_a_person_what_to_do_next(self, call):
-        said = call(*SMALL, "--cases", 80, "--batch", 20, "--seed", 1, *GPR, "--out", "run")
+        said = call(*SMALL, "--cases", 80, "--seed", 1, *GPR, "--out", "run")
         assert said.code == 0
-        assert "failures in 80 cases" in said.out
+        assert " in 80 cases" in said.out
         assert f"report: {Path('run', 'report.html')}" in said.out
         (command,) = (line for line in said.out.splitlines() if line.startswith("worst case: "))
         name, *arguments = command.removeprefix("worst case: ").split()

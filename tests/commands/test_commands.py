@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from merge_sumo import cli
 from merge_sumo.commands import complete
 from merge_sumo.commands.application import unwrapped
-from merge_sumo.commands.options import GROUP_OF, GROUPS
+from merge_sumo.commands.options import GROUP_OF, GROUPS, PANELS
 
 ENDS = ".", ":", "!", "?"
 
@@ -47,7 +47,21 @@ def help_of(name: str, columns: int) -> str:
     return done.output
 
 
+def test_seventeen_commands_stand_in_five_panels():
+    application: Any = typer.main.get_command(cli.app)
+    panels: dict[str | None, tuple[str, ...]] = {}
+    for name in application.list_commands(None):
+        panel = application.commands[name].rich_help_panel
+        panels[panel] = (*panels.get(panel, ()), name)
+    assert panels == PANELS
+    assert sum(map(len, panels.values())) == 17
+
+
 class TestOptions:
+    def test_of_a_campaign_are_at_most_28_with_json_and_help(self):
+        options = [p.opts[0] for p in COMMANDS["campaign"].params if p.name != "context"]
+        assert len({*options, "--help"}) <= 28, options
+
     @pytest.mark.parametrize("name", COMMANDS)
     def test_stand_in_groups(self, name):
         options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
@@ -89,7 +103,7 @@ class TestHelp:
     def test_shows_defaults_that_are_said_in_words(self):
         shown = " ".join(help_of("campaign", 100).replace("│", " ").split())
         assert "[default: (runs/VUT-DATE)]" in shown
-        assert "[default: (few, later more" in shown
+        assert "[default: (one a core, as soon" in shown
 
     def test_joins_the_lines_of_a_paragraph(self):
         assert unwrapped("A\n    b.\n\n    C\n    d.\n    ") == "A b.\n\nC d."
@@ -102,7 +116,7 @@ class TestCompletion:
         assert [value for value, _ in complete.vuts("design")] == ["design1", "design2"]
         assert tuple(
             next(value for value, _ in complete.vuts(begun)) for begun in ("tr", "fm", "mi")
-        ) == ("traci", "fmu:", "mine.py:")
+        ) == ("traci:", "fmu:", "mine.py:")
         names = [value for value, _ in complete.vuts("mine.py:")]
         assert names == ["mine.py:Vut", "mine.py:drive"]
         assert complete.vuts("mine.py:d") == [("mine.py:drive", "")]
@@ -151,7 +165,7 @@ class TestCtrlC:
     @pytest.mark.parametrize(
         "command",
         [
-            "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run",
+            "campaign --vut design1 --level 0 --cases 4000 --out run",
             pytest.param(
                 "truth --vut design1 --level 0 --cases 9000 --workers 1", marks=pytest.mark.long
             ),
@@ -168,7 +182,7 @@ class TestCtrlC:
 
     @pytest.mark.long
     def test_prints_no_control_sequence_where_there_is_no_terminal(self, tmp_path):
-        command = "campaign --vut design1 --level 0 --cases 4000 --batch 20 --out run"
+        command = "campaign --vut design1 --level 0 --cases 4000 --out run"
         process = subprocess.Popen(
             [sys.executable, "-m", "merge_sumo.cli", *command.split()],
             cwd=tmp_path,

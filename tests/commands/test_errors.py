@@ -178,7 +178,6 @@ class TestAnOptionThatIsGivenTwice:
             ("truth", "--vut", "design1", "--level", 0, "--level", 1),
             ("benchmark", "--vut", "design1", "--cases", 10, "--cases", 20),
             ("scenario", "new", "a.toml", "--net", "x", "--net", "y"),
-            ("policies", "export", "vut1", "--out", "a", "--out", "b"),
         ],
     )
     def test_is_refused(self, command_line, asked):

@@ -69,8 +69,7 @@ def test_runs(example, place, monkeypatch, tmp_path):
     for place_of, word in enumerate(words[:-1]):
         if word in SMALL:
             words[place_of + 1] = SMALL[word]
-    if "--batch" not in words:
-        words += MORE.get(words[0], [])
+    words += MORE.get(words[0], [])
     done = CliRunner().invoke(cli.app, words)
     # Their ways to say "worse", "not certain" and "not repaired".
     failed = words[0] in ("compare-runs", "repair") and done.exit_code == 1

@@ -278,7 +278,7 @@ def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
     (tmp_path / "sumo_net" / "another-arm.toml").write_text(ANOTHER_ARM)
 
-    options = ("--vut", "level0", "--level", "0", "--cases", "20", "--batch", "20", "--quiet")
+    options = ("--vut", "level0", "--level", "0", "--cases", "20", "--quiet")
     commands = [
         ("scenario", "list"),
         ("scenario", "check", "another-arm"),

@@ -269,7 +269,7 @@ class TestItIsShown:
         assert "no claim of compliance follows" in page
 
     def test_by_campaign(self, command_line, tmp_path):
-        plan = ("campaign", "--vut", "design1", "--level", 0, "--cases", 40, "--batch", 20)
+        plan = ("campaign", "--vut", "design1", "--level", 0, "--cases", 40)
         code, out, err = command_line(*plan, "--seed", 1, "--out", tmp_path / "a", "-q")
         assert code == 0, err
         kept = read_avoidance(Run(tmp_path / "a")).values()
