@@ -38,9 +38,21 @@ class Normal(Record, frozen=True, tag_field="kind", tag="normal"):
     """A normal distribution, cut off at `low` and `high`, by default the bounds of the pool."""
 
     mean: float
-    sd: Annotated[float, Meta(gt=0.0)]
+    sd: Annotated[float, Meta(ge=1e-3, le=1e3)]
     low: float | None = None
     high: float | None = None
+
+    def check(self) -> None:
+        """Raise `UserError` for a mean that is no number."""
+        if not math.isfinite(self.mean):
+            raise UserError(f"mean is {self.mean}: it must be finite")
+
+    def within(self, low: float, high: float) -> tuple[float, Normal]:
+        """Return the share of the values from `low` to `high`, and their distribution."""
+        from scipy.stats import norm
+
+        below, up_to = norm.cdf((np.array([low, high]) - self.mean) / self.sd)
+        return float(up_to - below), replaced(self, low=low, high=high)
 
     def quantile(self, chance: FloatArray) -> FloatArray:
         """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
@@ -57,6 +69,28 @@ class Histogram(Record, frozen=True, tag_field="kind", tag="histogram"):
 
     edges: tuple[float, ...]
     weights: Weights
+
+    def check(self) -> None:
+        """Raise `UserError` where edges and weights make no distribution."""
+        edges, weights = np.array(self.edges), self.weights
+        if len(edges) != len(weights) + 1:
+            raise UserError(f"{len(weights)} weights need {len(weights) + 1} edges")
+        if not ((np.diff(edges) > 0.0).all() and np.isfinite(edges).all()):
+            raise UserError("edges must rise, and be finite")
+        if not 0.0 < sum(weights) < math.inf:
+            raise UserError("weights must be not all 0, and finite")
+
+    def within(self, low: float, high: float) -> tuple[float, Histogram]:
+        """Return the share of the values from `low` to `high`, and their distribution."""
+        edges, weights = np.array(self.edges), np.array(self.weights)
+        cut = np.clip(edges, low, high)
+        inside = weights * np.diff(cut) / np.diff(edges)
+        kept = np.diff(cut) > 0.0
+        if not kept.any():
+            return 0.0, self
+        bounds = np.append(cut[:-1][kept], cut[1:][kept][-1])
+        cut_off = Histogram(edges=tuple(bounds.tolist()), weights=tuple(inside[kept].tolist()))
+        return float(inside.sum() / weights.sum()), cut_off
 
     def quantile(self, chance: FloatArray) -> FloatArray:
         """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
@@ -175,11 +209,7 @@ def _bounded(stated: Uniform | Normal, d: Dimension) -> Marginal:
 
 
 def _bins_within(stated: Histogram, d: Dimension) -> Histogram:
-    edges, weights = np.array(stated.edges), stated.weights
-    if len(edges) != len(weights) + 1:
-        raise UserError(f"{len(weights)} weights need {len(weights) + 1} edges")
-    if (np.diff(edges) <= 0.0).any() or edges[0] < d.low or edges[-1] > d.high:
-        raise UserError(f"edges must rise within the pool, {d.low:g} to {d.high:g}")
-    if not 0.0 < sum(weights) < math.inf:
-        raise UserError("weights must be not all 0, and finite")
+    stated.check()
+    if stated.edges[0] < d.low or stated.edges[-1] > d.high:
+        raise UserError(f"edges must be within the pool, {d.low:g} to {d.high:g}")
     return stated

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 from merge_sumo.analysis.coordinates import outside_of_the_pool
 from merge_sumo.analysis.result import Shown
-from merge_sumo.analysis.traffic import Traffic, named_traffic
+from merge_sumo.analysis.traffic import named_traffic
 from merge_sumo.analysis.verdict import parse_gates
 from merge_sumo.api.keywords import (
     CampaignKeywords,
@@ -49,9 +49,7 @@ from merge_sumo.api.keywords import (
 from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
-    PerMergeResult,
     PolicyChecks,
-    ProbabilityResult,
     RepairResult,
     StressResult,
     TruthResult,
@@ -103,12 +101,12 @@ from merge_sumo.studies import (
     versions,
     vut_check,
 )
-from merge_sumo.studies import failures_per_merge as per_merge
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.history import History, history_of
+from merge_sumo.studies.probability import ProbabilityResult
 from merge_sumo.studies.run_study import RunStudy, notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
 from merge_sumo.studies.truth import Repeats, Truth
@@ -150,7 +148,6 @@ __all__ += ["check_scenario", "check_vut", "compare_runs", "dated"]
 __all__ += ["benchmark", "export"]
 __all__ += [
     "explain",
-    "failures_per_merge",
     "history",
     "new_scenario",
     "open_in_gui",
@@ -493,19 +490,20 @@ def _study_of(
     run: Run,
     given: RerunKeywords,
     title: str,
-    total: int,
+    total: int | Mapping[Engine, int],
     unit: str = "cases",
     *,
     engine: str | None = Engine.SUMO,
 ) -> Iterator[RunStudy]:
     """Open a campaign for a study that runs cases of it, with a bar that counts `total` of them.
 
-    "{vut}" in the title stands for the VUT.
+    "{vut}" in the title stands for the VUT; a total may depend on the engine.
     """
     # Whoever calls the verb: between are the verb, `with`, this function and the two below.
     settings, plan, runner = _today(run, given, stacklevel=7)
     plan = plan.with_engine(engine)
-    counter = runner.counter(title.format(vut=settings.vut), total, unit)
+    number = total if isinstance(total, int) else total[plan.engine]
+    counter = runner.counter(title.format(vut=settings.vut), number, unit)
     with runner.open(plan) as opened, counter:
         yield RunStudy(run, settings, plan, opened, counter.ended)
 
@@ -826,19 +824,22 @@ def benchmark(
 def probability(
     run: AnyRun,
     *,
-    cases: int = estimates.DEFAULT_CASES,
+    cases: int | None = None,
+    traffic: AnyPath | None = None,
     distribution: AnyPath | None = None,
     confidence: float = 0.95,
     seed: int = 0,
     out: AnyPath | None = None,
-    engine: str = Engine.SUMO,
+    engine: str | None = None,
     **given: Unpack[RerunKeywords],
 ) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail; as `merge-sumo probability`.
 
     Args:
         run: the campaign, or its folder.
-        cases: fresh cases to run.
+        cases: fresh cases to run; by default 100,000 by the kinematic engine, and 4,000 in SUMO.
+        traffic: traffic on the mainline, a shipped one by name, or its TOML file: how many cars a
+            merge fails with in it.
         distribution: JSON file that says how often cases occur; uniform by default.
         confidence: chance that the interval holds the probability.
         seed: same seed, same cases.
@@ -850,50 +851,19 @@ def probability(
     check_keywords("probability", given, RerunKeywords)
     before = _opened(run).run
     target = before.folder / estimates.RESULT if out is None else Path(out)
-    stated = _path(distribution)
-    with _study_of(before, given, "fresh cases", cases, engine=engine) as study:
-        estimate = estimates.failure_probability(
-            study, target, cases=cases, distribution=stated, confidence=confidence, seed=seed
+    on_road = None if traffic is None else named_traffic(str(traffic))
+    total = estimates.DEFAULT_CASES if cases is None else cases
+    with _study_of(before, given, "fresh cases", total, engine=engine) as study:
+        found = estimates.failure_probability(
+            study,
+            target,
+            cases=cases,
+            distribution=_path(distribution),
+            traffic=on_road,
+            confidence=confidence,
+            seed=seed,
         )
-    return ProbabilityResult(estimate, target, before.criterion, distribution is None)
-
-
-def failures_per_merge(
-    run: AnyRun,
-    traffic: Traffic | AnyPath,
-    *,
-    density_veh_per_km: float | None = None,
-    cases: int = per_merge.DEFAULT_CASES,
-    confidence: float = 0.95,
-    seed: int = 0,
-    out: AnyPath | None = None,
-    engine: str = Engine.SUMO,
-    **given: Unpack[RerunKeywords],
-) -> PerMergeResult:
-    """Estimate with how many mainline cars a merge fails; as `merge-sumo failures-per-merge`.
-
-    Args:
-        run: the campaign, or its folder.
-        traffic: the traffic on the mainline: a shipped one by name, or its TOML file.
-        density_veh_per_km: density of the traffic, by default its own.
-        cases: fresh cases to run.
-        confidence: chance that an interval holds.
-        seed: same seed, same cases.
-        out: new file to write; `failures-per-merge.json` in the folder of the campaign by default.
-        engine: "sumo", or "kinematic": see `truths`.
-        given: how the drivers run, where it is to change, and where the cases run: see
-            `RerunKeywords`.
-    """
-    check_keywords("failures_per_merge", given, RerunKeywords)
-    before = _opened(run).run
-    on_road = traffic.checked() if isinstance(traffic, Traffic) else named_traffic(str(traffic))
-    on_road = on_road.with_density(density_veh_per_km)
-    target = before.folder / per_merge.RESULT if out is None else Path(out)
-    with _study_of(before, given, "fresh cases", cases, engine=engine) as study:
-        found = per_merge.failures_per_merge(
-            study, on_road, target, cases=cases, confidence=confidence, seed=seed
-        )
-    return PerMergeResult(found, target, before.criterion)
+    return ProbabilityResult(found, target, before.criterion)
 
 
 def stress(

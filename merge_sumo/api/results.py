@@ -35,15 +35,12 @@ from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.failures_per_merge import FailuresPerMerge, OverMixtures, Part
 from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
-from merge_sumo.studies.stratified import Estimate
 from merge_sumo.studies.stress import Stress
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.studies.versions import Change, RunComparison, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.records import to_plain
-from merge_sumo.system.suggestions import either
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
@@ -465,131 +462,6 @@ def _engine_of(truth: Truth) -> str:
         return ""
     cases = counted(truth.in_sumo, "case")
     return f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-
-
-@dataclass(frozen=True, repr=False)
-class ProbabilityResult(Result):
-    """How likely a VUT is to fail.
-
-    Attributes:
-        estimate: `probability`, ends `low` and `high` of the interval, and what they rest on.
-        file: file that was written.
-        criterion: what counts as a failure.
-        is_uniform: whether all cases of the pool are equally likely.
-    """
-
-    estimate: Estimate
-    file: Path
-    criterion: Criterion
-    is_uniform: bool
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {**asdict(self.estimate), "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return the probability, its interval, and that of the plain cases."""
-        one, plain = self.estimate, self.estimate.plain
-        cases = "under uniform cases" if self.is_uniform else "under the stated distribution"
-        lines = [
-            f"P(fail) {cases}: {one.probability:.3g}, {100.0 * one.confidence:g} % interval "
-            f"[{one.low:.3g}, {one.high:.3g}] ({counted(one.failures, 'failure')} in "
-            f"{one.cases} fresh cases)"
-        ]
-        if not self.criterion.is_papers:
-            lines.append(f"  a case fails when {self.criterion.words}")
-        if one.without_verdict:
-            lines.append(
-                f"  {one.without_verdict} cases without a verdict: safe for the lower end, "
-                "failures for the upper end"
-            )
-        return [
-            *lines,
-            *(
-                f"  {one.share:.2%} of them with P(fail) {one.expected:.2g} expected: "
-                f"{counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
-                for one in one.strata
-            ),
-            f"  for comparison, as many cases without strata would have an interval like "
-            f"[{plain.low:.3g}, {plain.high:.3g}]",
-            f"written: {self.file}",
-        ]
-
-
-@dataclass(frozen=True, repr=False)
-class PerMergeResult(Result):
-    """With how many mainline cars a merge fails.
-
-    Attributes:
-        found: `all_levels` and `levels`, each with `least`, `most`, `low` and `high`; `parts`.
-        file: file that was written.
-        criterion: what counts as a failure.
-    """
-
-    found: FailuresPerMerge
-    file: Path
-    criterion: Criterion
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {**self.found.to_record(), "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return the range over all mixtures, levels and parts, and what is counted."""
-        found, traffic = self.found, self.found.traffic
-        lines = [
-            f"failures per merge: {_per_merge(found.all_levels)}, "
-            f"{100.0 * found.confidence:g} % interval, {_mixed(found.parts)}",
-            f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km, "
-            f"{traffic.speeds.words} ({traffic.source})",
-        ]
-        if not self.criterion.is_papers:
-            lines.append(f"  a case fails when {self.criterion.words}")
-        for level, one in found.levels.items():
-            parts = [part for part in found.parts if part.level == level]
-            rests_on = f", {_counts(parts[0])}" if len(parts) == 1 else ""
-            lines.append(f"  level {level_name(level)}: {_per_merge(one)}{rests_on}")
-            lines += [f"    {_part_line(part)}" for part in parts if len(parts) > 1]
-        lines.append(f"  {found.counted}")
-        if found.without_verdict:
-            lines.append(
-                f"  {found.without_verdict} cases without a verdict: safe for the lower ends, "
-                "failures for the upper ends"
-            )
-        return [*lines, f"written: {self.file}"]
-
-
-def _mixed(parts: Sequence[Part]) -> str:
-    """Return of which POVs a range is."""
-    levels = sorted({part.level for part in parts})
-    named = either(map(level_name, levels)).replace(" or ", " and ")
-    mixed = [f"levels {named}"] if len(levels) > 1 else []
-    mixed += ["psi"] if any(part.svo_rad is not None for part in parts) else []
-    return f"whatever the shares of {' and of '.join(mixed)}" if mixed else f"at level {named}"
-
-
-def _per_merge(one: OverMixtures) -> str:
-    """Return a range over mixtures with its interval."""
-    ends = f"{one.least:.3g}" if one.least == one.most else f"{one.least:.3g} to {one.most:.3g}"
-    return f"{ends} [{one.low:.3g}, {one.high:.3g}]"
-
-
-def _part_line(part: Part) -> str:
-    """Return the failures per merge of a part, and what they rest on."""
-    names = []
-    if part.svo_rad is not None:
-        low, high = np.degrees(part.svo_rad)
-        names.append(f"psi {low:.0f} to {high:.0f} degrees")
-    if part.speed_sd_mps is not None:
-        names.append(f"sd {part.speed_sd_mps:g} m/s")
-    interval = f"{part.failures_per_merge:.3g} [{part.low:.3g}, {part.high:.3g}]"
-    return f"{', '.join(names)}: {interval}, {_counts(part)}"
-
-
-def _counts(part: Part) -> str:
-    """Return what a part rests on."""
-    one = part.estimate
-    return f"{counted(one.failures, 'failure')} in {counted(one.cases, 'case')}"
 
 
 @dataclass(frozen=True, slots=True, repr=False)

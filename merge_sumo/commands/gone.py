@@ -11,11 +11,13 @@ COMMANDS: Final[Mapping[str, str]] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
     "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
+    "failures-per-merge": "`merge-sumo probability RUN --traffic NAME` says it",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
     "bounds how much of the pool can fail",
 }
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
+    "--density": "a TOML file for --traffic states density, speeds and their source",
     "--audit": "`merge-sumo probability RUN` bounds, with fresh cases, how much fails where the "
     "campaign expects no failure",
     "--certificate": "`merge-sumo probability RUN --cases 100000` says more than a certificate",

@@ -40,7 +40,6 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "quick",
             "distribution",
             "traffic",
-            "density",
         ),
         *("param", "cost", "trials", "rounds"),
         *("draws", "stop_after_converged", "repeat"),
@@ -60,7 +59,6 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
 GROUP_OF: Final = {name: group for group, names in GROUPS.items() for name in names}
 
 KEYWORDS: Final = {
-    "density": "density_veh_per_km",
     "deadline": "deadline_s",
     "vut_memory": "vut_memory_gib",
     "follow_up": "follow_up_s",

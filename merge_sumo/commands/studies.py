@@ -118,7 +118,16 @@ def benchmark(
     options=("engine", *OF_RECORDED),
     own={
         "vut": VUT_AGAIN,
-        "cases": option(int, 4000, "Fresh cases to run."),
+        "cases": optional(
+            int, "Fresh cases to run.", show_default="100000 without SUMO, 4000 in it"
+        ),
+        "traffic": optional(
+            str,
+            "With how many cars a merge fails in a traffic: exid-2, exid-3, exid-5, or a TOML file "
+            "with density and speeds.",
+            metavar="NAME|FILE",
+            autocompletion=complete.traffics,
+        ),
         "distribution": optional(
             Path, "JSON: how often cases occur.", metavar="FILE", show_default="uniform"
         ),
@@ -133,59 +142,18 @@ def probability(given: Given, run: RunArgument) -> None:
     """Estimate how likely a VUT is to fail, with an interval that is valid.
 
     The cases of the campaign were chosen to fail: they only say where failures are expected. Fresh
-    cases are drawn independently from where they are, are in doubt, and are not, and run in SUMO;
-    the interval is exact, however wrong the expectation is.
+    cases are drawn independently from where they are and from where they are not, and the interval
+    is exact, however wrong the expectation is. What fails where nothing was expected to, the
+    campaign has missed. Where VUT and POV are of this package, the equations of motion run them
+    without SUMO, except for one of a hundred.
 
-    Example:  merge-sumo probability runs/design2 --cases 4000
+    Example:  merge-sumo probability runs/design2
+
+    Example:  merge-sumo probability runs/design2 --traffic exid-5 --out per-merge.json
     """
     from merge_sumo import api
 
     given.print(api.probability(run, **given.written))
-
-
-@app.verb(
-    "failures-per-merge",
-    options=("engine", *OF_RECORDED),
-    own={
-        "vut": VUT_AGAIN,
-        "density": optional(
-            float,
-            "Cars per km of the mainline's lane.",
-            metavar="VEH_PER_KM",
-            show_default="that of the traffic",
-        ),
-        "cases": option(int, 8000, "Fresh cases to run."),
-        "confidence": option(float, 0.95, "Chance that an interval holds."),
-        "seed": SEED,
-        "out": optional(
-            Path, "New file to write.", metavar="FILE", show_default="RUN/failures-per-merge.json"
-        ),
-    },
-)
-def failures_per_merge(
-    given: Given,
-    run: RunArgument,
-    traffic: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Traffic on the mainline: exid-2, exid-3, exid-5 or michigan-65mph, or a TOML "
-            "file with density and speeds.",
-            autocompletion=complete.traffics,
-        ),
-    ],
-) -> None:
-    """Estimate with how many cars of the mainline a merge fails, in traffic of a published site.
-
-    Fresh cases run as for `probability`, with the speeds of the traffic, for each level by itself
-    and, at level 2, for each third of psi. Their shares in real traffic are unknown: the range over
-    all mixtures is the result, with an interval that is valid for each of them.
-
-    Example:  merge-sumo failures-per-merge runs/design2 --traffic exid-5
-    """
-    from merge_sumo import api
-
-    given.print(api.failures_per_merge(run, traffic, **given.written))
 
 
 @app.verb(

@@ -239,9 +239,9 @@ def _studies(run: Run) -> Iterator[Fact]:
         name = f"failures that stay failures in all {stress.runs} runs of the stress test"
         yield Fact(name, len(stress.robust), "", STRESS, "rungs")
     known = probability_of(run.folder)
-    if known is not None:
+    if known is not None and known.overall is not None:
         for name in ("probability", "low", "high"):
             end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
-            value = 100.0 * getattr(known, name)
-            yield Fact(f"probability that a case fails{end}", value, PERCENT, RESULT, name)
+            value, key = 100.0 * getattr(known.overall, name), f"overall.{name}"
+            yield Fact(f"probability that a case fails{end}", value, PERCENT, RESULT, key)
         yield Fact("fresh cases of that", known.cases, "", RESULT, "cases")

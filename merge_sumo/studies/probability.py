@@ -1,296 +1,483 @@
-"""How likely a VUT is to fail under a stated distribution over the pool, with an interval.
+"""How likely a VUT is to fail under a stated distribution over the pool, with an exact interval.
 
-A sampler chose the cases of a campaign because they were expected to fail, given those before. No
-share of them is the probability of a failure, and no binomial interval of theirs is valid. So they
-only decide how the pool is cut into strata, from which fresh cases are drawn independently; the
-estimate rests on these (`stratified.py`).
+A campaign looks for failures, so no share of its cases is a probability, and no binomial interval
+of them is valid. They only tell where a failure is to be expected: in cells, equally likely under
+the distribution, that are more likely to fail than not by its surrogate, and in those beside them.
+That cuts the pool into two strata of known shares W_h. Fresh cases are drawn from each, n_h of them
+independently, and k_h fail:
+
+    P(fail) = sum_h W_h p_h,    of which the estimate is sum_h W_h k_h / n_h.
+
+Each p_h has the interval of Clopper and Pearson (1934), and the chances of being wrong add up to at
+most 1 - confidence (union bound). It holds for any number of cases, and however wrong the surrogate
+is, which costs width alone. The stratum where no failure is expected is an audit of the campaign:
+what fails there, the campaign has missed.
+
+With a traffic of k cars per metre, whose speeds are independent of their places, a merge fails with
+
+    N = k * integral dx E_v[P(fail | x, v)]
+
+cars of the mainline in the mean (Campbell's formula): no process of arrivals is assumed, and
+headways may depend on each other, as each car is judged by itself. How common POV levels are on a
+road is not known. N is linear in their shares, so over all mixtures it is between the least and the
+most of the levels.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 
 from merge_sumo.analysis.exposure import Distribution, read_distribution
-from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.surface import learn_surface
+from merge_sumo.analysis.traffic import Traffic
+from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate, open_simulators
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.samplers.belief import learn_chance
-from merge_sumo.samplers.coverage import REPLAYED
-from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
-from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.stratified import (
-    Draws,
-    Estimate,
-    Strata,
-    estimate,
-    of_cells,
-)
-from merge_sumo.system.folders import add_to, check_new_file, write_new
-from merge_sumo.system.records import Record, read_record
-from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import Case, FloatArray, to_unit
-from merge_sumo.values.scenario import DX_CRASH_M, Scenario
-from merge_sumo.values.score import Outcome
+from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.system.records import Record, read_record, to_plain
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.case import FloatArray
+from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.scenario import Scenario, level_name
 
 RESULT: Final = "probability.json"
-LINES: Final = ".jsonl"
-"""End of the name of the file beside it, with a line per fresh case."""
-DEFAULT_CASES: Final = 4000
+DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
 STREAM: Final = 7
 """Key of the random stream, so that it is none of a sampler's."""
-MOST_LEARNED: Final = 1000
-"""Cases, the last ones, that the twin learns from."""
-CHUNK: Final = 1000
-"""Cases that are predicted at a time."""
-TWIN_ALONE: Final = 0.9
-"""Weight of the twin from which the surrogate, which is slow, is not asked."""
-WRITTEN: Final = 500
-"""Cases after which outcomes are written and synced."""
+CELLS: Final = 16_384
+"""Cells of a level, at most."""
+EXPECTED: Final = 0.5
+"""Chance to fail from which the surrogate expects a failure."""
+EXPECTED_LEAST: Final = 0.25
+"""Least share of the cases for the stratum where failures are expected, if there is one: it is
+small, and nearly all of the variance is in it. If the surrogate knows nothing, that costs 15 % of
+the width."""
+NAMED: Final = 20
+"""Failures where none was expected that the result names."""
 
 
-def failure_probability(
-    study: RunStudy,
-    out: Path,
-    *,
-    cases: int = DEFAULT_CASES,
-    distribution: Path | None = None,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> Estimate:
-    """Estimate how likely the VUT of a campaign is to fail, with fresh cases.
-
-    Writes the estimate with all that decides it to `out`, and the fresh outcomes, each with its
-    weight, to the file of the same name that ends in .jsonl, synced every few hundred cases.
-
-    Args:
-        study: the campaign, and how its cases run.
-        out: new file, which ends in .json.
-        cases: fresh cases.
-        distribution: JSON file that states how often cases occur; uniform over the pool without.
-        confidence: chance that the interval holds the probability.
-        seed: of the draws.
-
-    Raises:
-        UserError: for a distribution or numbers that make no sense, a run whose net or policies are
-            not those of today, or files that exist or cannot be written.
-    """
-    check_numbers(cases, confidence, seed)
-    study.check_same_system()
-    settings = study.settings
-    stated = read_distribution(distribution, settings.levels, settings.scenario)
-    lines = lines_beside(out)
-    expected = Expected(study)
-    strata = strata_of(expected, settings.scenario, stated, cases, confidence)
-    draws = strata.draw(np.random.default_rng([seed, STREAM]))
-    drawn = cases_of(settings, stated, draws)
-    outcomes = run_fresh(study, drawn, notes_of(draws), lines)
-    failed = np.array([outcome.failed for outcome in outcomes])
-    judged = np.array([outcome.score is not None for outcome in outcomes])
-    result = estimate(strata, draws, failed, judged, confidence)
-    write_result(out, study, {**asdict(result), "distribution": stated.record()}, seed)
-    return result
-
-
-def write_result(out: Path, study: RunStudy, result: Mapping[str, Any], seed: int) -> None:
-    """Write what a study found with fresh cases as a new file, with all that decides it."""
-    decides = {"seed": seed, "engine": study.plan.engine, "campaign": study.record()}
-    record = {**result, **decides}
-    write_new(out, (json.dumps(record, indent=2, allow_nan=False) + "\n").encode())
-
-
-class ProbabilityFile(Record, frozen=True):
-    """What the file of an estimate says; its fields are those of `Estimate`.
+class Stratum(Record, frozen=True):
+    """What was drawn from a stratum.
 
     Attributes:
-        distribution: how often cases occur, as it was stated.
-        seed: of the draws.
-        engine: what moved the vehicles.
-        campaign: settings of the campaign that it is of.
+        expects_failures: whether the campaign does there.
+        share: of the cases, as often as they occur.
+        cases: fresh cases.
+        failures: those of them that fail.
+        without_verdict: those that ended as VUT_ERROR or SIM_ERROR.
+        low: lower end of the interval of the share that fails there; they count as safe.
+        high: upper end; they count as failures.
+    """
+
+    expects_failures: bool
+    share: float
+    cases: int
+    failures: int
+    without_verdict: int
+    low: float
+    high: float
+
+
+class Estimate(Record, frozen=True):
+    """A probability of failure; each interval holds with the confidence of the result.
+
+    Attributes:
+        probability: the estimate; cases without a verdict count as safe.
+        low: lower end of its interval.
+        high: upper end.
+        strata: the one without expected failures, and the one with them where there is one.
     """
 
     probability: float
     low: float
     high: float
+    strata: tuple[Stratum, ...]
+
+
+class PerMerge(Record, frozen=True):
+    """With how many cars of the mainline a merge fails in a traffic.
+
+    Attributes:
+        traffic: the traffic.
+        cars: mainline cars per merge that are counted: those that start in the pool.
+        counted_speeds: share of the traffic's speeds that are in the pool.
+        least: failures per merge for the mixture of levels with the fewest.
+        most: for that with the most.
+        low: end of the interval, which holds the failures per merge of every mixture.
+        high: end of the interval.
+    """
+
+    traffic: Traffic
+    cars: float
+    counted_speeds: float
+    least: float
+    most: float
+    low: float
+    high: float
+
+
+class Probability(Record, frozen=True):
+    """How likely a VUT is to fail, with all that decides it: what probability.json says.
+
+    Attributes:
+        overall: over the levels as they were weighed; None where a traffic has no weights of them.
+        levels: by level.
+        per_merge: failures per merge; None without a traffic.
+        confidence: chance that an interval holds.
+        cases: fresh cases.
+        in_sumo: those that ran in SUMO.
+        missed: failures where none was expected: level and coordinates, at most `NAMED` of them.
+        distribution: how often cases occur.
+        seed: of the draws.
+        engine: what moved the vehicles.
+        campaign: settings of the campaign.
+    """
+
+    overall: Estimate | None
+    levels: dict[int, Estimate]
+    per_merge: PerMerge | None
     confidence: float
-    low_risk: float
-    high_risk: float
     cases: int
-    failures: int
-    without_verdict: int
-    strata: list[dict[str, Any]]
-    plain: dict[str, float]
+    in_sumo: int
+    missed: tuple[dict[str, float], ...]
     distribution: dict[str, Any]
     seed: int
     engine: str
     campaign: dict[str, Any]
 
 
-def probability_of(folder: Path) -> ProbabilityFile | None:
+class Cells(NamedTuple):
+    """The cells of a level that are in one stratum.
+
+    Attributes:
+        level: the level.
+        expects_failures: whether the campaign does there.
+        share: of the cases of all levels, as often as they occur.
+        numbers: of the cells, (c,).
+    """
+
+    level: int
+    expects_failures: bool
+    share: float
+    numbers: NDArray[np.intp]
+
+
+class Counted(NamedTuple):
+    """Cells, and what became of the cases that were drawn from them."""
+
+    cells: Cells
+    cases: int
+    failures: int
+    without_verdict: int
+
+
+def failure_probability(
+    study: RunStudy,
+    out: Path,
+    *,
+    cases: int | None = None,
+    distribution: Path | None = None,
+    traffic: Traffic | None = None,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Probability:
+    """Estimate how likely the VUT of a campaign is to fail, with fresh cases.
+
+    Args:
+        study: the campaign, and how its cases run.
+        out: new file for the result.
+        cases: fresh cases; None is that of `DEFAULT_CASES` for the engine of the study.
+        distribution: JSON file that states how often cases occur; uniform over the pool without.
+        traffic: traffic on the mainline, in the place of a distribution.
+        confidence: chance that an interval holds what it is of.
+        seed: of the draws.
+
+    Raises:
+        UserError: for a distribution or numbers that make no sense, a run whose net or policies are
+            not those of today, or a file that exists or cannot be written.
+    """
+    cases = DEFAULT_CASES[study.plan.engine] if cases is None else cases
+    _check(cases, confidence, seed, both=distribution is not None and traffic is not None)
+    check_new_file(out)
+    study.check_same_system()
+    levels, scenario = study.settings.levels, study.settings.scenario
+    if traffic is None:
+        stated = read_distribution(distribution, levels, scenario)
+    else:
+        stated = traffic.in_pool(scenario, levels)
+    cells = expected_cells(study, stated)
+    drawn = draw(cells, scenario, cases, np.random.default_rng([seed, STREAM]))
+    plan = study.plan.for_cases(cases)
+    if study.workers is not None:
+        open_simulators(plan, study.workers)
+    counted, in_sumo = [], 0
+    missed: list[dict[str, float]] = []
+    for one, chances in zip(cells, drawn, strict=True):
+        at = CasesAt(study.settings.pool, one.level, stated.points(one.level, chances))
+        failed, judged, by_sumo = run_fresh(plan, at, study.workers, study)
+        counted.append(Counted(one, len(at), int(failed.sum()), int((~judged).sum())))
+        in_sumo += by_sumo
+        if not one.expects_failures:
+            missed += [_named(at, int(place)) for place in np.flatnonzero(failed)[:NAMED]]
+    by_level = {
+        level: estimate([one for one in counted if one.cells.level == level], confidence)
+        for level in stated.levels
+    }
+    result = Probability(
+        overall=estimate(counted, confidence) if traffic is None else None,
+        levels=by_level,
+        per_merge=None if traffic is None else _per_merge(traffic, scenario, by_level),
+        confidence=confidence,
+        cases=cases,
+        in_sumo=in_sumo,
+        missed=tuple(missed[:NAMED]),
+        distribution=stated.record(),
+        seed=seed,
+        engine=study.plan.engine,
+        campaign=study.record(),
+    )
+    write_new(out, (json.dumps(to_plain(result), indent=2, allow_nan=False) + "\n").encode())
+    return result
+
+
+def probability_of(folder: Path) -> Probability | None:
     """Return what the folder of a campaign says of a probability; None where it says nothing.
 
     Raises `UserError` for a file that is not as it was written.
     """
-    return read_record(folder / RESULT, ProbabilityFile)
+    return read_record(folder / RESULT, Probability)
 
 
-def check_numbers(cases: int, confidence: float, seed: int) -> None:
-    """Raise `UserError` where a number makes no sense."""
+def _check(cases: int, confidence: float, seed: int, *, both: bool) -> None:
+    if both:
+        raise UserError("choose a distribution or a traffic: a traffic states its own")
     for name, number, fits, bounds in (
         ("cases", cases, cases >= 1, "it must be 1 or more"),
         ("confidence", confidence, 0.5 <= confidence < 1.0, "choose 0.5 or more, and below 1"),
         ("seed", seed, seed >= 0, "it must be 0 or more"),
     ):
         if not fits:
-            raise UserError(f"--{name} is {number}: {bounds}")
+            raise UserError(f"{name} is {number}: {bounds}")
 
 
-def lines_beside(out: Path) -> Path:
-    """Return the file of fresh cases beside a result; `UserError` unless both can be new files."""
-    check_new_file(out)
-    lines = out.with_suffix(LINES)
-    if lines == out:
-        raise UserError(f"--out is {out}: end it in .json, as cases go to {LINES} beside it")
-    check_new_file(lines)
-    return lines
+# Strata.
 
 
-def strata_of(
-    expected: Expected, scenario: Scenario, stated: Distribution, cases: int, confidence: float
-) -> Strata:
-    """Return the strata that the outcomes of a campaign suggest."""
-    from threadpoolctl import threadpool_limits
-
-    chance = {}
-    # One thread: rounding must not depend on the number of cores.
-    with threadpool_limits(1):
-        for level in stated.levels:
-            dims = len(scenario.dimensions(level))
-            chance[level] = of_cells(dims, _of_chances(stated, level, expected.at(level)))
-    return Strata(stated.levels, chance, scenario, cases, confidence)
-
-
-def _of_chances(
-    stated: Distribution, level: int, of_points: Callable[[FloatArray], FloatArray]
-) -> Callable[[FloatArray], FloatArray]:
-    """Return a function of points as one of chances of the distribution."""
-    return lambda chances: of_points(stated.points(level, chances))
+def expected_cells(study: RunStudy, stated: Distribution) -> list[Cells]:
+    """Return the cells of each level, by whether the campaign expects failures there."""
+    found = []
+    for level, weight in stated.levels.items():
+        shape = cells_of(stated.scenario, level)
+        surface = learn_surface(study.run.outcomes, level, tolerated=study.settings.tolerated)
+        expects = np.zeros(shape, dtype=bool)
+        if surface is not None:
+            middle = (np.indices(shape).reshape(len(shape), -1).T + 0.5) / shape
+            chance = surface.chance(stated.points(level, middle))
+            expects = maximum_filter((chance >= EXPECTED).reshape(shape), 3)
+        for expects_failures in (False, True):
+            (numbers,) = np.nonzero(expects.ravel() == expects_failures)
+            if len(numbers):
+                share = weight * len(numbers) / expects.size
+                found.append(Cells(level, expects_failures, share, numbers))
+    return found
 
 
-class Expected:
-    """P(fail) of cases as expected after a campaign: by twin and surrogate, or surrogate alone.
+def cells_of(scenario: Scenario, level: int) -> tuple[int, ...]:
+    """Return the number of cells along each coordinate of a level."""
+    dims = len(scenario.dimensions(level))
+    return (int(CELLS ** (1.0 / dims) + 1e-9),) * dims
 
-    What is expected decides the width of the interval, and not its validity.
+
+def draw(
+    cells: Sequence[Cells], scenario: Scenario, cases: int, rng: np.random.Generator
+) -> list[FloatArray]:
+    """Return independent cases of each stratum, as often as they occur there.
+
+    They are places in the distribution, (n, d), uniform in the unit cube, for each of the cells.
     """
-
-    def __init__(self, study: RunStudy) -> None:
-        run, settings, plan = study.run, study.settings, study.plan
-        self._sampler = make_sampler("uniform", settings.pool, 0)
-        self._sampler.tell(run.outcomes)
-        self._by_level: dict[int, Callable[[FloatArray], FloatArray]] = {}
-        self._limit_m = settings.scenario.dx_crash_m if plan.criterion.is_papers else DX_CRASH_M
-        lines = centre_lines(plan.road)
-        self._twin = Twin(settings.pool, plan.povs, 0, criterion=plan.criterion, lines=lines)
-        last = run.outcomes[-MOST_LEARNED:]
-        # Without motions, as in a folder of which only the outcomes were kept, it learns nothing.
-        with suppress(UserError):
-            self._twin.tell(last, {o.index: run.trajectory(o.index).motion for o in last})
-
-    def at(self, level: int) -> Callable[[FloatArray], FloatArray]:
-        """Return P(fail), (n,), as a function of points, (n, d), of a level's unit cube."""
-        if level not in self._by_level:
-            self._by_level[level] = self._learned(level)
-        return self._by_level[level]
-
-    def _learned(self, level: int) -> Callable[[FloatArray], FloatArray]:
-        history = self._sampler.history(level)
-        surrogate = learn_chance(history)
-
-        def by_surrogate(points: FloatArray) -> FloatArray:
-            if surrogate is None:
-                return np.zeros(len(points))
-            return np.concatenate([surrogate(part) for part in _parts(points)])
-
-        if not self._twin.can_predict(level) or not history.failed.any():
-            return by_surrogate
-        skill = self._skill(level)
-        if skill.is_worthless:
-            return by_surrogate
-
-        def by_both(points: FloatArray) -> FloatArray:
-            gaps = [self._twin.predict([Query(level, part)])[0] for part in _parts(points)]
-            gaps_m = np.concatenate(gaps, axis=-1)
-            chance = skill.chance(gaps_m)
-            if surrogate is None or skill.twin.min() > TWIN_ALONE:
-                return chance
-            return skill.mixed(gaps_m, chance, by_surrogate(points))
-
-        return by_both
-
-    def _skill(self, level: int) -> PredictionSkill:
-        """Return the skill of the twin, judged by predictions of its last cases, too."""
-        last = self._sampler.observed(level)[-REPLAYED:]
-        indices = [outcome.index for outcome in last]
-        points = to_unit((o.case for o in last), level, self._sampler.pool.scenario)
-        gaps_m = self._twin.predict([Query(level, points, held_out=indices)])[0]
-        replayed = dict(zip(indices, gaps_m.T, strict=True))
-        return PredictionSkill(self._sampler.observed(), level, self._limit_m, replayed)
+    expected = sum(one.share for one in cells if one.expects_failures)
+    some = cases > 1 and 0.0 < expected < 1.0 - 1e-9
+    most = round(cases * max(expected, EXPECTED_LEAST)) if some else round(cases * expected)
+    drawn: dict[int, FloatArray] = {}
+    for expects_failures, count in ((False, cases - most), (True, most)):
+        of_stratum = {n: c for n, c in enumerate(cells) if c.expects_failures == expects_failures}
+        shares = np.array([one.share for one in of_stratum.values()])
+        numbers = rng.multinomial(count, shares / shares.sum()) if of_stratum else ()
+        for (place, one), number in zip(of_stratum.items(), numbers, strict=True):
+            shape = cells_of(scenario, one.level)
+            corner = np.unravel_index(rng.choice(one.numbers, number), shape)
+            drawn[place] = (np.stack(corner, axis=1) + rng.random((number, len(shape)))) / shape
+    return [drawn[place] for place in range(len(cells))]
 
 
-def _parts(points: FloatArray) -> list[FloatArray]:
-    return np.array_split(points, len(points) // CHUNK + 1)
-
-
-def cases_of(settings: CampaignSettings, stated: Distribution, draws: Draws) -> list[Case]:
-    """Return the cases of draws from a distribution, in their order."""
-    by_place: dict[int, Case] = {}
-    for level in stated.levels:
-        places = np.flatnonzero(draws.level == level)
-        dims = len(settings.scenario.dimensions(level))
-        points = stated.points(level, draws.chances[places, :dims])
-        drawn = settings.pool.cases(points, level)
-        by_place.update(zip(places.tolist(), drawn, strict=True))
-    return [by_place[place] for place in range(len(by_place))]
-
-
-def notes_of(draws: Draws) -> list[dict[str, float]]:
-    """Return what the line of each drawn case says beside its outcome."""
-    weights, strata = draws.weight.tolist(), draws.stratum.tolist()
-    return [{"weight": w, "stratum": h} for w, h in zip(weights, strata, strict=True)]
+# Cases.
 
 
 def run_fresh(
-    study: RunStudy, cases: Sequence[Case], notes: Sequence[Mapping[str, float]], lines: Path
-) -> list[Outcome]:
-    """Run cases in order, some at a time; write each outcome with what is noted of its case."""
-    outcomes: list[Outcome] = []
-    with workers_or_here(study.workers) as processes:
-        plan = study.plan.for_cases(len(cases))
-        open_simulators(plan, processes)
-        for first in range(0, len(cases), WRITTEN):
-            ran = []
-            for place, done in evaluate(plan, cases[first : first + WRITTEN], processes):
-                ran.append(done.outcome(first + place, first // WRITTEN))
-                study.on_cases(1)
-            ran.sort(key=lambda outcome: outcome.index)
-            append_lines(lines, ran, notes)
-            outcomes += ran
-    return outcomes
+    plan: SimulationPlan, cases: CasesAt, workers: Workers | None, study: RunStudy
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], int]:
+    """Run cases; return which failed and which had a verdict, (n,), and how many ran in SUMO."""
+    failed, judged = np.zeros((2, len(cases)), dtype=bool)
+    in_sumo = 0
+    for place, (fails, has_verdict, by_sumo) in evaluate(plan, cases, workers, _judged):
+        failed[place], judged[place] = fails, has_verdict
+        in_sumo += by_sumo
+        study.on_cases(1)
+    return failed, judged, in_sumo
 
 
-def append_lines(
-    lines: Path, outcomes: Sequence[Outcome], notes: Sequence[Mapping[str, float]]
-) -> None:
-    """Add outcomes to the file of fresh cases, and sync it."""
-    content = ""
-    for o in outcomes:
-        content += json.dumps({**o.to_record(), **notes[o.index]}, allow_nan=False) + "\n"
-    add_to(lines, content.encode(), new=outcomes[0].index == 0)
+def _judged(results: CaseResults) -> list[tuple[bool, bool, bool]]:
+    """Return of each case whether it failed, had a verdict, and ran in SUMO."""
+    return [
+        (verdict.failed, verdict.score is not None, place in results.in_sumo)
+        for place, verdict in enumerate(results.verdicts())
+    ]
+
+
+def _named(cases: CasesAt, place: int) -> dict[str, float]:
+    case = cases[place : place + 1][0]
+    fields = (d.field for d in case.scenario.dimensions(case.level))
+    return {"level": case.level, **{name: getattr(case, name) for name in fields}}
+
+
+# Intervals.
+
+
+def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
+    """Return the estimate of the share of failures among cases of some cells."""
+    whole = sum(one.cells.share for one in counted)
+    by_stratum = [
+        [one for one in counted if one.cells.expects_failures == expects_failures]
+        for expects_failures in (False, True)
+    ]
+    present = [of_stratum for of_stratum in by_stratum if of_stratum]
+    strata = tuple(
+        _stratum(of_stratum, whole, 1.0 - (1.0 - confidence) / len(present))
+        for of_stratum in present
+    )
+    return Estimate(
+        probability=sum(one.share * one.failures / max(one.cases, 1) for one in strata),
+        low=sum(one.share * one.low for one in strata),
+        high=min(sum(one.share * one.high for one in strata), 1.0),
+        strata=strata,
+    )
+
+
+def _stratum(counted: Sequence[Counted], whole: float, confidence: float) -> Stratum:
+    cases, failures, without_verdict = (
+        sum(of) for of in zip(*(one[1:] for one in counted), strict=True)
+    )
+    return Stratum(
+        expects_failures=counted[0].cells.expects_failures,
+        share=sum(one.cells.share for one in counted) / whole,
+        cases=cases,
+        failures=failures,
+        without_verdict=without_verdict,
+        low=clopper_pearson(failures, cases, confidence)[0],
+        high=clopper_pearson(failures + without_verdict, cases, confidence)[1],
+    )
+
+
+def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
+    """Return the exact interval of a probability by independent cases; (0, 1) without any."""
+    from scipy.stats import binomtest
+
+    if not cases:
+        return 0.0, 1.0
+    found = binomtest(failures, cases).proportion_ci(confidence, method="exact")
+    return float(found.low), float(found.high)
+
+
+def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]) -> PerMerge:
+    """Return the range over mixtures of levels.
+
+    Its low end is above the fewest only where the end of that level is, and its high end below the
+    most likewise; so all mixtures are inside with the confidence of a level.
+    """
+    cars, found = traffic.cars_in_pool(scenario), [one.probability for one in levels.values()]
+    low, high = min(e.low for e in levels.values()), max(e.high for e in levels.values())
+    return PerMerge(
+        traffic=traffic,
+        cars=cars,
+        counted_speeds=traffic.speeds_in_pool(scenario)[0],
+        least=cars * min(found),
+        most=cars * max(found),
+        low=cars * low,
+        high=cars * high,
+    )
+
+
+# The result.
+
+
+@dataclass(frozen=True, repr=False)
+class ProbabilityResult(Result):
+    """How likely a VUT is to fail.
+
+    Attributes:
+        found: `overall`, `levels` and `per_merge`, with their intervals, and what they rest on.
+        file: file that was written.
+        criterion: what counts as a failure.
+    """
+
+    found: Probability
+    file: Path
+    criterion: Criterion
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        record: dict[str, Any] = to_plain(self.found)
+        return {**record, "file": str(self.file)}
+
+    def lines(self) -> list[str]:
+        """Return the probability and its interval, the strata, the levels, and what is counted."""
+        found, at = self.found, f"{100.0 * self.found.confidence:g} % interval"
+        lines = [] if found.per_merge is None else _per_merge_lines(found.per_merge, at)
+        if found.overall is not None:
+            lines.append(f"P(fail): {_interval(found.overall)}, {at}, by {found.cases:,} cases")
+            lines += map(_stratum_line, found.overall.strata)
+        if found.overall is None or len(found.levels) > 1:
+            lines += [
+                f"  level {level_name(level)}: P(fail) {_interval(one)}"
+                for level, one in found.levels.items()
+            ]
+        if not self.criterion.is_papers:
+            lines.append(f"  a case fails when {self.criterion.words}")
+        if errors := sum(s.without_verdict for e in found.levels.values() for s in e.strata):
+            lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
+        if found.in_sumo < found.cases:
+            lines.append(f"  by the equations of motion; {found.in_sumo:,} in SUMO too, all alike")
+        return [*lines, f"written: {self.file}"]
+
+
+def _interval(one: Estimate) -> str:
+    return f"{one.probability:.3g} [{one.low:.3g}, {one.high:.3g}]"
+
+
+def _stratum_line(one: Stratum) -> str:
+    expected = "failures" if one.expects_failures else "no failure"
+    return (
+        f"  where the campaign expects {expected}, {one.share:.2%} of the cases: {one.failures:,} "
+        f"of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
+    )
+
+
+def _per_merge_lines(one: PerMerge, at: str) -> list[str]:
+    traffic = one.traffic
+    return [
+        f"failures per merge: {one.least:.3g} to {one.most:.3g} [{one.low:.3g}, {one.high:.3g}], "
+        f"{at}, whatever the shares of the POV levels",
+        f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
+        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
+        f"{one.counted_speeds:.0%} of the speeds of this traffic",
+    ]

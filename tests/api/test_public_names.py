@@ -59,9 +59,8 @@ print(ms.export(run, 3)[0].name, ms.report(run).name, ms.replay(run, 3).diverged
 code: int = ms.open_in_gui(run, 3)
 print(ms.truth(Mine, 0, cases=100).failures.shape, ms.truths("fsm").truths[0].score.mean())
 print(ms.benchmark("fsm", 0, samplers=["uniform"], seeds=2).samplers["uniform"].fmc.median)
-print(ms.probability(run, cases=100).estimate.low)
+print(ms.probability(run, cases=100).found.overall.low)
 print(ms.repair(run, ["gain=0..1"], trials=9).repair.spec)
-print(ms.failures_per_merge(run, "exid-5", cases=100).found.all_levels.high)
 print(ms.check_vut(Mine).problems, ms.train(["pov1"], check=True)["pov1"].mean_regret)
 try:
     ms.open_run("nowhere")

@@ -33,7 +33,6 @@ from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run, re
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
-from merge_sumo.studies.probability import LINES
 from merge_sumo.studies.truth import Truth, ground_truth, read_truth
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.severity import Severity
@@ -88,7 +87,7 @@ class Disk:
         """Put the run there anew, with one bit of a file changed."""
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.copytree(self.pristine, self.folder)
-        for made in ("new", "tables", "p.json", f"p{LINES}", "junit.xml"):
+        for made in ("new", "tables", "p.json", "junit.xml"):
             path = self.root / made
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
         if name is not None:

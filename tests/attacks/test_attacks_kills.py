@@ -87,7 +87,7 @@ COMMANDS = {
     "probability": Command(
         ("probability", "run", "--cases", "600", "--json"),
         ROUNDS,
-        ("run/probability.jsonl", "run/probability.json"),
+        ("run/probability.json",),
     ),
     "export csv": Command(
         ("export", "run", "--format", "csv", "--out", "tables"),

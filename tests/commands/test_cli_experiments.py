@@ -1,9 +1,8 @@
-"""The commands benchmark, reproduce and probability, and a campaign that stops early."""
+"""The commands benchmark and reproduce, and a campaign that stops early."""
 
 from __future__ import annotations
 
 import json
-import shutil
 
 import pytest
 from calling import assert_refused
@@ -70,24 +69,3 @@ class TestReproduce:
         assert_refused(call("reproduce", "--seeds", 0, "--out", "here"), "--seeds is 0")
         assert_refused(call("reproduce", "--workers", 0, "--out", "here"), "--workers is 0")
         assert not (tmp_path / "here").exists()
-
-
-class TestProbability:
-    def test_prints_an_estimate_and_writes_it_into_the_run(self, call, run, tmp_path):
-        folder = shutil.copytree(run.folder, tmp_path / "run")
-        code, out, err = call("probability", folder, "--cases", 50, "--json")
-        assert code == 0, err
-        found = json.loads(out)
-        assert found["low"] <= found["probability"] <= found["high"]
-        assert json.loads((folder / "probability.json").read_text())["high"] == found["high"]
-        assert (folder / "probability.jsonl").read_bytes().count(b"\n") == 50
-        assert_refused(call("probability", folder, "--cases", 50), "probability.json exists")
-
-    def test_says_what_the_interval_is_of(self, call, run, tmp_path):
-        (tmp_path / "d.json").write_text('{"x_pov0_m": {"kind": "uniform", "high": -250}}')
-        arguments = ("--cases", 40, "--out", "p.json", "--confidence", 0.9)
-        code, out, err = call("probability", run.folder, "--distribution", "d.json", *arguments)
-        assert code == 0, err
-        assert out.startswith("P(fail) under the stated distribution: ")
-        assert "90 % interval" in out
-        assert "written: p.json" in out

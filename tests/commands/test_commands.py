@@ -82,7 +82,7 @@ class TestOptions:
         }
         assert set(COMMANDS) == has["as_json"]
         again = {"explain", "repair", "stress"}
-        fresh = {*again, "failures-per-merge", "probability"}
+        fresh = {*again, "probability"}
         runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
         assert has["quiet"] == {*runs_cases, "reproduce", "train"}

@@ -1,4 +1,4 @@
-"""Failure probability: closed-form failure sets, known densities, intervals that hold."""
+"""Failure probability: exact intervals by hand, that hold, and what a campaign and a road make."""
 
 from __future__ import annotations
 
@@ -8,218 +8,145 @@ import math
 import numpy as np
 import pytest
 from campaigning import campaign_settings, run_campaign
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy.stats import binom, kstest, norm, truncnorm
+from scipy.stats import kstest, norm, truncnorm
 
-from merge_sumo.analysis.exposure import read_distribution
+from merge_sumo.analysis.exposure import Histogram, Normal, read_distribution
+from merge_sumo.analysis.traffic import FOLDER, Traffic, named_traffic, shipped_traffics
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies import probability
-from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.stratified import (
-    CELLS,
-    DEFENSIVE,
-    Strata,
-    cells,
+from merge_sumo.studies.probability import (
+    EXPECTED_LEAST,
+    Cells,
+    Counted,
+    cells_of,
+    clopper_pearson,
+    draw,
     estimate,
-    of_cells,
-    risks,
-    upper_end,
+    probability_of,
 )
+from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.values.case import V_POV0, dimensions
-from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)
 UNIFORM = read_distribution(None, LEVELS, scenario=US23)
+SHAPE = cells_of(US23, 1)
 
 
-def band(points, half_width):
-    """Fail in a diagonal band, as the designs do."""
-    return np.abs(0.6 * points[:, 0] + 0.8 * points[:, 1] - 0.7) < half_width
+def band(points, middle=0.7, half_width=0.05):
+    """Fail in a diagonal band of area 2.5 half_width, as the designs do."""
+    return np.abs(0.6 * points[:, 0] + 0.8 * points[:, 1] - middle) < half_width
 
 
-def band_area(half_width):
-    """Return the area of the band in the unit square, for half widths up to 0.1."""
-    # It leaves the square through the sides u = 0 and u = 1 and is 2 w / 0.8 high everywhere.
-    return 2.0 * half_width / 0.8
+def strata(expects, levels=(1,)) -> list[Cells]:
+    """Return the cells of levels of two coordinates, by a mask of what is expected to fail."""
+    return [
+        Cells(level, flag, np.mean(expects == flag) / len(levels), np.flatnonzero(expects == flag))
+        for level in levels
+        for flag in (False, True)
+        if (expects == flag).any()
+    ]
 
 
-def strata_by(chance, cases, weights=None, confidence=0.95) -> Strata:
-    return Strata(weights or {1: 1.0}, chance, US23, cases, confidence)
+def expecting(middle, half_width):
+    points = (np.indices(SHAPE).reshape(2, -1).T + 0.5) / SHAPE
+    return band(points, middle, half_width)
 
 
-def knowing(half_width, cases, blur=0.005, confidence=0.95):
-    """Return strata of a surrogate that knows the band, but not sharply."""
-    middle = cells(2)
-    beyond = np.abs(0.6 * middle[:, 0] + 0.8 * middle[:, 1] - 0.7) - half_width
-    return strata_by({1: 1.0 / (1.0 + np.exp(beyond / blur))}, cases, confidence=confidence)
-
-
-def estimate_band(strata, half_width, seed, confidence=0.95):
-    draws = strata.draw(np.random.default_rng(seed))
-    failed = band(draws.chances[:, :2], half_width)
-    return estimate(strata, draws, failed, np.ones(len(failed), dtype=bool), confidence)
-
-
-def estimate_counts(share, cases, failures, confidence=0.95):
-    """Return both ends for failures in the cases of strata."""
-    share, cases, failures = map(np.array, (share, cases, failures))
-    low, high = risks(len(share), confidence)
-    return 1.0 - upper_end(share, cases, cases - failures, low), upper_end(
-        share, cases, failures, high
-    )
-
-
-class TestTheStrata:
-    def test_have_shares_that_add_up_to_1_and_all_cases(self):
-        rng = np.random.default_rng(0)
-        chance = {level: rng.random(len(cells(3 if level == 2 else 2))) ** 4 for level in LEVELS}
-        strata = strata_by(chance, 600, {0: 0.2, 1: 0.5, 2: 0.3})
-        assert strata.share.sum() == pytest.approx(1.0, abs=1e-12)
-        assert strata.cases.sum() == 600
-        assert (strata.cases >= np.floor(DEFENSIVE * 600 * strata.share)).all()
-        assert (np.diff(strata.expected) > 0.0).all()
-
-    def test_draw_what_their_weights_say(self):
-        """E[w 1(A)] = p(A), for a set A far from any cell's edge."""
-        chance = {1: cells(2)[:, 0] ** 8, 2: cells(3)[:, 2] ** 8}
-        strata = strata_by(chance, 40_000, {1: 0.25, 2: 0.75})
-        assert len(strata.share) == 3
-        draws = strata.draw(np.random.default_rng(1))
-        inside = (draws.level == 2) & (draws.chances[:, 2] > 0.9)
-        x = draws.weight * inside
-        assert x.mean() == pytest.approx(0.075, abs=0.006)
-        assert draws.weight.mean() == pytest.approx(1.0, abs=1e-12)
-
-    def test_draw_each_case_from_its_stratum(self):
-        strata = knowing(0.05, 2000, blur=0.02)
-        draws = strata.draw(np.random.default_rng(2))
-        near = np.abs(0.6 * draws.chances[:, 0] + 0.8 * draws.chances[:, 1] - 0.7)
-        assert near[draws.stratum == 2].max() < near[draws.stratum == 0].min()
-        assert np.array_equal(np.bincount(draws.stratum), strata.cases)
-
-    def test_are_one_where_nothing_is_expected(self):
-        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 100)
-        draws = strata.draw(np.random.default_rng(0))
-        assert np.array_equal(draws.weight, np.ones(100))
-        assert strata.share.tolist() == [1.0]
-
-    def test_are_found_with_few_predictions(self):
-        asked = []
-
-        def expected(points):
-            asked.append(len(points))
-            return band(points, 0.05).astype(float)
-
-        fine = of_cells(2, expected)
-        assert np.mean(fine != band(cells(2), 0.05)) < 0.001
-        assert sum(asked) < 0.4 * len(cells(2))
+def measured(cells, fails, cases, seed, confidence=0.95):
+    drawn = draw(cells, US23, cases, np.random.default_rng(seed))
+    counted = [
+        Counted(one, len(points), int(fails(points).sum()), 0)
+        for one, points in zip(cells, drawn, strict=True)
+    ]
+    return estimate(counted, confidence)
 
 
 class TestTheInterval:
-    @pytest.mark.parametrize(("half_width", "n"), [(0.002, 400), (0.02, 400), (0.1, 150)])
-    def test_holds_the_truth_at_least_as_often_as_it_says(self, half_width, n):
-        strata = knowing(half_width, n, confidence=0.8)
-        truth = band_area(half_width)
-        found = [estimate_band(strata, half_width, seed, 0.8) for seed in range(20)]
-        held = sum(e.low <= truth <= e.high for e in found)
-        assert held >= 0.8 * 20
-        assert np.mean([e.probability for e in found]) == pytest.approx(truth, rel=0.25)
+    def test_of_plain_cases_is_that_of_clopper_and_pearson(self):
+        """By hand: no failure in n gives 1 - (alpha/2)^(1/n); 10 of 100 are in each table."""
+        assert clopper_pearson(0, 100, 0.95) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
+        assert clopper_pearson(100, 100, 0.95) == pytest.approx((0.025 ** (1 / 100), 1.0))
+        assert clopper_pearson(10, 100, 0.95) == pytest.approx((0.0490, 0.1762), abs=1e-4)
+        assert clopper_pearson(0, 0, 0.95) == (0.0, 1.0)
 
-    def test_holds_with_a_surrogate_that_looks_in_the_wrong_place(self):
-        wrong = strata_by({1: np.exp(-50.0 * cells(2).sum(axis=1))}, 300, confidence=0.8)
-        truth, held = band_area(0.02), 0
-        for seed in range(20):
-            e = estimate_band(wrong, 0.02, seed, 0.8)
-            held += e.low <= truth <= e.high
-        assert held >= 16
-
-    def test_is_half_as_wide_as_that_of_plain_cases_on_a_rare_set(self):
-        truth, n = band_area(0.0036), 600
-        ours = [estimate_band(knowing(0.0036, n, blur=0.002), 0.0036, seed) for seed in range(3)]
-        plain = clopper_pearson(round(n * truth), n, 0.025)
-        assert max(e.high - e.low for e in ours) < 0.6 * (plain[1] - plain[0])
-
-    def test_of_one_stratum_is_that_of_clopper_and_pearson(self):
-        assert estimate_counts([1.0], [600], [5]) == pytest.approx(
-            clopper_pearson(5, 600, 0.025), abs=1e-12
-        )
-
-    def test_by_hand_where_only_the_safe_stratum_is_open(self):
-        """No failure in 100 cases of .9 of the pool, and only failures in 10^6 of the rest.
-
-        Of a risk of .0375, .0025 is for values that single strata exclude: .9 (1 - .03375^(1/100))
-        remains for the upper end.
-        """
-        low, high = estimate_counts([0.9, 0.1], [100, 10**6], [0, 10**6])
-        assert high == pytest.approx(0.1 + 0.9 * (1.0 - 0.03375 ** (1 / 100)), rel=0.005)
-        assert low == pytest.approx(0.1, abs=1e-5)
-
-    @pytest.mark.parametrize(
-        ("share", "cases", "p"),
-        [
-            ((0.9, 0.1), (12, 8), (0.1, 0.6)),
-            ((0.9, 0.1), (12, 8), (0.0, 0.5)),
-            ((0.5, 0.5), (10, 10), (0.02, 0.1)),
-            ((0.8, 0.15, 0.05), (6, 3, 2), (0.05, 0.5, 0.95)),
-        ],
-    )
-    def test_is_wrong_as_often_as_it_says_by_all_results(self, share, cases, p):
-        """Sum the chances of all results whose interval does not hold the probability."""
-        truth, wrong = float(np.dot(share, p)), np.zeros(2)
-        for failures in np.ndindex(*(n + 1 for n in cases)):
-            chance = float(np.prod(binom.pmf(failures, cases, p)))
-            if chance > 1e-6:
-                low, high = estimate_counts(share, cases, failures, 0.8)
-                wrong += chance * np.array([low > truth, high < truth])
-        assert (wrong <= np.array(risks(len(share), 0.8)) + 1e-4).all()
-
-    @pytest.mark.parametrize(("fails", "p"), [(False, 0.0), (True, 1.0)])
-    def test_of_certain_cases_ends_at_the_certain_probability(self, fails, p):
-        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 1000)
-        draws = strata.draw(np.random.default_rng(0))
-        e = estimate(strata, draws, np.full(1000, fails), np.ones(1000, dtype=bool), 0.95)
-        assert e.probability == p
-        assert (e.high if fails else e.low) == pytest.approx(p, abs=1e-12)
-        # The rule of three, for half of the risk.
-        assert e.high - e.low == pytest.approx(1.0 - 0.025 ** (1 / 1000), rel=1e-9)
+    def test_of_two_strata_shares_the_risk_out(self):
+        """Of 90 % no case of 300 fails, of 10 % all 100 do: at 5 %, each stratum has 2.5 %."""
+        numbers = np.arange(10)
+        counted = [
+            Counted(Cells(1, False, 0.9, numbers), 300, 0, 0),
+            Counted(Cells(1, True, 0.1, numbers), 100, 100, 0),
+        ]
+        found = estimate(counted, 0.95)
+        assert found.probability == pytest.approx(0.1)
+        assert found.low == pytest.approx(0.1 * 0.0125 ** (1 / 100))
+        assert found.high == pytest.approx(0.9 * (1.0 - 0.0125 ** (1 / 300)) + 0.1)
+        assert found.strata[0].high == pytest.approx(1.0 - 0.0125 ** (1 / 300))
 
     def test_takes_a_case_without_a_verdict_as_safe_below_and_as_a_failure_above(self):
-        strata = strata_by({1: np.zeros(CELLS[2] ** 2)}, 400)
-        draws = strata.draw(np.random.default_rng(0))
-        part = np.random.default_rng(1).permutation(400)
-        failed, judged = part < 100, part < 300
-        e = estimate(strata, draws, failed, judged, 0.95)
-        assert e.low < 0.25
-        assert e.high > 0.5
-        assert e.probability == pytest.approx(0.25)
-        assert e.without_verdict == e.strata[0].without_verdict == 100
-        known = estimate(strata, draws, failed, np.ones(400, dtype=bool), 0.95)
-        assert known.low == e.low
-        assert known.high < e.high
+        (cells,) = strata(np.zeros(math.prod(SHAPE), dtype=bool))
+        found = estimate([Counted(cells, 400, 100, 100)], 0.95)
+        assert found.probability == 0.25
+        assert found.low == clopper_pearson(100, 400, 0.95)[0]
+        assert found.high == clopper_pearson(200, 400, 0.95)[1]
 
-    @given(st.lists(st.integers(0, 20), min_size=3, max_size=3))
-    @settings(deadline=None, max_examples=5)
-    def test_holds_the_estimate_and_grows_with_each_failure(self, failures):
-        share, cases = [0.7, 0.2, 0.1], [20, 20, 20]
-        low, high = estimate_counts(share, cases, failures)
-        assert 0.0 <= low <= np.dot(share, failures) / 20 + 1e-9 <= high + 2e-9 <= 1.0 + 3e-9
-        more = np.minimum(np.add(failures, [1, 0, 0]), 20)
-        assert estimate_counts(share, cases, more)[1] >= high - 0.01
+    @pytest.mark.parametrize(
+        ("expects", "held", "width"),
+        [
+            (expecting(0.7, 0.06), 190, 0.6),
+            (expecting(0.7, 0.03), 190, 1.1),
+            (expecting(0.2, 0.05), 190, 1.4),
+            (np.zeros(math.prod(SHAPE), dtype=bool), 184, 1.01),
+        ],
+        ids=["known", "half known", "wrong place", "unknown"],
+    )
+    def test_holds_whatever_the_surrogate_expects(self, expects, held, width):
+        """A band of area .125, 600 cases, 200 seeds; the width beside that of plain cases."""
+        found = [measured(strata(expects), band, 600, seed) for seed in range(200)]
+        assert sum(one.low <= 0.125 <= one.high for one in found) >= held
+        assert np.mean([one.probability for one in found]) == pytest.approx(0.125, abs=0.004)
+        low, high = clopper_pearson(75, 600, 0.95)
+        assert np.mean([one.high - one.low for one in found]) < width * (high - low)
 
-    def test_begins_at_zero_where_no_case_fails_and_ends_at_one_where_all_do(self):
-        share, cases = [0.7, 0.2, 0.1], [20, 20, 20]
-        assert estimate_counts(share, cases, [0, 0, 0])[0] == 0.0
-        assert estimate_counts(share, cases, cases)[1] == 1.0
+    def test_of_levels_holds_for_each_and_for_all(self):
+        """Level 0 fails nowhere, level 1 in the band."""
+        cells = strata(expecting(0.7, 0.06), levels=(0, 1))
+        held = np.zeros(3)
+        for seed in range(100):
+            drawn = draw(cells, US23, 600, np.random.default_rng(seed))
+            counted = [
+                Counted(one, len(points), int(band(points).sum()) if one.level else 0, 0)
+                for one, points in zip(cells, drawn, strict=True)
+            ]
+            for place, (some, p) in enumerate(
+                ((counted[:2], 0.0), (counted[2:], 0.125), (counted, 0.0625))
+            ):
+                found = estimate(some, 0.95)
+                held[place] += found.low <= p <= found.high
+        assert (held >= 94).all()
 
-    def test_of_plain_cases_is_the_exact_binomial_one(self):
-        # Clopper and Pearson by hand: no failure in n gives 1 - (alpha/2)^(1/n).
-        assert clopper_pearson(0, 100, 0.025) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
-        assert clopper_pearson(100, 100, 0.025) == pytest.approx((0.025 ** (1 / 100), 1.0))
-        assert clopper_pearson(10, 100, 0.025) == pytest.approx((0.0490, 0.1762), abs=1e-4)
+
+class TestTheDraws:
+    def test_are_uniform_in_each_stratum_and_as_many_as_asked_for(self):
+        expects = expecting(0.7, 0.05)
+        safe, failing = draw(strata(expects), US23, 4000, np.random.default_rng(1))
+        assert len(safe) + len(failing) == 4000
+        assert len(failing) == 4000 * EXPECTED_LEAST
+        for points, flag in ((safe, False), (failing, True)):
+            cell = (points * SHAPE).astype(int)
+            assert (expects[np.ravel_multi_index(tuple(cell.T), SHAPE)] == flag).all()
+            assert kstest((points * SHAPE % 1.0).ravel(), "uniform").pvalue > 0.01
+        share = np.mean(safe[:, 0] < 0.5) * 0.875 + np.mean(failing[:, 0] < 0.5) * 0.125
+        assert share == pytest.approx(0.5, abs=0.03)
+
+    def test_are_one_stratum_where_nothing_is_expected(self):
+        (points,) = draw(
+            strata(np.zeros(math.prod(SHAPE), dtype=bool)), US23, 7, np.random.default_rng(0)
+        )
+        assert points.shape == (7, 2)
 
 
 class TestADistribution:
@@ -265,19 +192,6 @@ class TestADistribution:
         assert again.record() == first.record()
         assert record["v_pov0_mps"]["low"] == V_POV0.low
 
-    def test_gives_an_estimate_of_its_own_probability(self, tmp_path):
-        """P(v > 32 m/s) for a normal speed, cut off at the pool's bounds."""
-        found = self.stated(
-            tmp_path, {"levels": {"1": 1}, "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 1}}
-        )
-        middle = found.points(1, cells(2))
-        strata = strata_by({1: (middle[:, 1] > 0.68).astype(float)}, 3000, found.levels, 0.99)
-        draws = strata.draw(np.random.default_rng(0))
-        failed = found.points(1, draws.chances[:, :2])[:, 1] > 0.7
-        e = estimate(strata, draws, failed, np.ones(3000, dtype=bool), 0.99)
-        assert e.low < norm.sf(2.0) < e.high
-        assert e.high - e.low < 0.02
-
     @pytest.mark.parametrize(
         ("text", "says"),
         [
@@ -295,7 +209,7 @@ class TestADistribution:
             ({"x_pov0_m": {"kind": "uniform", "low": -400}}, "-340 to -180"),
             ({"x_pov0_m": {"kind": "uniform", "low": -200, "high": -300}}, "low < high"),
             ({"v_pov0_mps": {"kind": "normal", "mean": 30}}, "no sd"),
-            ({"v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 0}}, "above 0"),
+            ({"v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 0}}, "sd is 0"),
             ({"v_pov0_mps": {"kind": "normal", "mean": "30", "sd": 1}}, "'30'"),
             ('{"v_pov0_mps": {"kind": "normal", "mean": NaN, "sd": 1}}', "no JSON"),
             ({"svo_rad": {"kind": "histogram", "edges": [0, 1], "weights": [1, 1]}}, "3 edges"),
@@ -315,49 +229,156 @@ class TestADistribution:
             read_distribution(tmp_path / "nowhere.json", LEVELS, scenario=US23)
 
 
-def failure_probability(run, out, **other):
+def traffic(**changes) -> Traffic:
+    """A traffic of 8.7 cars per km with 27 +- 2.85 m/s."""
+    known = {"source": "made up", "speeds": Normal(mean=27.0, sd=2.85), "density_veh_per_km": 8.7}
+    return Traffic(**{**known, **changes, "name": "mine"})
+
+
+class TestATraffic:
+    def test_has_cars_in_the_pool_as_random_traffic_has(self):
+        """Poisson traffic on 1 km, 20,000 merges: those from -340 to -180 m at 25 to 35 m/s."""
+        rng = np.random.default_rng(0)
+        number = rng.poisson(8.7, 20_000).sum()
+        x_m, v_mps = rng.uniform(-1000.0, 0.0, number), rng.normal(27.0, 2.85, number)
+        counted = (x_m > -340.0) & (x_m < -180.0) & (v_mps > 25.0) & (v_mps < 35.0)
+        share = norm.cdf(8.0 / 2.85) - norm.cdf(-2.0 / 2.85)
+        cars = traffic().cars_in_pool(US23)
+        assert cars == pytest.approx(0.0087 * 160.0 * share)
+        assert counted.sum() / 20_000 == pytest.approx(cars, rel=0.02)
+
+    def test_fails_with_as_many_cars_as_are_drawn_in_it(self):
+        """Cars at 30 m/s and more fail: the formula, and the share of cases that it draws."""
+        points = traffic().in_pool(US23, [1]).points(1, np.random.default_rng(0).random((20000, 2)))
+        v_mps = 25.0 + 10.0 * points[:, 1]
+        expected = 0.0087 * 160.0 * (norm.cdf(8.0 / 2.85) - norm.cdf(3.0 / 2.85))
+        found = traffic().cars_in_pool(US23) * np.mean(v_mps > 30.0)
+        assert found == pytest.approx(expected, rel=0.03)
+
+    def test_of_a_histogram_is_cut_at_the_pool(self):
+        """Of 20-30, 30-40 and 40-50 m/s half of the first two bins is in 25 to 35 m/s."""
+        speeds = Histogram(edges=(20.0, 30.0, 40.0, 50.0), weights=(4.0, 2.0, 2.0))
+        share, found = traffic(speeds=speeds).speeds_in_pool(US23)
+        assert share == pytest.approx(3.0 / 8.0)
+        v_mps = found.quantile(np.array([0.0, 1 / 3, 2 / 3, 1.0]))
+        assert v_mps == pytest.approx([25.0, 27.5, 30.0, 35.0])
+
+    def test_that_is_shipped_has_the_published_figures_and_their_source(self):
+        published = {"exid-2": (5.7, 23.3), "exid-3": (4.9, 21.5), "exid-5": (8.7, 25.1)}
+        assert shipped_traffics() == [*published]
+        for name, (density, mean) in published.items():
+            found = named_traffic(name)
+            assert found.density_veh_per_km == density
+            assert found.speeds == Normal(mean=mean, sd=2.85)
+            assert "arXiv 2303.11531" in found.source
+
+    @pytest.mark.parametrize(
+        ("scenario", "says"),
+        [
+            (named_scenario("us23-traffic"), "us23-traffic has cars ahead of the POV"),
+            (named_scenario("roundabout"), "less than 1% of the speeds of mine"),
+        ],
+        ids=["headways", "other speeds"],
+    )
+    def test_needs_a_merge_with_single_cars_at_such_speeds(self, scenario, says):
+        with pytest.raises(UserError, match=says):
+            traffic().in_pool(scenario, [0])
+
+    @pytest.mark.parametrize(
+        ("change", "says"),
+        [
+            ({"density_veh_per_km = 8.7": "density_veh_per_km = 0"}, "density_veh_per_km is 0"),
+            ({"density_veh_per_km = 8.7": "density_veh_per_km = inf"}, "density_veh_per_km is inf"),
+            ({"density_veh_per_km": "density"}, "'density"),
+            ({"mean = 25.1": "mean = nan"}, "mean is nan"),
+            ({"sd = 2.85": "sd = 0"}, "sd is 0"),
+            ({'"normal"': '"beta"'}, "'beta'"),
+            (
+                {'"normal"': '"histogram"', "mean = 25.1": "edges = [20, nan]", "sd = 2.85": ""},
+                "weights",
+            ),
+            (
+                {
+                    '"normal"': '"histogram"',
+                    "mean = 25.1": "edges = [30, 20]",
+                    "sd = 2.85": "weights = [1]",
+                },
+                "must rise",
+            ),
+            ({"source": "# source"}, "no source"),
+            ({"[speeds]": "[speeds"}, "is no TOML"),
+        ],
+        ids=lambda value: str(value)[:40],
+    )
+    def test_that_makes_no_sense_is_refused_in_one_sentence(self, tmp_path, change, says):
+        text = (FOLDER / "exid-5.toml").read_text(encoding="utf-8")
+        for old, new in change.items():
+            text = text.replace(old, new)
+        (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+        with pytest.raises(UserError, match=says) as error:
+            named_traffic(str(tmp_path / "mine.toml"))
+        assert "\n" not in str(error.value)
+
+
+def failure_probability(run, out, engine="kinematic", **other):
     settings = settings_of(run.folder, run.settings)
-    study = RunStudy(run, settings, resolve(settings))
+    study = RunStudy(run, settings, resolve(settings).with_engine(engine))
     return probability.failure_probability(study, out, **other)
 
 
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory):
+    settings = campaign_settings(vut="design1", cases=160, batch=20, seed=1)
+    return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
+
+
 class TestOfACampaign:
-    def test_is_estimated_with_fresh_cases_and_kept(self, tmp_path):
-        settings = campaign_settings(vut="design1", cases=160, batch=20, seed=1)
-        run = run_campaign(settings, tmp_path / "run")
-        out = tmp_path / "p.json"
-        found = failure_probability(run, out, cases=600)
-        # 2.5 % of the pool fail (250 of 10,000 uniform cases).
-        assert found.low < 0.025 < found.high
-        assert found.failures > 1.3 * 0.025 * 600, "the campaign says where to look"
-        record = json.loads(out.read_text())
-        assert record["probability"] == found.probability
-        assert record["campaign"]["vut"] == "design1"
-        lines = out.with_suffix(".jsonl").read_text().splitlines()
-        drawn = [json.loads(line) for line in lines]
-        weighted = sum(d["weight"] for d in drawn if d["score"] < -500.0)
-        assert weighted / 600 == pytest.approx(found.probability)
-        counts = [sum(d["stratum"] == h for d in drawn) for h in range(3)]
-        assert counts == [stratum.cases for stratum in found.strata]
-        plain = found.plain.high - found.plain.low
-        assert found.high - found.low < 0.6 * plain, "half as wide, in the mean over seeds"
+    def test_is_estimated_with_fresh_cases_and_kept(self, campaign, tmp_path):
+        found = failure_probability(campaign, tmp_path / "probability.json", cases=4000)
+        # .0229 of the pool fail: a truth of 1,000,000 uniform cases.
+        assert found.overall.low < 0.0229 < found.overall.high
+        safe, failing = found.overall.strata
+        assert failing.failures > 1.3 * 0.0229 * 4000, "the campaign says where to look"
+        assert len(found.missed) == min(safe.failures, 20)
+        low, high = clopper_pearson(92, 4000, 0.95)
+        assert found.overall.high - found.overall.low < 0.7 * (high - low)
+        read = probability_of(tmp_path)
+        assert read is not None
+        assert (read.overall, read.missed) == (found.overall, found.missed)
+        assert found.campaign["vut"] == "design1"
 
-    def test_with_the_same_seed_is_the_same(self, run, tmp_path):
-        texts = []
-        for name in ("a.json", "b.json"):
-            failure_probability(run, tmp_path / name, cases=60, seed=3)
-            texts.append((tmp_path / name).read_bytes())
-            texts.append((tmp_path / name).with_suffix(".jsonl").read_bytes())
-        assert texts[:2] == texts[2:]
+    def test_has_the_same_failures_in_sumo(self, campaign, tmp_path):
+        """The same 300 cases by the equations of motion and in SUMO."""
+        ours = failure_probability(campaign, tmp_path / "a.json", cases=300, seed=3)
+        sumo = failure_probability(campaign, tmp_path / "b.json", "sumo", cases=300, seed=3)
+        assert ours.overall == sumo.overall
+        assert ours.missed == sumo.missed
+        assert ours.in_sumo < 60 < sumo.in_sumo == 300
 
-    def test_by_the_kinematic_engine_is_the_same(self, run, tmp_path, command_line):
-        found = failure_probability(run, tmp_path / "a.json", cases=60, seed=3)
-        options = ("--cases", 60, "--seed", 3, "--workers", 1, "--engine", "kinematic")
-        out = tmp_path / "b.json"
-        code, _, err = command_line("probability", run.folder, *options, "--out", out)
+    def test_is_printed_written_and_returned_alike(self, campaign, tmp_path, command_line):
+        options = ("--cases", 60, "--seed", 3, "--workers", 1)
+        out = tmp_path / "a.json"
+        code, said, err = command_line("probability", campaign.folder, *options, "--out", out)
         assert code == 0, err
-        record = json.loads(out.read_bytes())
-        assert (record["probability"], record["engine"]) == (found.probability, "kinematic")
+        assert said.startswith("P(fail): ")
+        found = failure_probability(campaign, tmp_path / "b.json", cases=60, seed=3)
+        assert (tmp_path / "b.json").read_bytes() == out.read_bytes()
+        assert json.loads(out.read_bytes())["overall"]["high"] == found.overall.high
+        code, _, err = command_line("probability", campaign.folder, *options, "--out", out)
+        assert (code, "a.json exists" in err) == (2, True)
+
+    def test_in_a_traffic_is_a_number_of_cars_per_merge(self, campaign, tmp_path, command_line):
+        out = tmp_path / "p.json"
+        options = ("--traffic", "exid-5", "--cases", 400, "--workers", 1, "--out", out)
+        code, said, err = command_line("probability", campaign.folder, *options)
+        assert code == 0, err
+        assert said.startswith("failures per merge: ")
+        assert "counted: 0.72 cars per merge" in said
+        written = json.loads(out.read_text())
+        assert written["overall"] is None
+        one, level = written["per_merge"], written["levels"]["0"]
+        assert one["most"] == pytest.approx(one["cars"] * level["probability"])
+        assert one["high"] == pytest.approx(one["cars"] * level["high"])
 
     def test_takes_how_the_vut_is_hosted(self, run, tmp_path, command_line):
         out = tmp_path / "p.json"
@@ -370,27 +391,22 @@ class TestOfACampaign:
         recorded = json.loads(out.read_text())["campaign"]
         assert (recorded["deadline_s"], recorded["vut_memory_gib"]) == (2.0, 1.0)
 
-    def test_overwrites_nothing(self, run, tmp_path):
-        (tmp_path / "p.jsonl").write_text("mine")
-        with pytest.raises(UserError, match=r"p\.jsonl exists"):
-            failure_probability(run, tmp_path / "p.json", cases=10)
-        assert (tmp_path / "p.jsonl").read_text() == "mine"
-
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"cases": 0}, "--cases is 0"),
-            ({"confidence": 1.0}, "--confidence is 1.0"),
-            ({"confidence": math.nan}, "--confidence is nan"),
-            ({"seed": -1}, "--seed is -1"),
+            ({"cases": 0}, "cases is 0"),
+            ({"confidence": 1.0}, "confidence is 1.0"),
+            ({"confidence": math.nan}, "confidence is nan"),
+            ({"seed": -1}, "seed is -1"),
+            ({"traffic": traffic(), "distribution": "d.json"}, "a distribution or a traffic"),
         ],
     )
-    def test_refuses_numbers_that_make_no_sense(self, run, tmp_path, options, says):
+    def test_refuses_what_makes_no_sense(self, campaign, tmp_path, options, says):
         with pytest.raises(UserError, match=says):
-            failure_probability(run, tmp_path / "p.json", **options)
+            failure_probability(campaign, tmp_path / "p.json", **options)
 
-    def test_refuses_a_campaign_of_another_net(self, run, tmp_path, monkeypatch):
-        monkeypatch.setitem(run.settings, "net_sha256", "0" * 64)
+    def test_refuses_a_campaign_of_another_net(self, campaign, tmp_path, monkeypatch):
+        monkeypatch.setitem(campaign.settings, "net_sha256", "0" * 64)
         with pytest.raises(UserError, match="another net"):
-            failure_probability(run, tmp_path / "p.json", cases=10)
+            failure_probability(campaign, tmp_path / "p.json", cases=10)
         assert not (tmp_path / "p.json").exists()
