@@ -147,7 +147,6 @@ ELEMENTS = {
     *("additional", "vType", "fcd-export", "timestep", "vehicle"),
 }
 ATTRIBUTES = re.compile(r'([\w:.-]+)="([^"]*)"')
-RAMP = "-420.000000,-65.000000 0.000000,0.000000"
 SCHEMA = "http://sumo.dlr.de/xsd/net_file.xsd"
 
 

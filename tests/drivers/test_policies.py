@@ -13,7 +13,7 @@ from merges import HALF, LIKE_A_ROUNDABOUT, SMALLER
 from plans import POVS
 
 from merge_sumo.drivers.base import Scene
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.levelk import (
     FEATURES,
     LevelKDriver,
@@ -252,23 +252,11 @@ class TestALimitOfBraking:
         assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
         assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
 
-    def test_counts_for_the_agent_of_a_game_alone(self):
-        brakes = QNetwork(self.LAYERS)
-        game = Game("pov", brakes, REWARD, -2.0)
-        state = np.array([[-200.0, 30.0, -182.0, 20.0]])
-        after, _, _ = game.advance(state, np.zeros(1), game.actions_mps2[:1])
-        assert after[0, 1] == pytest.approx(29.0)  # half a second of -2 m/s2
-        assert after[0, 3] == pytest.approx(18.0)  # and of -4 m/s2
-
 
 class TestTheLibraryOfPeople:
     """`--policies human`, whose POVs brake by 2 m/s2 at most."""
 
     POVS = Povs(policies=policies_in(HUMAN))
-
-    def test_has_the_vut_of_the_paper_s_library_against_which_pov2_was_trained(self):
-        paper, human = read_manifest(), read_manifest(self.POVS.policies)
-        assert human["vut1"] == paper["vut1"]
 
     @pytest.mark.parametrize("level", [1, 2])
     def test_brakes_no_harder_than_people_did(self, level):
@@ -278,10 +266,6 @@ class TestTheLibraryOfPeople:
             found = [measure(t) for _, t in rollout(world, pov, vut, cases)]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0
-
-    def test_is_for_those_alone_who_name_it(self):
-        named_so = dataclasses.replace(US23, name=HUMAN)
-        assert policies_of(named_so) == policies_of(US23) != self.POVS.policies
 
     @pytest.mark.long
     @pytest.mark.parametrize("name", NETWORKS)
@@ -340,11 +324,6 @@ class TestRationality:
         assert found.mean_regret <= mean_bound
         assert found.p99_regret <= p99_bound
         assert found.avoidable_collisions == 0
-
-    def test_a_level0_driver_in_their_place_would_collide(self):
-        cases = checking.check_cases("pov1", 2000, seed=5, scenario=US23)
-        returns = checking.returns_of(checking.play(cases, Level0Pov, Level0Vut), REWARD)
-        assert returns.collided.sum() > 20
 
     def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
         cases = checking.check_cases("pov2", 4000, seed=6, scenario=US23)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import shutil
@@ -22,7 +21,6 @@ from lxml import etree
 from plans import plan_for
 
 from merge_sumo.analysis.diagnosis import Kind, diagnose
-from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
@@ -35,10 +33,8 @@ from merge_sumo.drivers.policies import (
     scenario_of,
 )
 from merge_sumo.engine.simulator import Simulator, road_for
-from merge_sumo.reports.report import write_report
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.training import check as checking
-from merge_sumo.training.env import MergeGame
 from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
@@ -71,11 +67,6 @@ class TestItsRoad:
             at = road.lane_point(x_m, on_ramp=False)
             assert from_the_middle_m(at) == pytest.approx(RADIUS_M, abs=0.2)
 
-    def test_is_driven_round_counterclockwise(self, road):
-        before, m = (road.lane_point(x_m, on_ramp=False) for x_m in (-75.0, 0.0))
-        turned = math.atan2(m.y_m, m.x_m) - math.atan2(before.y_m, before.x_m)
-        assert math.degrees(turned) % 360.0 == pytest.approx(math.degrees(75.0 / RADIUS_M), abs=1.0)
-
     def test_has_an_entry_that_comes_from_the_south_and_touches_the_ring(self, road):
         start, line, m = (road.lane_point(x_m, on_ramp=True) for x_m in (-50.0, -11.3, 0.0))
         assert start.angle_deg == pytest.approx(0.0)
@@ -86,17 +77,6 @@ class TestItsRoad:
     def test_gives_the_ring_the_right_of_way(self, road):
         assert road.ramp_approach.yields
         assert not road.mainline_approach.yields
-
-    def test_limits_speeds_to_the_fastest_of_the_pool(self, road):
-        assert road.speed_limit_mps == ROUNDABOUT.v_pov0_mps[1] == 12.0
-
-    def test_is_drawn_all_around(self, road):
-        drawn = [*road.surroundings, *(piece.shape for piece in road.mainline.pieces)]
-        corners = np.array([point[:2] for shape in drawn for point in shape])
-        for angle in range(0, 360, 5):
-            turn = math.radians(angle)
-            on_ring = RADIUS_M * np.array([math.cos(turn), math.sin(turn)])
-            assert np.linalg.norm(corners - on_ring, axis=1).min() < 3.2
 
 
 class TestItsPool:
@@ -137,9 +117,6 @@ class TestItsDrivers:
             assert entry["check"]["avoidable_collisions"] == 0
         for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
             assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
-
-    def test_have_seen_its_starts(self):
-        assert unseen(ROUNDABOUT) == []
 
     @pytest.mark.long
     @pytest.mark.parametrize("name", ["pov1", "vut1"])
@@ -191,9 +168,6 @@ class TestTheExampleRuns:
         names = ("roundabout-yields", "roundabout-stalemate")
         return [make_scenarios.play(make_scenarios.EXAMPLES[name]) for name in names]
 
-    def test_begin_alike(self, runs):
-        assert np.array_equal(runs[0].motion[0, :, :2], runs[1].motion[0, :, :2])
-
     def test_in_one_the_pov_slows_and_the_vut_merges_first(self, runs):
         run = runs[0]
         assert run.v_pov_mps[-1] < run.v_pov_mps[0] - 3.0
@@ -207,18 +181,6 @@ class TestTheExampleRuns:
         assert abs(slowest[0] - slowest[1]) <= 2
         assert (run.v_pov_mps.min(), run.v_vut_mps.min()) < (2.0, 2.0)
         assert -12.0 < run.x_pov_m[slowest[0]] < run.x_vut_m[slowest[1]] < -6.0
-
-
-def test_a_game_on_it_is_played_by_its_numbers(road):
-    game = MergeGame("pov", Level0Vut(1), Reward.of(ROUNDABOUT), road)
-    try:
-        game.begin(0, np.array([-60.0, 8.0, -50.0, 7.8]))
-        state, _, over = game.decide(np.array([1.0]))
-    finally:
-        game.close()
-    # 8, 8.1 ... 8.4 and 7.8, 7.9, 8, 8, 8 m/s for 0.1 s each: level 0 holds 8 m/s.
-    assert state[0] == pytest.approx([-60.0 + 4.1, 8.5, -50.0 + 3.97, 8.0], abs=1e-9)
-    assert not over[0]
 
 
 class TestACampaignOnIt:
@@ -245,19 +207,6 @@ class TestACampaignOnIt:
         # The arms that are driven on, of 250 m, and 2 km straight on behind the last of them.
         assert 100.0 * 2000.0 / float(place["zoom"]) < 6.0 * 2.0 * RADIUS_M
         assert float(shown.find("scheme/vehicles").get("vehicle_exaggeration")) <= 1.5
-
-    def test_names_the_net_as_the_package_does_wherever_it_is_installed(self, run):
-        recorded = json.loads((run.folder / "campaign.json").read_text())["scenario"]
-        assert recorded["net"] == "roundabout.net.xml"
-        assert Run(run.folder).scenario == ROUNDABOUT
-
-    def test_has_a_report_that_shows_the_ring_to_the_left_of_the_way_through_m(self, run):
-        page = write_report(run).read_text()
-        data = json.loads(page.split('id="data">', 1)[1].split("</script>", 1)[0])
-        on_ring = [(x, y) for x_m, x, y in data["main"] if ROUNDABOUT.x_pov0_m[0] < x_m <= 0.0]
-        assert len(on_ring) > 15
-        for place in on_ring:
-            assert math.dist(place, (0.0, RADIUS_M)) == pytest.approx(RADIUS_M, abs=1.5)
 
 
 ANOTHER_ARM = """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,20 +11,16 @@ from campaigning import run_campaign
 from plans import plan_for
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
-from merge_sumo.engine.simulator import Simulator, road_for
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.replay_folder import HOLD_STEPS, write_scenario
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import Case, MergeCase, Pool, from_unit, to_unit
 from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.base import VutOptions, seen_at_start, seen_in
+from merge_sumo.vuts.base import VutOptions, seen_in
 from merge_sumo.vuts.registry import VutFactory
 
 TRAFFIC = replace(
@@ -93,15 +88,6 @@ class TestThePool:
         with pytest.raises(UserError, match=next(reversed(wrong))):
             replace(US23, **wrong)
 
-    def test_refuses_a_case_without_its_headways_or_with_some_that_do_not_belong_there(self):
-        state: dict[str, Any] = {"level": 0, "x_pov0_m": -300.0, "v_pov0_mps": 30.0}
-        with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
-            MergeCase(**state, scenario=TRAFFIC)
-        with pytest.raises(UserError, match="headway_ahead_s belongs to traffic"):
-            MergeCase(**{"scenario": US23, **state}, headway_ahead_s=2.0, headway_behind_s=2.0)
-        with pytest.raises(UserError, match="3 m apart"):
-            MergeCase(**state, headway_ahead_s=0.1, headway_behind_s=2.0, scenario=TRAFFIC)
-
 
 def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
     libsumo = load_libsumo()
@@ -167,11 +153,6 @@ class TestCarsOfTheMainline:
             assert (x[[AHEAD, POV]] - x[[POV, BEHIND]]).min() > TRAFFIC.pov_length_m
         assert v.max(axis=1)[[POV, AHEAD, BEHIND]].max() < 0.2
 
-    def test_do_not_depend_on_what_runs_beside(self):
-        cases = cases_of(2, 12)
-        for one, other in zip(run("design2", cases, 1), run("design2", cases, 12), strict=True):
-            assert np.array_equal(one.motion, other.motion)
-
 
 class TestWhatTheVutMeets:
     def test_is_the_car_that_will_be_nearest_to_m(self):
@@ -188,43 +169,6 @@ class TestWhatTheVutMeets:
         assert seen == (1.5, -190.0, 29.0, -140.0, 28.0)
         assert seen.others == ((-150.0, 31.0), (-190.0, 29.0), (-200.0, 30.0))
         assert seen.others[0].x_m == -150.0
-
-    def test_is_the_pov_where_there_is_no_other(self):
-        seen = seen_at_start(MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23))
-        assert seen.others == ((-300.0, 30.0),)
-        assert len(seen) == 5
-
-    def test_is_told_to_a_vut_in_a_process_of_its_own_as_to_one_in_ours(self, tmp_path):
-        file = tmp_path / "notes.py"
-        file.write_text(
-            "class Notes:\n"
-            "    def reset(self, seen):\n"
-            "        self.first = seen.others\n"
-            "    def act(self, seen):\n"
-            "        cars = [x for car in (*self.first, *seen.others) for x in car]\n"
-            "        assert len(cars) == 12 and (seen[1], seen[2]) in seen.others\n"
-            "        return sum(cars) % 1.0\n"
-            "class Batch:\n"
-            "    def __init__(self, corridors):\n"
-            "        self.first = [None] * corridors\n"
-            "    def reset(self, corridor, seen):\n"
-            "        self.first[corridor] = [x for car in seen.others for x in car]\n"
-            "    def act_batch(self, seen):\n"
-            "        now = seen.x_others_m, seen.v_others_mps\n"
-            "        assert (now[0][:-1] >= now[0][1:]).all()\n"
-            "        import numpy as np\n"
-            "        answers = []\n"
-            "        for k, first in enumerate(self.first):\n"
-            "            cars = [x for car in zip(now[0][:, k], now[1][:, k]) for x in car]\n"
-            "            answers.append(sum([*(first or []), *cars]) % 1.0)\n"
-            "        return np.array(answers)\n"
-        )
-        cases = cases_of(1, 6)
-        hosted = run(f"{file}:Notes", cases, 4)
-        assert [t.error for t in hosted] == [None] * 6
-        for other in (run(f"{file}:Notes", cases, 4, in_process=True), run(f"{file}:Batch", cases)):
-            for one, two in zip(hosted, other, strict=True):
-                assert np.array_equal(one.motion, two.motion)
 
     def test_is_all_cars_for_sumos_own_drivers(self):
         # Behind M the car ahead is its leader; far away there is none.
@@ -250,28 +194,6 @@ class TestARunInTraffic:
             vut="design2", levels=(0, 1, 2), sampler="uniform", cases=30, batch=15, scenario=TRAFFIC
         )
         return run_campaign(settings, folder)
-
-    def test_is_read_back_as_it_was_written(self, made):
-        again = Run(made.folder)
-        assert again.outcomes == made.outcomes
-        assert again.scenario == TRAFFIC
-        assert {o.measures.nearest for o in again.outcomes} == {"pov", "ahead", "behind"}
-        trajectory = again.trajectory(7)
-        assert trajectory.motion.shape[1:] == (4, 3)
-        lines = centre_lines(road_for(TRAFFIC))
-        assert measure(trajectory, lines) == again.outcome(7).measures
-
-    @pytest.mark.parametrize("hosted", [False, True])
-    def test_is_replayed_identically(self, made, tmp_path, hosted):
-        road = road_for(TRAFFIC)
-        if hosted:  # as a road that is not the shipped one
-            road = replace(road, sha256="0" * 64)
-        for index in (0, 12, 25):
-            folder = tmp_path / str(index)
-            write_scenario(folder, road, made.outcome(index), made.trajectory(index))
-            result = replay(folder)
-            assert (result.diverged_at_s, result.detail) == (None, "")
-            assert result.rows == 4 * (len(made.trajectory(index).motion) + HOLD_STEPS)
 
     def test_shows_all_cars_to_a_traci_client(self, tmp_path):
         script = tmp_path / "client.py"

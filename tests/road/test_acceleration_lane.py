@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import re
-import shutil
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -35,7 +34,6 @@ from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MergeScenario
 
 EXACT = 1e-9
-MAX_SPEED = "200"
 
 
 @pytest.fixture(scope="module")
@@ -82,16 +80,6 @@ class TestTheShippedRoad:
         assert us23.lane_point(0.0, on_ramp=False) == ("lane_1", 70.0, 0.0, 0.0, 90.0)
         assert us23.lane_point(0.0, on_ramp=True) == ("lane_0", 70.0, 0.0, -3.2, 90.0)
 
-    def test_and_its_traffic_differ_from_us23_in_the_lane_alone(self):
-        for name in ("us23", "us23-traffic"):
-            ours, lane = (named_scenario(n) for n in (name, name.replace("us23", "us23-lane")))
-            assert lane.dimensions(2) == ours.dimensions(2)
-            own = ("name", "net", "mainline", "ramp", "lane_m", "lane_end", "follow_up_s")
-            records = (
-                {k: v for k, v in s.to_record().items() if k not in own} for s in (ours, lane)
-            )
-            assert next(records) == next(records)
-
 
 class TestTheWindow:
     @pytest.mark.parametrize("name", LANES)
@@ -107,12 +95,6 @@ class TestTheWindow:
         for x_m in np.linspace(begin_m + 1.0, end_m - 1.0, 9).tolist():
             main, ramp = (own.lane_point(x_m, on_ramp=on_ramp) for on_ramp in (False, True))
             assert np.hypot(main.x_m - ramp.x_m, main.y_m - ramp.y_m) == pytest.approx(3.2, abs=0.1)
-
-    def test_of_several_edges_holds_the_junctions_between_them(self, road):
-        own = road("two edges")
-        inside = [p.lane for p in own.ramp.pieces if own.lane_m[0] <= p.start_m < own.lane_m[1]]
-        assert [inside[0], inside[-1], len(inside)] == ["acc1_1", "acc2_0", 3]
-        assert own.lane_m[1] - own.lane_m[0] == pytest.approx(222.4 + 2.53 + 121.57)
 
     def test_shifts_all_and_changes_nothing_else(self, tmp_path):
         net = NetFile(lane_drop(tmp_path))
@@ -286,17 +268,6 @@ class TestAScenario:
             f">{name}</text>" in picture for name in ("VUT", "POV", "M", "gore", "end of lane")
         )
 
-    def test_for_a_long_lane_begins_farther_from_m(self, tmp_path):
-        # 700 m of lane, so the gore is at -245 m: farther than the paper's start of the VUT.
-        def build(folder):
-            return Path(shutil.copy(stretched(lane_drop(folder), 700.0), folder / "long.net.xml"))
-
-        scenario, _ = self.new(tmp_path, build, *LANES["lane drop"][1:])
-        assert scenario.lane_m == (-245.0, 455.0)
-        assert scenario.x_vut0_m == -295.0
-        # From 18 m/s at 1 m/s2 to 28 m/s in 230 m and 10 s, and 520 m at 28 m/s: twice 28.6 s.
-        assert scenario.timeout_s == 58.0
-
     @pytest.mark.parametrize(
         ("length_m", "kind", "lane_m"),
         [
@@ -334,10 +305,6 @@ class TestAScenario:
         (weaves,) = (line for line in lines if line.startswith("weaving"))
         assert weaves.startswith("weaving: the lane goes on to exit; ")
 
-    def test_where_the_lane_never_ends_there_is_none(self, tmp_path):
-        with pytest.raises(UserError, match="goes on beside the mainline, and no merge is"):
-            self.new(tmp_path, added_lane, "in acc out", "ramp acc out")
-
 
 def stretched(net: Path, length_m: float, without: str = "\0") -> Path:
     """Give the lanes of edge acc another length, and take a text out of the file."""
@@ -362,16 +329,4 @@ def weaving(folder: Path) -> Path:
         + edge("exit", "d", "x", 1, 22, priority=3),
         lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
         + lane("acc", 0, "exit", 0) + lane("acc", 1, "out", 0) + lane("acc", 2, "out", 1),
-    )  # fmt: skip
-
-
-def added_lane(folder: Path) -> Path:
-    """A mainline to which a ramp adds a lane for good."""
-    return plain(
-        folder,
-        NODES,
-        edge("in", "a", "n", 2, 30, priority=9) + edge("acc", "n", "d", 3, 30, priority=9)
-        + edge("out", "d", "b", 3, 30, priority=9) + edge("ramp", "r", "n", 1, 22, priority=3),
-        lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
-        + "".join(lane("acc", number, "out", number) for number in range(3)),
     )  # fmt: skip

@@ -38,21 +38,9 @@ class TestTheShippedRoad:
             before, behind = path.pieces
             assert before.shape[-1][:2] == behind.shape[0][:2] == (0.0, 0.0)
 
-    def test_has_lanes_of_whole_lengths(self, road):
-        assert [piece.length_m for piece in road.mainline.pieces] == [1000.0, 2000.0]
-        assert [piece.length_m for piece in road.ramp.pieces] == [425.0, 2000.0]
-
-    def test_draws_its_lanes_as_long_as_they_are(self, road):
-        for piece in (*road.mainline.pieces, road.ramp.pieces[0]):
-            (x0, y0, _), (x1, y1, _) = piece.shape
-            assert math.hypot(x1 - x0, y1 - y0) == pytest.approx(piece.length_m, abs=1e-9)
-
     def test_is_a_main_road_with_two_lanes_and_a_ramp_with_one(self):
         lanes = re.findall(r'<lane id="(\w+)_\d"', default_net_path().read_text())
         assert [lanes.count(edge) for edge in ("main_in", "main_out", "ramp")] == [2, 2, 1]
-
-    def test_limits_no_speed_of_the_scenario(self, road):
-        assert road.speed_limit_mps >= 45.0
 
     @pytest.mark.parametrize("on_ramp", [False, True])
     def test_puts_a_lane_coordinate_at_its_distance_from_the_merge_point(self, road, on_ramp):
@@ -63,19 +51,6 @@ class TestTheShippedRoad:
             assert lane == (before if x_m < 0 else "main_out_0")
             length = {"ramp_0": 425.0, "main_in_0": 1000.0, "main_out_0": 0.0}[lane]
             assert position == pytest.approx(length + x_m, abs=1e-9)
-
-    def test_points_the_main_road_east_and_the_ramp_towards_it(self, road):
-        assert road.lane_point(-10.0, on_ramp=False)[4] == pytest.approx(90.0)
-        assert road.lane_point(10.0, on_ramp=True)[4] == pytest.approx(90.0)
-        # From (-420, -65): atan(420 / 65), clockwise from north.
-        assert road.lane_point(-10.0, on_ramp=True)[4] == pytest.approx(81.2025893, abs=1e-6)
-
-    def test_has_a_hash_of_the_bytes_of_its_file(self, road, tmp_path):
-        copy, content = tmp_path / "copy.net.xml", default_net_path().read_bytes()
-        copy.write_bytes(content)
-        assert road_of(copy).sha256 == road.sha256
-        copy.write_bytes(content + b"\n")
-        assert road_of(copy).sha256 != road.sha256
 
 
 def edited(old: str, new: str):
@@ -99,12 +74,6 @@ def without(pattern: str):
 
 
 class TestABrokenNet:
-    @pytest.mark.parametrize("missing", ["nowhere.net.xml", "."])
-    def test_that_is_no_file_is_refused_in_one_sentence(self, missing, tmp_path):
-        with pytest.raises(UserError, match="cannot read the net") as error:
-            road_of(tmp_path / missing)
-        assert "\n" not in str(error.value)
-
     @pytest.mark.parametrize(
         "edit",
         [

@@ -15,7 +15,6 @@ from merge_sumo.values.ball_union import ball_volume, cell_volume, star_volume
 from merge_sumo.values.fmc import RADIUS, fmc, fmc_and_error, radius_for, regions
 
 FloatArray = np.ndarray
-SIX = pytest.param(6, marks=pytest.mark.long)
 DIMENSIONS = pytest.mark.parametrize("dimension", some([4, 5, 6], 4))
 
 
