@@ -30,7 +30,7 @@ def prediction_error_m(outcome: Outcome) -> float | None:
     return None if predicted_m is None or gap_m is None else abs(predicted_m - gap_m)
 
 
-def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
+def surprises(outcomes: Sequence[Outcome]) -> list[Outcome]:
     """Return the cases with a prediction, the largest surprise first: gaps on a logarithmic scale.
 
     A case in which the VUT never arrived, or was predicted not to, is one with a large gap.
@@ -39,7 +39,7 @@ def surprises(outcomes: Sequence[Outcome], limit_m: float) -> list[Outcome]:
     def surprise(outcome: Outcome) -> float:
         assert outcome.prediction is not None, "filtered below"  # noqa: S101
         gaps = np.array([outcome.prediction.median_dx_m, outcome.signed_gap_m], dtype=np.float64)
-        return abs(float(np.diff(compressed(gaps, limit_m))[0]))
+        return abs(float(np.diff(compressed(gaps, outcome.gap_limit_m))[0]))
 
     predicted = [o for o in outcomes if o.prediction is not None and o.measures.score is not None]
     return sorted(predicted, key=lambda o: (-surprise(o), o.index))

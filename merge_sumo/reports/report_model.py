@@ -99,7 +99,7 @@ class ReportModel:
             (o for o in self.cases if _is_told(o) and not o.failed),
             key=lambda o: (o.score, o.index),
         )
-        self.surprises = surprises(self.cases, run.scenario.dx_crash_m)[:LISTED]
+        self.surprises = surprises(self.cases)[:LISTED]
         self.untested = [o for o in self.cases if not _is_told(o)]
         examples = [o for trouble in self.troubles() for o in self.examples_of(trouble)]
         listed = [*(*examples, *self.spread, *self.near[:LISTED], *self.surprises)]

@@ -15,7 +15,7 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
 from merge_sumo.values.chance import RunsOfCase, by_case, fails_above
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome
+from merge_sumo.values.score import Outcome, gap_limit_m
 
 if TYPE_CHECKING:
     from merge_sumo.samplers.prediction_skill import Predictor
@@ -127,6 +127,12 @@ class Sampler(ABC):
         pending = sum(level in (None, case.level) for case in self._pending)
         return pending + (self._proposed.total() if level is None else self._proposed[level])
 
+    @property
+    def gap_limit_m(self) -> float:
+        """The limit of the gaps that are learned, within which a case fails, in m."""
+        stands_in = any(outcome.margin is not None for outcome in self.observed())
+        return gap_limit_m(self.pool.scenario, stands_in=stands_in)
+
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays, a row for each case."""
         if self._repeated:
@@ -172,6 +178,7 @@ class Sampler(ABC):
             dx_m=np.array([o.signed_gap_m for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
             tolerated=self.tolerated,
+            limit_m=self.gap_limit_m,
         )
 
     def rng(self, *key: int) -> np.random.Generator:

@@ -1,6 +1,6 @@
 """The surrogate of `coverage`: P(fail) of a case, from the outcomes so far.
 
-Failing means that the signed gap dx at M is within 6 m, so failures lie where the gap changes its
+Failing means that the signed gap dx at M is within a limit: failures lie where the gap changes its
 sign: where another car goes first. There the gap often jumps, and no test between the two sides
 ever fails. Three experts give P(fail):
 
@@ -36,7 +36,6 @@ from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chanc
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import FAILURE_SCORE
 
 NO_GAP_M: Final = 200.0
@@ -199,13 +198,13 @@ def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | 
 def margin_of(history: LevelHistory, limit: float | None = None) -> tuple[FloatArray, float, float]:
     """Return what is learned, (N,), and the interval of it that means failure.
 
-    The signed gap in units of the limit (6 m), compressed like a logarithm where it is large: a
+    The signed gap in units of the limit, compressed like a logarithm where it is large: a
     gap of 100 m says little more about failures than one of 50 m. Without gaps, the score in
     units of the limit (lambda).
     """
     if not has_gaps(history):
         return np.minimum(history.score / (limit or FAILURE_SCORE) - 1.0, 1.0), 0.0, np.inf
-    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / (limit or DX_CRASH_M)
+    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / (limit or history.limit_m)
     return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
 
 

@@ -26,7 +26,6 @@ from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import DX_CRASH_M
 from merge_sumo.values.score import Outcome
 
 FIRST_BATCH: Final = 10
@@ -233,11 +232,7 @@ class CoverageSampler(Sampler):
             points = to_unit((outcome.case for outcome in last), level, self.pool.scenario)
             gaps_m = yield Query(level, points, held_out=indices)
             replayed = dict(zip(indices, gaps_m.T, strict=True))
-        outcomes = self.observed()
-        # The stand-in for a gap under another criterion has the limit of the paper's scenario.
-        stands_in = any(outcome.margin is not None for outcome in outcomes)
-        limit_m = DX_CRASH_M if stands_in else self.pool.scenario.dx_crash_m
-        return PredictionSkill(outcomes, level, limit_m, replayed)
+        return PredictionSkill(self.observed(), level, self.gap_limit_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.

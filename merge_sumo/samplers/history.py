@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.scenario import DX_CRASH_M
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +25,14 @@ class LevelHistory:
         failed: whether more than the tolerated share of the runs failed, (N,); for a single run,
             score < lambda.
         dx_m: signed gap at M in the worst run, (N,), or its stand-in under another criterion: a run
-            fails within 6 m; NaN where the VUT never arrived or there is no trajectory.
+            fails within `limit_m`; NaN where the VUT never arrived or there is no trajectory.
         batch: batch of the campaign in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
         failures: number of those that failed, (N,).
         variance: variance of the score over the runs of a case, (N,); NaN for a single run.
         varies: whether runs of a case have differed, at this level or another.
         tolerated: share of the runs of a case that may fail.
+        limit_m: gap within which a run fails.
     """
 
     points: FloatArray
@@ -43,6 +45,7 @@ class LevelHistory:
     variance: FloatArray = field(default_factory=lambda: np.empty(0, dtype=np.float64))
     varies: bool = False
     tolerated: float = 0.0
+    limit_m: float = DX_CRASH_M
 
     def __post_init__(self) -> None:
         """Give each case a single run where nothing else is said."""

@@ -38,9 +38,8 @@ def _margin(outcome: Outcome) -> float:
     """Return the margin of an outcome with a verdict; the paper's criterion gives it by the gap."""
     if outcome.margin is not None:
         return outcome.margin
-    limit_m = outcome.case.scenario.dx_crash_m
     gap_m = np.array([outcome.signed_gap_m], dtype=np.float64)
-    return float(margins(gap_m, limit_m)[0])
+    return float(margins(gap_m, outcome.gap_limit_m)[0])
 
 
 def margins(gap_m: FloatArray, limit_m: float) -> FloatArray:

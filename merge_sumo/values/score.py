@@ -219,7 +219,7 @@ class Outcome:
 
     @property
     def signed_gap_m(self) -> float | None:
-        """The gap dx at M that a sampler learns; a case fails where it is within 6 m.
+        """The gap dx at M that a sampler learns; a case fails within `gap_limit_m`.
 
         Under another criterion than the paper's it is what stands for it: 6 m times 1 + m at a
         margin m of 0 or more, and 6 m / (1 - m) below; negative where the VUT goes first.
@@ -229,6 +229,11 @@ class Outcome:
             return dx
         gap = DX_CRASH_M * (1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin))
         return -gap if dx is not None and dx < 0.0 else gap
+
+    @property
+    def gap_limit_m(self) -> float:
+        """The limit of `signed_gap_m` within which this case would fail."""
+        return gap_limit_m(self.case.scenario, stands_in=self.margin is not None)
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
@@ -302,6 +307,15 @@ def _record_fields(
         ("foretold", Prediction | None, None),
     ]
     return case_names, measure_names, record_type("outcome", [*required, *optional])
+
+
+def gap_limit_m(scenario: Scenario, *, stands_in: bool) -> float:
+    """Return the limit of gaps within which a case fails, in m.
+
+    It is that of the scenario, or of what stands for a gap under another criterion than the
+    paper's: see `Outcome.signed_gap_m`.
+    """
+    return DX_CRASH_M if stands_in else scenario.dx_crash_m
 
 
 def score_of(margin: float) -> float:

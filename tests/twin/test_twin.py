@@ -398,6 +398,6 @@ class TestTheReport:
     def test_lists_what_came_otherwise_than_predicted(self):
         told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
         missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
-        assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)], 6.0)] == [3, 2, 1, 0]
+        assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)])] == [3, 2, 1, 0]
         assert prediction_error_m(told[2]) == 2.0
         assert prediction_error_m(missed) is None
