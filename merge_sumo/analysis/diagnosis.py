@@ -8,8 +8,7 @@ taken for a decision.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, Final
@@ -172,7 +171,6 @@ class FailureBox:
         level: POV level.
         bounds: (feature, low, high), rounded as it is written; None where nothing bounds it.
         cases: cases of the run inside, by the bounds as written, and the failures among them.
-        kinds: kinds of these failures, the most frequent first.
         indices: the cases.
     """
 
@@ -180,7 +178,6 @@ class FailureBox:
     bounds: Bounds
     cases: int
     failures: int
-    kinds: tuple[tuple[Kind, int], ...]
     indices: tuple[int, ...]
 
     @property
@@ -190,29 +187,18 @@ class FailureBox:
         return " and ".join(parts) or "anywhere"
 
     @property
-    def what(self) -> str:
-        """Return the kinds of failure in words."""
-        if len(self.kinds) == 1 and self.kinds[0][1] == self.failures:
-            return f"{self.kinds[0][0]}: {MEANING[self.kinds[0][0]]}"
-        return ", ".join(f"{count} {kind}" for kind, count in self.kinds)
-
-    @property
     def sentence(self) -> str:
         """Return the box as a sentence."""
-        text = f"POV level {level_name(self.level)}, {self.where}: "
-        text += f"{self.failures} of {self.cases} cases fail"
-        return f"{text} ({self.what})." if self.kinds else f"{text}."
+        where = f"POV level {level_name(self.level)}, {self.where}"
+        return f"{where}: {self.failures} of {self.cases} cases fail."
 
 
-def failure_boxes(
-    outcomes: Sequence[Outcome], level: int, kinds: Mapping[int, Kind]
-) -> list[FailureBox]:
+def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
     """Return where a level's failures lie, as boxes of the pool, those with most failures first.
 
     A small decision tree (scikit-learn, Gini, balanced classes) tells failing cases from the
     others; its leaves with at least as many failures as other cases are the boxes, joined where
-    siblings are. The shares are of cases that a sampler chose: they are no probabilities. `kinds`
-    are the kinds of failures by index, as far as known.
+    siblings are. The shares are of cases that a sampler chose: they are no probabilities.
     """
     scored = [o for o in outcomes if o.case.level == level and o.score is not None]
     failed = np.array([o.failed for o in scored], dtype=bool)
@@ -231,7 +217,7 @@ def failure_boxes(
     leaf = tree.apply(places)
     failing = {node for node in set(leaf.tolist()) if failed[leaf == node].mean() >= 0.5}
     boxes = [
-        _box(level, _rounded(axes, low, high), scored, kinds)
+        _box(level, _rounded(axes, low, high), scored)
         for low, high in _leaf_boxes(tree.tree_, failing, len(axes))
     ]
     boxes = [box for box in boxes if box.failures >= FEWEST_FAILURES]
@@ -271,14 +257,10 @@ def _rounded(axes: Sequence[Feature], low: FloatArray, high: FloatArray) -> Boun
     )
 
 
-def _box(
-    level: int, bounds: Bounds, scored: Sequence[Outcome], kinds: Mapping[int, Kind]
-) -> FailureBox:
+def _box(level: int, bounds: Bounds, scored: Sequence[Outcome]) -> FailureBox:
     inside = [o for o in scored if _inside(o, bounds)]
-    failures = [o for o in inside if o.failed]
-    counts = Counter(kinds[o.index] for o in failures if o.index in kinds)
-    kinds_found, indices = tuple(counts.most_common()), tuple(o.index for o in inside)
-    return FailureBox(level, bounds, len(inside), len(failures), kinds_found, indices)
+    failures = sum(o.failed for o in inside)
+    return FailureBox(level, bounds, len(inside), failures, tuple(o.index for o in inside))
 
 
 def _inside(outcome: Outcome, bounds: Bounds) -> bool:

@@ -6,13 +6,13 @@ sampler and more contested than traffic. So they are put side by side, and no te
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass
 from statistics import median
-from typing import Any, Final
+from typing import Final
 
 from merge_sumo.system.printable import counted
-from merge_sumo.values.scenario import lane_of, level_name
+from merge_sumo.values.scenario import lane_of
 from merge_sumo.values.score import Outcome
 
 
@@ -95,21 +95,6 @@ def merging_of(outcomes: Iterable[Outcome]) -> MergeStatistics | None:
         time_gap_ahead_s=_median(o.measures.time_gap_ahead_s for o in ran),
         time_gap_behind_s=_median(o.measures.time_gap_behind_s for o in ran),
     )
-
-
-def merging_record(outcomes: Sequence[Outcome]) -> dict[str, Any]:
-    """Return what JSON shows of merges from a lane, in all and by level; nothing without a lane."""
-    found = merging_of(outcomes)
-    if found is None:
-        return {}
-    levels = {
-        level_name(level): merging_of(o for o in outcomes if o.case.level == level)
-        for level in sorted({o.case.level for o in outcomes})
-    }
-    by_level = {name: asdict(one) for name, one in levels.items() if one is not None}
-    people: dict[str, Any] = {"source": SOURCE, "rear_headway_s": REAR_HEADWAY_S}
-    people["sites"] = [asdict(site) for site in SITES]
-    return {"merging": {**asdict(found), "levels": by_level, "people": people}}
 
 
 def place_in_words(lane_share: float) -> str:

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from merge_sumo.analysis.chance import ChanceSummary, chance_in
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.merging import MergeStatistics, merging_of, merging_record
+from merge_sumo.analysis.merging import MergeStatistics, merging_of
 from merge_sumo.analysis.plausibility import doubts, notes_on
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import Summary, summarise
@@ -154,11 +153,6 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels, self._run.tolerated)
 
     @cached_property
-    def chance(self) -> ChanceSummary | None:
-        """What repeats show of chance; None without any."""
-        return chance_in(self._run.outcomes, self._run.tolerated)
-
-    @cached_property
     def merging(self) -> MergeStatistics | None:
         """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
         return merging_of(self._run.cases)
@@ -218,8 +212,6 @@ class CampaignRun(Result):
         return {
             **asdict(self.summary),
             **self.verdict.to_record(),
-            **merging_record(outcomes),
-            **({} if self.chance is None else {"chance": self.chance.to_record()}),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
@@ -298,22 +290,6 @@ class CampaignRun(Result):
 
     def __repr__(self) -> str:
         return f"<campaign {self.folder}: {self.verdict.counts}>"
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><td>{level_name(level)}</td><td>{one.cases}</td><td>{one.failures}</td>"
-            f"<td>{one.regions}</td><td>{one.fmc:.4f}</td></tr>"
-            for level, one in self.summary.levels.items()
-        )
-        title = escape(f"{self._run.vut}: {self.verdict.counts}")
-        untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
-        warnings = filter(None, [unrepeatable(self.repeats), *untested])
-        wrong = "".join(f"<p><b>{escape(text)}</b></p>" for text in warnings)
-        return (
-            f"<p><b>{title}</b><br>{escape(str(self.folder))}</p>{wrong}"
-            "<table><thead><tr><th>POV level</th><th>cases</th><th>failures</th><th>regions</th>"
-            f"<th>FMC</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
 
 
 class CaseRun(Result):

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.analysis.chance import chance_in
+from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.summary import LevelSummary, Summary
 from merge_sumo.analysis.verdict import Verdict
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
@@ -20,6 +20,7 @@ from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
 from merge_sumo.studies.probability import RESULT, probability_of
 from merge_sumo.studies.stress import STRESS, stress_of
 from merge_sumo.system.printable import printable
+from merge_sumo.values.chance import MOST_RUNS, by_case, fails_above, is_decided
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
@@ -173,25 +174,44 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         yield fact("regions", found.regions, f"{failing}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
         yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
+    merging = merging_of(o for o in run.cases if o.case.level == level)
+    if merging is not None:
+        yield fact("merges where the lane ends", merging.forced, "lane_share >= 1")
+        yield fact("cases that stood on the lane", merging.stood, "stood_s > 0")
+        for name, value, unit, key in (
+            ("place of the merge", merging.lane_share, "% of the lane", "lane_share"),
+            ("time gap ahead", merging.time_gap_ahead_s, "s", "time_gap_ahead_s"),
+            ("time gap behind", merging.time_gap_behind_s, "s", "time_gap_behind_s"),
+        ):
+            if value is not None:
+                scale = 100.0 if unit.startswith("%") else 1.0
+                yield fact(f"{name}, median", scale * value, key, unit)
 
 
 def _repeats(run: Run) -> Iterator[Fact]:
-    chance = chance_in(run.outcomes, run.tolerated)
-    if chance is None:
+    cases, tolerated = by_case(run.outcomes), run.tolerated
+    repeated = [one for one in cases if one.runs > 1]
+    if not (tolerated or repeated):
         return
+    varied = [one for one in repeated if one.varies]
+    untold = [
+        one
+        for one in cases
+        if fails_above(one, tolerated)
+        and one.runs < MOST_RUNS
+        and not is_decided(one.failures, one.runs, tolerated)
+    ]
     for name, number in (
-        ("runs", chance.runs),
-        ("cases that ran more than once", chance.repeated),
-        ("of these, cases whose runs differ", chance.varied),
-        ("of these, cases that both fail and pass", chance.both_ways),
-        ("failures that ran too seldom to tell", chance.undecided),
+        ("runs", sum(one.runs for one in cases)),
+        ("cases that ran more than once", len(repeated)),
+        ("of these, cases whose runs differ", len(varied)),
+        ("of these, cases that both fail and pass", sum(0 < v.failures < v.runs for v in varied)),
+        ("failures that ran too seldom to tell", len(untold) if tolerated else 0),
     ):
         yield Fact(name, number, "", OUTCOMES, "draw")
-    if chance.tolerated:
-        yield Fact(
-            "share of its runs in which a case may fail",
-            *(100.0 * chance.tolerated, PERCENT, SETTINGS, "tolerated"),
-        )
+    if tolerated:
+        name = "share of its runs in which a case may fail"
+        yield Fact(name, 100.0 * tolerated, PERCENT, SETTINGS, "tolerated")
 
 
 def _motion(run: Run) -> Iterator[Fact]:

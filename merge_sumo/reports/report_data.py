@@ -209,7 +209,7 @@ def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
 
 
 def _search(facts: ReportModel) -> dict[str, Any]:
-    """Return cases, mean score and coverage of each level after groups of batches."""
+    """Return coverage, and error of predictions, of each level after groups of batches."""
     batches = sorted({o.batch for o in facts.cases})
     width = -(-len(batches) // MOST_STEPS) or 1
     groups = batches[::width]
@@ -217,18 +217,12 @@ def _search(facts: ReportModel) -> dict[str, Any]:
     for level in facts.levels:
         at = [o for o in facts.cases if o.case.level == level]
         group = np.array([o.batch // width for o in at], dtype=np.int64)
-        score = np.array([o.score for o in at], dtype=np.float64)
         failed = np.array([o.failed for o in at], dtype=bool)
         points = to_unit((o.case for o in at), level, facts.run.scenario)
-        counted: list[int] = []
-        means: list[float | None] = []
         covered: list[float | None] = []
         stride = -(-len(groups) * int(failed.sum()) // MOST_BALLS) or 1
         last = len(groups) - 1
         for number in range(len(groups)):
-            inside = score[(group == number) & ~np.isnan(score)]
-            counted.append(int((group == number).sum()))
-            means.append(round(float(inside.mean()), 1) if len(inside) else None)
             so_far = points[failed & (group <= number)]
             wanted = (last - number) % stride == 0
             covered.append(round(fmc(so_far), 5) if wanted else None)
@@ -236,8 +230,6 @@ def _search(facts: ReportModel) -> dict[str, Any]:
         levels.append(
             {
                 "level": level,
-                "cases": counted,
-                "score": means,
                 "fmc": covered,
                 "off": [_median(off[group == number]) for number in range(len(groups))],
             }

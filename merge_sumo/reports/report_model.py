@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from merge_sumo.analysis.chance import chance_in
 from merge_sumo.analysis.coordinates import Coordinate, coordinates
 from merge_sumo.analysis.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.analysis.predictions import surprises
@@ -48,7 +47,6 @@ class ReportModel:
     Attributes:
         cases: the run that stands for each case.
         repeated: by its index, all runs of a case that ran more than once.
-        chance: what repeats show of chance; None without any.
     """
 
     def __init__(
@@ -70,7 +68,6 @@ class ReportModel:
         self.cases = run.cases
         runs = [one for one in by_case(run.outcomes) if one.runs > 1]
         self.repeated = {one.deciding(run.tolerated).index: one for one in runs}
-        self.chance = chance_in(run.outcomes, run.tolerated)
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
         self.verdict = judge(self.cases)
         self.facts = facts_of(run, self.summary, self.verdict)
@@ -118,9 +115,7 @@ class ReportModel:
             if found.kind is not None and index in failed
         }
         self.boxes = [
-            box
-            for level in self.levels
-            for box in failure_boxes(self.worst + self.near, level, self.kinds)
+            box for level in self.levels for box in failure_boxes(self.worst + self.near, level)
         ]
         self.truths = {level: _truth(run, self.road, level) for level in self.levels}
 

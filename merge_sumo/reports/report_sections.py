@@ -14,7 +14,7 @@ from typing import Any, Final
 from markupsafe import Markup
 
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
-from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE, merging_of
+from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -78,7 +78,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": list(REFERENCES) if model.avoidance else [],
-        "chance": model.chance,
+        "varied": any(one.varies for one in model.repeated.values()),
         "repeated": model.repeated,
     }
 
@@ -113,6 +113,7 @@ def _facts(model: ReportModel) -> dict[str, Any]:
         "rows": rows,
         "totals": {fact.name: fact for fact in overall if fact.name in names},
         "facts": [fact for fact in overall if fact.name not in names],
+        "people": (SOURCE, SITES, REAR_HEADWAY_S),
         "radii": [(dim, radius_for(dim)) for dim in sorted(dims) if dim > 3],
     }
 
@@ -125,23 +126,6 @@ def _maps(model: ReportModel) -> dict[str, Any]:
         "fewest_failures": FEWEST_FAILURES,
         "learns": model.learns,
         "covered": any(len(scenario.dimensions(level)) <= 3 for level in model.levels),
-    }
-
-
-def _merging(model: ReportModel) -> dict[str, Any] | None:
-    outcomes = model.cases
-    found = merging_of(outcomes)
-    if found is None:
-        return None
-    levels = {
-        f"level {level_name(level)}": merging_of(o for o in outcomes if o.case.level == level)
-        for level in model.levels
-    }
-    return {
-        "rows": [("all", found), *((name, one) for name, one in levels.items() if one)],
-        "sites": SITES,
-        "headway_s": REAR_HEADWAY_S,
-        "source": SOURCE,
     }
 
 
@@ -268,7 +252,6 @@ SECTIONS: Final[Registry[ReportSection]] = Registry(
         "facts": ReportSection(template=_own("facts"), words=_facts),
         "where": ReportSection(template=_own("where"), words=_maps),
         "against": ReportSection(template=_own("against"), words=_against),
-        "merging": ReportSection(template=_own("merging"), words=_merging),
         "words": ReportSection(template=_own("words"), words=_in_words),
         "stress": ReportSection(template=_own("stress"), words=_stress),
         "cases": ReportSection(template=_own("cases"), words=_cases),

@@ -106,11 +106,6 @@ class Avoidance:
         """Whether a careful and competent driver avoids it in the VUT's place."""
         return CAREFUL in self.avoided_by
 
-    @property
-    def by_takeover_driver(self) -> bool:
-        """Whether the driver of `latest_takeover_s` avoids it from the start."""
-        return TAKES_OVER in self.avoided_by
-
 
 # The file of a campaign.
 

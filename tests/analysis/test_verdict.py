@@ -296,6 +296,11 @@ def mixed(vuts, tmp_path_factory) -> Path:
     return folder
 
 
+def again(folder: Path, vuts: dict[str, str]) -> tuple[object, ...]:
+    """Return how to go on with the mixed campaign, whose folder names no code to run."""
+    return ("--resume", folder, "--vut", vuts["mixed"])
+
+
 class TestACampaignWithGates:
     @pytest.mark.parametrize(
         ("gates", "code"),
@@ -307,10 +312,10 @@ class TestACampaignWithGates:
             (("fmc>0.99", "timeouts"), 1),
         ],
     )
-    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, mixed, gates, code):
+    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, vuts, mixed, gates, code):
         before = (mixed / "campaign.json").read_bytes()
         options = [word for gate in gates for word in ("--gate", gate)]
-        said = invoke("campaign", "--resume", mixed, "-q", "--json", *options)
+        said = invoke("campaign", *again(mixed, vuts), "-q", "--json", *options)
         assert said.exit_code == code
         found = json.loads(said.stdout)
         assert found["passed"] is (code == 0)
@@ -333,15 +338,15 @@ class TestACampaignWithGates:
         before = file.read_bytes()
         for words in (
             ("--vut", "design2", "--level", 0, "--cases", 4, "--out", tmp_path / "other"),
-            ("--resume", mixed),
+            again(mixed, vuts),
         ):
             said = invoke("campaign", *words, "--junit", file)
             assert isinstance(said.exception, UserError)
             assert "choose another name with --junit" in str(said.exception)
         assert not (tmp_path / "other").exists()
         assert file.read_bytes() == before
-        again = invoke("campaign", "--resume", mixed, "--junit", mixed / "junit.xml", *options[2:])
-        assert again.exit_code == 1
+        options = ("--junit", mixed / "junit.xml", "--gate", "errors")
+        assert invoke("campaign", *again(mixed, vuts), *options).exit_code == 1
         assert [t.get("name") for t in read_junit(mixed / "junit.xml").iter("testcase")] == [
             t.get("name") for t in root.iter("testcase")
         ]
@@ -389,51 +394,6 @@ class TestACampaignOfFewCasesThatIsResumed:
         assert "less than 25.00%" in text.stdout
         found = json.loads(invoke("campaign", "--resume", stopped, "-q", "--json").stdout)
         assert found["stopped"] == "converged"
-
-
-@pytest.fixture(scope="module")
-def folders(vuts, tmp_path_factory) -> dict[str, Path]:
-    """Return campaigns of a good VUT and of broken ones, by name."""
-    place = tmp_path_factory.mktemp("versions")
-    for name, vut in {"good": "design2", **vuts}.items():
-        settings = campaign_settings(vut=vut, sampler="uniform", cases=20, batch=10, seed=1)
-        run_campaign(settings, place / name)
-    return {path.name: path for path in place.iterdir()}
-
-
-class TestTwoVersions:
-    @pytest.mark.parametrize("broken", list(VUTS))
-    @pytest.mark.parametrize("rerun", ["--rerun", "--no-rerun"])
-    def test_of_which_the_second_is_broken_are_worse_and_not_the_other_way_round(
-        self, folders, broken, rerun
-    ):
-        worse = invoke("compare-runs", folders["good"], folders[broken], rerun)
-        assert worse.exit_code == 1
-        assert "B is worse than A" in worse.stdout
-        assert "at POV level 0 B " in worse.stdout
-        better = invoke("compare-runs", folders[broken], folders["good"], rerun)
-        assert better.exit_code == 0
-        assert "B is not worse than A" in better.stdout
-        head, _ = better.stdout.split("\nB: ")
-        counts = judge(Run(folders[broken]).outcomes)
-        assert head.splitlines()[0].endswith(counts.counts)
-        assert [line.split()[1].strip(",") for line in head.splitlines()[1:]] == [
-            trouble.end for trouble in counts.troubles
-        ]
-
-    def test_of_which_both_tested_nothing_are_worse(self, folders):
-        for other in ("raises", "stops"):
-            said = invoke("compare-runs", folders["stops"], folders[other], "--tolerance", 1)
-            assert said.exit_code == 1
-            assert "B reached the merge point in no case of its campaign" in said.stdout
-
-    def test_that_stop_where_the_first_collided_have_fixed_nothing(self, run, folders):
-        found = invoke("compare-runs", run.folder, folders["stops"], "--json")
-        level = json.loads(found.stdout)["levels"]["0"]
-        assert level["fmc_a"] > 0.0
-        assert level["fmc_fixed"] == 0.0
-        assert level["changes"]["fixed"] == 0
-        assert level["changes"]["no verdict of B"] == 20 + len(failures(run.outcomes))
 
 
 class TestFromPython:

@@ -235,11 +235,12 @@ class TestACampaign:
         opened = api.results.CampaignRun(tmp_path / "run", gates=["failures"])
         failing = failing_cases(opened.run.outcomes, 0.3)
         assert opened.summary.failures == opened.verdict.failures == len(failing)
-        assert opened.chance.cases == opened.verdict.cases == len(by_case(opened.run.outcomes))
-        assert opened.chance.runs == 60
+        assert opened.verdict.cases == len(by_case(opened.run.outcomes))
+        facts = {fact.name: fact.value for fact in opened.facts}
+        assert facts["runs"] == 60
+        assert facts["share of its runs in which a case may fail"] == 30.0
         assert len(opened.failures) == len(failing)
         assert opened.gates[0].found.startswith(f"{len(failing)} failure")
-        assert opened.to_record()["chance"]["tolerated"] == 0.3
 
 
 def test_the_package_s_own_vuts_repeat_nothing_without_noise():

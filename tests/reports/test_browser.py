@@ -337,8 +337,7 @@ def test_a_click_on_a_region_in_words_shows_its_cases_in_maps_and_table(browser,
     viewport = {"width": size[0], "height": size[1]}
     found = failures(made.outcomes)
     near = [o for o in made.outcomes if o.is_tested and not o.failed]
-    kinds = ReportModel(made).kinds
-    boxes = [b for n in (0, 1, 2) for b in diagnosis.failure_boxes(found + near, n, kinds)]
+    boxes = [b for n in (0, 1, 2) for b in diagnosis.failure_boxes(found + near, n)]
     with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
         sentences = page.locator(".sentences button")
         assert sentences.all_inner_texts() == [box.sentence for box in boxes]

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ import pytest
 from handmade import write_run
 from lxml import etree
 from test_browser import browser, shown  # noqa: F401 (a fixture)
-from test_report import data_of, root_of, text_of
+from test_report import data_of, text_of
 
 from merge_sumo.analysis.merging import merging_of
 from merge_sumo.api import CampaignRun
@@ -75,8 +74,7 @@ class TestSentences:
         assert "lane" not in without(text_of(page), ("along the lane", "where the lanes run"))
         assert not {"lane", "place"} & set(data_of(page))
         assert not {"x_merge_m", "lane_share", "stood_s"} & set(data_of(page)["cases"])
-        assert not root_of(page).xpath("//section[@aria-labelledby='merging']")
-        assert "merging" not in CampaignRun(run).to_record()
+        assert "place of the merge, median" not in text_of(page)
         assert not any("merges" in line for line in CampaignRun(run).lines())
         outcome = run.outcomes[0]
         listed = "\n".join(lines_of(outcome, run.trajectory(0)))
@@ -149,22 +147,15 @@ class TestMerging:
         assert merging_of([replace(made.outcomes[0], case=case)]) is None
         assert merging_of([]) is None
 
-    def test_is_in_the_report_and_in_json_with_the_published_figures(self, made, page):
-        (section,) = root_of(page).xpath("//section[@aria-labelledby='merging']")
-        text = " ".join(section.text_content().split())
-        assert "exiD, Li et al. 2023, arXiv 2303.11531" in text
-        rows = [[cell.text for cell in row] for row in section.xpath(".//tbody/tr")]
-        assert [row[:3] for row in rows[-3:]] == [
-            ["people, site 2", "1,292", "32 %"],
-            ["people, site 3", "565", "46 %"],
-            ["people, site 5", "1,573", "33 %"],
-        ]
-        assert rows[0][:5] == ["all", "177", "35 %", "0", "2"]
-        record = CampaignRun(made).to_record()["merging"]
-        assert json.loads(json.dumps(record))["people"]["rear_headway_s"] == [2.0, 2.7]
-        assert record["merges"] == 177
-        assert sum(level["merges"] for level in record["levels"].values()) == 177
-        assert sum("of the lane in the median" in one for one in CampaignRun(made).lines()) == 1
+    def test_is_among_the_facts_of_each_level_beside_published_figures(self, made, page):
+        assert "exiD, Li et al. 2023, arXiv 2303.11531" in text_of(page)
+        run = CampaignRun(made)
+        facts = {fact.name: fact.shown for fact in run.facts if fact.level == 0}
+        assert facts["place of the merge, median"] == "35.4 % of the lane"
+        assert facts["merges where the lane ends"] == "0"
+        stood = [f.value for f in run.facts if f.name == "cases that stood on the lane"]
+        assert sum(map(int, stood)) == 2
+        assert sum("of the lane in the median" in line for line in run.lines()) == 1
 
 
 @pytest.mark.slow

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.analysis.chance import ChanceSummary, chance_in
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.chance import (
@@ -133,29 +132,3 @@ def test_a_case_is_decided_by_the_posterior_of_its_runs():
     assert (runs_needed(1, 1, 0.2), runs_needed(0, 7, 0.2), runs_needed(1, 8, 0.2)) == (1, 2, 2)
     assert (runs_needed(4, 19, 0.2), runs_needed(4, 20, 0.2)) == (1, 0)
     assert [runs_needed(failures, 5, 0.0) for failures in (0, 1)] == [1, 0]
-
-
-def test_what_repeats_show_is_counted():
-    other = replace(CASE, x_pov0_m=-200.0)
-    told = outcomes(
-        [
-            (CASE, 0, FAILS),
-            (CASE, 1, PASSES),
-            (other, 0, PASSES),
-            (other, 1, PASSES),
-            (CASE, 2, None),
-        ]
-    )
-    assert chance_in(told[:1]) is None
-    assert chance_in(told) == ChanceSummary(
-        runs=4,
-        cases=2,
-        repeated=2,
-        varied=1,
-        both_ways=1,
-        tolerated=0.0,
-        failures=1,
-        undecided=0,
-    )
-    tolerant = chance_in(told, 0.4)
-    assert (tolerant.failures, tolerant.undecided) == (1, 1)

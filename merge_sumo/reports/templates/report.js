@@ -675,21 +675,10 @@ function csvText(text) { // a spreadsheet is to run nothing: not at the start, n
 function search() {
   const { batch, levels } = data.search;
   if (!batch.length) return;
-  const bars = [], xRange = [batch[0], batch[batch.length - 1] + data.search.width];
-  let most = 1;
-  batch.forEach((b, n) => {
-    let y = 0;
-    for (const { level, cases: counted } of levels) {
-      bars.push({ name: `box level${level}`, x0: b, x1: b + data.search.width, y0: y, y1: y + counted[n] });
-      y += counted[n];
-    }
-    most = Math.max(most, y);
-  });
+  const xRange = [batch[0], batch[batch.length - 1] + data.search.width];
   const lines = (key) => levels.map((of) => ({ name: `level${of.level}`, points: of[key].map((y, n) => [batch[n] + data.search.width / 2, y]).filter(([, y]) => y !== null) })).filter(({ points }) => points.length);
   const common = { xRange, xLabel: "batch" };
-  plot(byId("chart-share"), { ...common, yRange: [0, most * 1.05], lines: [], bars });
-  const scores = lines("score"), coverage = lines("fmc");
-  plot(byId("chart-score"), { ...common, yRange: range(scores.flatMap(({ points }) => points.map(([, y]) => y)).concat(scores.length ? [] : [0])), lines: scores });
+  const coverage = lines("fmc");
   const off = lines("off");
   if (byId("chart-off")) plot(byId("chart-off"), { ...common, yRange: [0, Math.max(...off.flatMap(({ points }) => points.map(([, y]) => y)), 1) * 1.1], lines: off });
   plot(byId("chart-fmc"), { ...common, yRange: [0, Math.max(...coverage.flatMap(({ points }) => points.map(([, y]) => y)), 0.001) * 1.1], lines: coverage });
