@@ -167,4 +167,4 @@ def kept_truth(run: Run, road: Corridor, level: int) -> tuple[Truth, Path] | Non
         criterion=run.criterion,
         versions=versions(),
     )
-    return TruthKey(plan, level, TRUTH_CASES[level], seed=0).read_with_path(run.scenario)
+    return TruthKey(plan, level, TRUTH_CASES[level], seed=0).read(run.scenario)

@@ -177,9 +177,8 @@ def ground_truth(
     The cache's key is a hash of level, cases, seed, engine and of what decides outcomes by the
     plan, with the versions of the software: after a change in the sources of this package that
     gives it no other version, the cache is to be removed. What the VUT itself loaded while it drove
-    is kept with the truth, and a truth is only used while those files are the same. It is signed:
-    what somebody else has put into the cache is not believed. A plan for the kinematic engine also
-    takes the truth that SUMO gave.
+    is kept with the truth, and a truth is only used while those files are the same. A plan for the
+    kinematic engine also takes the truth that SUMO gave.
 
     Args:
         plan: how cases run.
@@ -203,7 +202,7 @@ def ground_truth(
     kept = TruthKey({**plan.key(level), **of_runs}, level, count, seed, plan.engine)
     known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
     if known is not None:
-        return known
+        return known[0]
     path = kept.path(cache)
     check_place(path.parent, CACHE)
     check_own(path)
@@ -315,7 +314,8 @@ def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
     """Return the truth that the cache has, by whichever engine; None where it has none."""
-    return TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
+    found = TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
+    return None if found is None else found[0]
 
 
 @dataclass(frozen=True, slots=True)
@@ -346,18 +346,8 @@ class TruthKey:
         scenario: Scenario,
         cache: Path | None = None,
         engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
-    ) -> Truth | None:
-        """Return the truth that is kept, by the first of some engines; None where none is."""
-        found = self.read_with_path(scenario, cache, engines)
-        return None if found is None else found[0]
-
-    def read_with_path(
-        self,
-        scenario: Scenario,
-        cache: Path | None = None,
-        engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
     ) -> tuple[Truth, Path] | None:
-        """Return the truth of `read`, and its file."""
+        """Return the truth that is kept by the first of some engines, and its file; or None."""
         for engine in engines:
             path = replace(self, engine=engine).path(cache)
             truth = read_truth(path, self.level, self.cases, scenario)
@@ -367,10 +357,10 @@ class TruthKey:
 
 
 def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
-    """Return what a file of the cache holds.
+    """Return what a file of the cache holds, which only its user can write.
 
-    None where there is none, or it is torn or something else, such as another truth under this
-    name, others can write the cache, or a file that the VUT loaded is not what it was.
+    None where there is none, or it is torn or another truth under this name, others can write the
+    cache, or a file that the VUT loaded is not what it was.
     """
     dims = len(scenario.dimensions(level))
     try:
@@ -386,18 +376,9 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
             return None
     except (*UNREADABLE_NPZ, UserError):
         return None
-    fits = points.shape == (cases, dims) and score.shape == (cases,)
-    numbers = points.dtype == score.dtype == np.float64
-    counted = in_sumo.shape == () and in_sumo.dtype == np.int64 and in_sumo >= 0
-    if not (fits and numbers and counted):
+    if points.shape != (cases, dims) or {len(score), *map(len, counts)} != {cases}:
         return None
-    inside = bool(((points >= 0.0) & (points <= 1.0)).all())
-    scores = not (np.isinf(score) | (score > 0.0)).any()
-    counts_fit = all(c.shape == (cases,) and c.dtype == np.int64 and (c >= 0).all() for c in counts)
-    if not (inside and scores and counts_fit and len(counts) in (0, len(COUNTS))):
-        return None
-    truth = Truth(points, score, int(in_sumo), *counts)
-    return truth if truth.in_sumo <= truth.all_runs else None
+    return Truth(points, score, int(in_sumo), *counts)
 
 
 def _scores(results: CaseResults) -> list[tuple[float, bool, Files]]:

@@ -14,7 +14,6 @@ import os
 import re
 import shutil
 import sys
-import zipfile
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -266,88 +265,20 @@ def compressed(size: int) -> bytes:
     return content.getvalue()
 
 
-def claiming(shape: tuple[int, ...]) -> bytes:
-    """Return an archive whose array says that it has a shape, and has no data."""
-    content = io.BytesIO()
-    with zipfile.ZipFile(content, "w") as archive:
-        for name in ("points", "score", "in_sumo", "files", "of"):
-            header = io.BytesIO()
-            np.lib.format.write_array_header_1_0(
-                header, {"descr": "<f8", "fortran_order": False, "shape": shape}
-            )
-            archive.writestr(f"{name}.npy", header.getvalue())
-    return content.getvalue()
-
-
-def plain(array: Any) -> bytes:
-    content = io.BytesIO()
-    np.save(content, array, allow_pickle=True)
-    return content.getvalue()
-
-
 SPOILT = {
     "empty": b"",
     "text": b"points and scores",
-    "html": b"<html>404</html>",
-    "a zip of nothing": b"PK\5\6" + bytes(18),
-    "one array": plain(np.zeros((CASES, 2))),
-    "a pickle": plain(np.array([{"a": 1}], dtype=object)),
+    "a pickle": saved(points=np.full((CASES, 2), None)),
     "of another truth": saved(of="truth-0123456789abcdef01234567"),
-    "of nothing": saved(of=None),
-    "of a number": saved(of=7),
     "no score": saved(score=None),
-    "no points": saved(points=None),
-    "no files": saved(files=None),
     "too many points": saved(points=np.zeros((CASES + 1, 2))),
     "points of level 2": saved(points=np.zeros((CASES, 3))),
-    "flat points": saved(points=np.zeros(2 * CASES)),
-    "points of 32 bits": saved(points=np.zeros((CASES, 2), dtype=np.float32)),
-    "whole points": saved(points=np.zeros((CASES, 2), dtype=np.int64)),
-    "complex points": saved(points=np.zeros((CASES, 2), dtype=complex)),
-    "points of text": saved(points=np.full((CASES, 2), "0.5")),
-    "points of objects": saved(points=np.full((CASES, 2), None)),
-    "points that are none": saved(points=np.full((CASES, 2), np.nan)),
-    "points far away": saved(points=np.full((CASES, 2), 1e9)),
-    "points below": saved(points=np.full((CASES, 2), -1e-9)),
-    "bytes in the other order": saved(points=np.zeros((CASES, 2), dtype=">f8")),
-    "scores of 32 bits": saved(score=np.zeros(CASES, dtype=np.float32)),
-    "scores of objects": saved(score=np.full(CASES, None)),
-    "scores in two columns": saved(score=np.zeros((CASES, 2))),
     "scores that are too few": saved(score=np.zeros(CASES - 1)),
-    "scores above 0": saved(score=np.full(CASES, 1.0)),
-    "no number of cases in SUMO": saved(in_sumo=None),
-    "more cases in SUMO than there are": saved(in_sumo=CASES + 1),
-    "fewer cases in SUMO than none": saved(in_sumo=-1),
-    "halves of cases in SUMO": saved(in_sumo=0.5),
-    "several numbers of cases in SUMO": saved(in_sumo=np.ones(2, dtype=np.int64)),
-    "infinite scores": saved(score=np.full(CASES, -np.inf)),
-    "records": saved(points=np.zeros(CASES, dtype=[("x", "f8"), ("y", "f8")])),
-    "compressed": compressed(10),
     "a bomb of 800 MB": compressed(10**8),
-    "an array that says that it is large": claiming((10**12,)),
-    "an array that says that it is larger": claiming((2**62, 2**62)),
-    "an array that says that it is negative": claiming((-1, 2)),
     **{
         f"files that are {text[:30]!r}": saved(files=text)
-        for text in (
-            *("", "{", "[]", "null", "7", '"text"', "[1, 2]", '{"/etc/passwd": null}'),
-            *(
-                '{"\\u0000": "x"}',
-                '{"gone": "0"}',
-                '{"gone": 7}',
-                '{"/": {}}',
-                '{"/dev/zero": "0"}',
-            ),
-            *(
-                '{"' + "x" * 5000 + '": "0"}',
-                "[" * 100_000,
-                '{"a":' * 100_000,
-                "NaN",
-                '{"\\ud800": "0"}',
-            ),
-        )
+        for text in ("{", "[]", '{"gone": "0"}', '{"/dev/zero": "0"}', "[" * 100_000)
     },
-    "files of numbers": saved(files=np.zeros(3)),
 }
 
 
