@@ -170,18 +170,8 @@ class TestRefuses:
             resume_campaign(Path("run"), {"cases": 20})
         assert json.loads((Path("run") / SETTINGS).read_text())["cases"] == 10
 
-    def test_to_run_the_old_version_that_a_received_folder_names(self, monkeypatch):
-        Path("old.py").write_text(f"open({str(Path('it-ran').absolute())!r}, 'w')\n{OLD}")
+    def test_nothing_where_a_study_runs_the_new_version_alone(self, call):
         run_campaign(settings(vut="design2", cases=10), Path("run"))
-        Path("it-ran").unlink(missing_ok=True)
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(Path("theirs").absolute()))
-        with pytest.raises(UserError, match=r"the controller that it names, old\.py:f"):
-            resume_campaign(Path("run"), {"cases": 20})
-        assert not Path("it-ran").exists()
-
-    def test_nothing_where_a_study_runs_the_new_version_alone(self, call, monkeypatch):
-        run_campaign(settings(vut="design2", cases=10), Path("run"))
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(Path("theirs").absolute()))
         assert call("rerun", "run", 0).code == 0
         assert call("run", "--case", "run", 0, "--vut", "old.py:f").code in (0, 1)
 

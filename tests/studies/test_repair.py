@@ -95,7 +95,8 @@ def campaigns(tmp_path_factory):
 
 def repair(run, params, **given):
     """Repair the controller of a campaign, which is named again as it was."""
-    return api.repair(run, params, **{"vut": api.open_run(run).settings["vut"], **given})
+    folder = getattr(run, "folder", run)
+    return api.repair(run, params, **{"vut": api.open_run(folder).settings["vut"], **given})
 
 
 def test_a_threshold_that_is_known_is_found_with_its_reserve(campaigns, tmp_path):
