@@ -9,8 +9,7 @@ of the truth. The share of these within the radius of the FMC of a regression th
 printed after 40 cases, as median with the least and the most over the seeds:
 
 - of a campaign against the old version;
-- of two independent campaigns of as many cases and `compare-runs`, which runs the failures of each
-  with the other version;
+- of two independent campaigns of as many cases, whose failures run again with the other version;
 - of as many greedy picks among the regressions of the truth (oracle).
 """
 
@@ -121,7 +120,7 @@ class Versions:
         return self._points(broke)
 
     def independent(self, cases: int, seed: int) -> FloatArray:
-        """Return the regressions that two campaigns and `compare-runs` find, (k, d).
+        """Return the regressions that two campaigns find, whose failures run with both, (k, d).
 
         The failures of the old version's campaign are none, so that campaign need not run.
         """

@@ -59,10 +59,10 @@ def main() -> None:
                 progress=False,
             )
         print(f"seed {seed}", *found.lines()[:-1], sep="\n  ")
-        if found.repair.spec is not None:
+        if found.spec is not None:
             truths = [
                 api.truths(spec, cases=asked.truth_cases, seed=TRUTH_SEED, workers=None).truths
-                for spec in (asked.vut, found.repair.spec)
+                for spec in (asked.vut, found.spec)
             ]
             figures[str(seed)] = {
                 str(level): row(*(t[level] for t in truths)) for level in truths[0]

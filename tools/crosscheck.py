@@ -38,7 +38,7 @@ from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.studies.versions import settings_today
+from merge_sumo.studies.comparison import settings_today
 from merge_sumo.sumo.world import MAX_SPEED_MPS
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario

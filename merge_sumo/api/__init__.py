@@ -50,8 +50,6 @@ from merge_sumo.api.results import (
     CampaignRun,
     CaseRun,
     PolicyChecks,
-    RepairResult,
-    StressResult,
     TruthResult,
 )
 from merge_sumo.campaigns.campaign import (
@@ -81,14 +79,14 @@ from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
+from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
-from merge_sumo.reports.junit import check_junit, write_junit
+from merge_sumo.reports.junit import check_junit, write_junit, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars, CampaignBars
-from merge_sumo.reports.repair_page import repair_page
+from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
-from merge_sumo.reports.version_pages import comparison_page, history_page, write_page
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_of
@@ -96,21 +94,20 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import (
+    comparison,
     explanation,
     reproduction,
-    versions,
     vut_check,
 )
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
+from merge_sumo.studies.comparison import Comparison, settings_today
 from merge_sumo.studies.counterfactuals import note_avoidance
-from merge_sumo.studies.history import History, history_of
 from merge_sumo.studies.probability import ProbabilityResult
 from merge_sumo.studies.run_study import RunStudy, notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
 from merge_sumo.studies.truth import Repeats, Truth
-from merge_sumo.studies.versions import Rerun, RunComparison, settings_today
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
@@ -123,7 +120,6 @@ from merge_sumo.system.folders import (
     dated,
     link_latest,
     make_folder,
-    replace_own,
     write_new,
 )
 from merge_sumo.system.interrupt import Stopped
@@ -132,7 +128,6 @@ from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.vuts.parameters import Range
@@ -143,12 +138,11 @@ if TYPE_CHECKING:
     from merge_sumo.values.case import Case
 
 __all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseKeywords", "CaseRun", "Hosting"]
-__all__ += ["RunComparison", "Seen", "SeenBatch", "Setup", "campaign"]
-__all__ += ["check_scenario", "check_vut", "compare_runs", "dated"]
+__all__ += ["Comparison", "Seen", "SeenBatch", "Setup", "campaign"]
+__all__ += ["check_scenario", "check_vut", "compare", "dated"]
 __all__ += ["benchmark", "export"]
 __all__ += [
     "explain",
-    "history",
     "new_scenario",
     "open_in_gui",
     "open_run",
@@ -467,7 +461,7 @@ def rerun(
     *,
     level: int | str | None = None,
     **given: Unpack[RerunKeywords],
-) -> Rerun:
+) -> Comparison:
     """Run recorded cases again with a changed VUT; the same as `merge-sumo rerun`.
 
     Args:
@@ -482,7 +476,7 @@ def rerun(
     wanted = _of_level(before, _listed(indices), level)
     total = len(set(wanted) or before.outcomes)
     with _study_of(before, given, "{vut} again", total) as study:
-        return versions.rerun(study, wanted)
+        return comparison.rerun(study, wanted)
 
 
 @contextmanager
@@ -616,61 +610,31 @@ def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
 # Versions of a VUT
 
 
-def compare_runs(
-    a: AnyRun,
-    b: AnyRun,
-    *,
-    rerun: bool = True,
-    policies: AnyPath | None = None,
-    out: AnyPath | None = None,
-    tolerance: float = 0.0,
-) -> RunComparison:
-    """Compare two campaigns: what got fixed, and what broke; as `merge-sumo compare-runs`.
+def compare(
+    runs: Iterable[AnyRun], *, out: AnyPath | None = None, junit: AnyPath | None = None
+) -> Comparison:
+    """Compare recorded campaigns: what broke, and what was fixed; as `merge-sumo compare`.
 
-    `worse(tolerance)` of the result says why B is worse, if it is.
-
-    Args:
-        a: the campaign before, or its folder.
-        b: the campaign after, or its folder.
-        rerun: run the failures, errors and timeouts of each with the other's VUT.
-        policies: folder of the learned drivers, where they are elsewhere now.
-        out: page to write; nothing may be there. None is written when left out.
-        tolerance: by how much B may be worse before the page says so.
-    """
-    if out is not None:
-        check_new_file(Path(out))
-    first, second = _opened(a).run, _opened(b).run
-    given = {} if policies is None else {"policies": str(policies)}
-    motions: dict[tuple[str, int], Trajectory] = {}
-
-    def keep(of: str, index: int, trajectory: Trajectory) -> None:
-        motions[of, index] = trajectory
-
-    compared = versions.compare_runs(
-        first, second, rerun=rerun, given=(given, given), on_motion=keep
-    )
-    if out is not None:
-        write_page(comparison_page(compared, first, second, motions, tolerance), Path(out))
-    return compared
-
-
-def history(runs: Iterable[AnyRun], *, out: AnyPath | None = None) -> History:
-    """Return how a VUT changed over several campaigns; the same as `merge-sumo history`.
-
-    Everything is read from the records: no case runs again, and no VUT.
+    Everything is read from the records: no case runs, and no VUT.
 
     Args:
         runs: the campaigns, or their folders, the oldest first.
         out: page to write; nothing may be there. None is written when left out.
+        junit: JUnit file to write, in the same way.
     """
     if isinstance(runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
+    for path in (out, junit):
+        if path is not None:
+            check_new_file(Path(path))
+    opened = [_opened(run).run for run in runs]
+    compared = comparison.compare(opened)
     if out is not None:
-        check_new_file(Path(out))
-    result = history_of([_opened(run).run for run in runs])
-    if out is not None:
-        write_page(history_page(result), Path(out))
-    return result
+        html = comparison_page(compared, opened)
+        write_new(Path(out), html.encode(errors="backslashreplace"))
+    if junit is not None:
+        write_junit_of_comparison(Path(junit), compared)
+    return compared
 
 
 # Studies
@@ -866,19 +830,11 @@ def probability(
     return ProbabilityResult(found, target, before.criterion)
 
 
-def stress(
-    run: AnyRun,
-    *,
-    draws: int = ladder.DEFAULT_DRAWS,
-    seed: int = 0,
-    **given: Unpack[RerunKeywords],
-) -> StressResult:
-    """Run the cases of a campaign again, each time a little otherwise; as `merge-sumo stress`.
+def stress(run: AnyRun, **given: Unpack[RerunKeywords]) -> ladder.Stress:
+    """Run the cases of a campaign again, each time a little otherwise: `merge-sumo rerun --stress`.
 
     Args:
         run: the campaign, or its folder, into which `stress.json` is written.
-        draws: times that all cases run where the change is drawn at random, 1 to 1,000.
-        seed: same seed, same draws.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
 
@@ -887,11 +843,10 @@ def stress(
     check_keywords("stress", given, RerunKeywords)
     before = _opened(run).run
     check_own(before.folder / ladder.STRESS)
-    total = sum(ladder.runs_of(change, draws) for change in ladder.RUNGS)
+    total = sum(map(ladder.runs_of, ladder.RUNGS))
     cases = total * sum(outcome.is_tested for outcome in before.outcomes)
     with _study_of(before, given, "cases again", cases, engine=None) as study:
-        found = ladder.stress(study, draws=draws, seed=seed)
-    return StressResult(found, before.folder / ladder.STRESS)
+        return ladder.stress(study)
 
 
 def repair(
@@ -907,7 +862,7 @@ def repair(
     resume: bool = False,
     check: Callable[[], None] | None = None,
     **given: Unpack[RerunKeywords],
-) -> RepairResult:
+) -> mending.Repair:
     """Search for values of a controller's parameters that repair it; as `merge-sumo repair`.
 
     Args:
@@ -937,7 +892,6 @@ def repair(
     today, plan, runner = _today(before, given, stacklevel=5)
     runner = replace(runner, check=check)
     RunStudy(before, today, plan).check_same_system()
-    motions: dict[Path, dict[tuple[str, int], Trajectory]] = {}
     bars: list[Bars] = []
 
     @contextmanager
@@ -954,21 +908,9 @@ def repair(
             done -= trials
             bars[0].counted(f"round {trial.round}, smallest change", done, done, "trials")
 
-    def fresh(spec: str, number: int) -> tuple[Run, RunComparison]:
+    def fresh(spec: str, number: int) -> Run:
         campaign = folder / mending.CAMPAIGN.format(number)
-        settings = mending.fresh_settings(today, asked, spec, number)
-        ran = _fresh_campaign(settings, campaign, runner)
-        seen = motions[ran.folder] = {}
-        of_both = {n: v for n in ("policies", "pov") if (v := getattr(today, n)) is not None}
-        # The earlier version, where its folder may not name it.
-        named = {"vut": today.vut} if "vut" in controllers(before.settings) else {}
-        compared = versions.compare_runs(
-            before,
-            ran,
-            given=({**of_both, **named}, {**of_both, "vut": spec}),
-            on_motion=lambda of, index, motion: seen.update({(of, index): motion}),
-        )
-        return ran, compared
+        return _fresh_campaign(mending.fresh_settings(today, asked, spec, number), campaign, runner)
 
     search = mending.Search(
         *(before, plan.with_engine(None), asked),
@@ -977,16 +919,9 @@ def repair(
         check=runner.checks,
         on_trial=on_trial,
     )
-    found = search.repaired(fresh)
-    mending.write_repair(found, folder)
-    page = folder / mending.PAGE
-    replace_own(page, repair_page(found, before).encode(errors="backslashreplace"))
-    best = found.best
-    if best.compared is not None and best.campaign is not None:
-        seen = motions[best.campaign.folder]
-        changes = comparison_page(best.compared, before, best.campaign, seen)
-        replace_own(folder / mending.CHANGES, changes.encode(errors="backslashreplace"))
-    return RepairResult(found, folder, page)
+    found = search.repaired(fresh, folder)
+    write_repair(found, before)
+    return found
 
 
 def _fresh_campaign(settings: CampaignSettings, folder: Path, runner: Runner) -> Run:

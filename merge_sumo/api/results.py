@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from html import escape
@@ -31,15 +30,12 @@ from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
+from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
-from merge_sumo.reports.version_pages import AGAINST_PAGE
-from merge_sumo.studies.repair import MEASURED_BY, Repair, record_of_repair
-from merge_sumo.studies.stress import Stress
+from merge_sumo.studies.comparison import Change, Comparison, compare_against
 from merge_sumo.studies.truth import REAL_REGION, Truth
-from merge_sumo.studies.versions import Change, RunComparison, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
-from merge_sumo.system.records import to_plain
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
@@ -163,15 +159,15 @@ class CampaignRun(Result):
         return facts_of(self._run, self.summary, self.verdict)
 
     @cached_property
-    def against(self) -> RunComparison | None:
+    def against(self) -> Comparison | None:
         """What changed from the version that the campaign is against; None where it is none."""
         return compare_against(self._run)
 
     @property
     def regressions(self) -> Table:
-        """The cases that fail and pass with that version, the worst first."""
-        cases = [] if self.against is None else self.against.cases
-        broke = [case.index for case in cases if case.change is Change.BROKE]
+        """The cases that do not pass, and pass with that version, the worst first."""
+        cases = [] if self.against is None else self.against.steps[0].cases
+        broke = [case.b.index for case in cases if case.change is Change.BROKE]
         return Table(self._run.outcome(index) for index in broke)
 
     @cached_property
@@ -217,7 +213,7 @@ class CampaignRun(Result):
             "stopped": "converged" if self.converged else "cases",
             "fail_when": criterion.text,
             "notes": notes_on(outcomes, criterion),
-            **({} if self.against is None else {AGAINST: self.against.to_record()}),
+            **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
             "repeats": [repeat.to_record() for repeat in self.repeats],
             "run": str(self.folder),
             "report": str(self.report_file),
@@ -251,22 +247,10 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        changes = Counter(case.change for case in self.against.cases)
-        counts = (
-            f"{counted(changes[Change.BROKE], 'case')} broke",
-            f"{changes[Change.FIXED]} fixed",
-            f"{changes[Change.BOTH_FAIL]} fail with both",
-        )
         earlier = printable(str(self.settings[AGAINST])[:NAME_CHARACTERS])
-        silent = {
-            f"with {printable(self._run.vut)} alone": changes[Change.NO_VERDICT_OF_B],
-            f"with {earlier} alone": changes[Change.NO_VERDICT_OF_A],
-            "with both": changes[Change.NO_VERDICT],
-        }
-        parts = [f"{counted(number, 'case')} {which}" for which, number in silent.items() if number]
         return [
-            f"against {earlier}: {', '.join(counts)}",
-            *([f"  error or timeout, so no verdict: {', '.join(parts)}"] if parts else []),
+            f"against {earlier}: {self.against.headline}",
+            *self.against.steps[0].table_lines(),
             f"what broke: {self.folder / AGAINST_PAGE}",
         ]
 
@@ -438,123 +422,6 @@ def _engine_of(truth: Truth) -> str:
         return ""
     cases = counted(truth.in_sumo, "case")
     return f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-
-
-@dataclass(frozen=True, slots=True, repr=False)
-class StressResult(Result):
-    """Which verdicts of a campaign flip where something is a little otherwise.
-
-    Attributes:
-        found: `rungs`, each with its `flips`; `robust` and `fragile` failures.
-        file: file that was written.
-    """
-
-    found: Stress
-    file: Path
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        found = self.found
-        lists = {"robust": found.robust, "fragile": found.fragile}
-        return {**to_plain(found), **lists, "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return a table of the rungs, and which failures are robust."""
-        found = self.found
-        lines = [
-            f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
-            f"failures, {found.runs} times each",
-            "   flips  now pass  now fail  no verdict  what is changed",
-        ]
-        for rung in found.rungs:
-            if rung.skipped:
-                lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
-                continue
-            passes, fails, without = rung.counts
-            numbers = f"{passes:10d}{fails:10d}{without:12d}"
-            drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
-            lines.append(f"{found.share(rung) or 0.0:8.1%}{numbers}  {rung.about}{drawn}")
-        return [*lines, found.sentence, f"written: {self.file}"]
-
-
-@dataclass(frozen=True, repr=False)
-class RepairResult(Result):
-    """Values of a controller's parameters that repair it, or that there are none.
-
-    Attributes:
-        repair: `spec`, the repaired controller, and what is known of it.
-        folder: folder that was written.
-        page: page in it.
-    """
-
-    repair: Repair
-    folder: Path
-    page: Path
-
-    @property
-    def verified(self) -> bool:
-        """Whether values were found and hold in a fresh campaign."""
-        return self.repair.verified
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {**record_of_repair(self.repair), "folder": str(self.folder), "page": str(self.page)}
-
-    def lines(self) -> list[str]:
-        """Return the values, what they cost, what a fresh campaign says, and the command."""
-        found, chosen = self.repair, self.repair.chosen
-        failing = f"{counted(len(found.failing), 'case')} of {found.cases}"
-        if chosen is None:
-            return [
-                f"{found.vut}: no values in these ranges let any of the {failing} pass that do not "
-                "today, unless others fail that pass",
-                f"  these stay: {_indices(found.stays)}",
-                f"page: {self.page}",
-            ]
-        stays = f", {len(found.stays)} still do not: {_indices(found.stays)}" if found.stays else ""
-        lines = [
-            f"{found.vut}: {failing} did not pass; with other values "
-            f"{len(found.failing) - len(found.stays)} of them pass{stays}; none that passed fails"
-        ]
-        for one in found.settings.ranges:
-            today, value = found.today[one.name], chosen.values[one.name]
-            lines.append(f"  {one.name}: {today:g}" + (f" -> {value:g}" if value != today else ""))
-        extra = (
-            f"{chosen.extra[cost]:+.2f} {unit} of {cost}" for cost, (_, unit) in MEASURED_BY.items()
-        )
-        lines.append(f"  cost, mean of a case: {', '.join(extra)}")
-        for number, tested in enumerate(found.rounds, start=1):
-            if tested.campaign is not None and tested.compared is not None:
-                levels = ", ".join(
-                    f"level {level_name(level)} {of.fmc_a:.4f} -> {of.fmc_b:.4f}"
-                    for level, of in tested.compared.levels.items()
-                )
-                cases = counted(len(tested.campaign.outcomes), "case")
-                lines.append(f"fresh campaign {number}, {cases}: FMC {levels}")
-        lines += _verification(found)
-        return [
-            *lines,
-            f"the repaired controller: merge-sumo campaign --vut {quoted(found.spec or '')}",
-            f"page: {self.page}",
-        ]
-
-
-MOST_INDICES: Final = 30
-
-
-def _indices(indices: Sequence[int]) -> str:
-    """Return indices of cases in words."""
-    more = f" and {len(indices) - MOST_INDICES} more" if len(indices) > MOST_INDICES else ""
-    return ", ".join(map(str, indices[:MOST_INDICES])) + more
-
-
-def _verification(found: Repair) -> list[str]:
-    """Return what the last fresh campaign says against the values."""
-    compared = found.best.compared
-    if compared is None or found.verified:
-        return []
-    broke = [f"{counted(found.broke, 'case')} fail that passed"] if found.broke else []
-    return [f"not verified: {sentence}" for sentence in (*broke, *compared.worse(0.0))]
 
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):

@@ -23,7 +23,7 @@ from merge_sumo.commands.printing import folder_of, print_json, quoted, say, sho
 from merge_sumo.errors import UserError
 
 if TYPE_CHECKING:
-    from merge_sumo.api import CampaignRun, CaseRun, RunComparison
+    from merge_sumo.api import CaseRun
 
 SETTINGS: Final = (
     *("vut", "against", "level", "sampler", "cases", "in_flight", "seed", "learn_from"),
@@ -185,7 +185,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
 
 
 @app.verb(
-    options=("level", *HOSTING, "policies", "tolerance", *RUNNING),
+    options=("level", *HOSTING, "policies", *RUNNING),
     own={"vut": VUT_AGAIN},
 )
 def rerun(
@@ -195,38 +195,74 @@ def rerun(
         list[int] | None,
         typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
     ] = None,
+    stress: Annotated[
+        bool,
+        typer.Option(
+            "--stress",
+            help="Change the simulation and not the VUT: a shorter step, an actuator that lags, "
+            "limited power, a start that is off by the error of a sensor, longer cars. Failures "
+            "that fail every time are robust.",
+        ),
+    ] = False,
 ) -> None:
-    """Run recorded cases again with a changed VUT, and say which verdicts changed.
+    """Run recorded cases again with a changed VUT, and say which broke and which are fixed.
 
-    Exit code 1 when it is worse than what was recorded, as in compare-runs: at some level the share
-    of cases with an error, with an error or a timeout, or the failure mode coverage (FMC) grew by
-    more than the tolerance, or it merged in no case.
+    The cases are those of the old version's search: `campaign --against` searches where the new one
+    alone fails.
+
+    Exit code 1 when a case broke: it passed, and does not pass now.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2
+
+    Example:  merge-sumo rerun runs/design2 --stress
     """
     from merge_sumo import api
 
-    tolerance = given.keywords["tolerance"]
-    changed = {name: value for name, value in given.written.items() if name != "tolerance"}
-    result = api.rerun(run, case or (), **changed)
-    why = result.compared.worse(tolerance)
-    if given.as_json:
-        print_json({**result.to_record(), **_judgement(why, tolerance)})
-    else:
-        given.print(result)
-        for one in result.changed[:1]:
-            show(
-                f"look at one: merge-sumo run --case {quoted(run)} {one.index} "
-                f"--vut {quoted(result.vut)} --gui"
-            )
-        show(f"it is {result.compared.judgement(tolerance)} (A is what was recorded, B is now)")
-        for sentence in why:
-            show(f"  {sentence}")
-    raise typer.Exit(1 if why else 0)
+    if stress:
+        if case or "level" in given.written:
+            raise UserError("--stress runs all cases: leave indices and --level away")
+        given.print(api.stress(run, **given.written))
+        return
+    result = api.rerun(run, case or (), **given.written)
+    given.print(result)
+    raise typer.Exit(1 if result.worse else 0)
 
 
-def _judgement(why: list[str], tolerance: float) -> dict[str, Any]:
-    return {"tolerance": tolerance, "worse": bool(why), "why": why}
+@app.verb()
+def compare(
+    given: Given,
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Folders of campaigns, the oldest first.", autocompletion=complete.runs
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="New HTML page to write: what changed, in which cases, and both motions.",
+        ),
+    ] = None,
+    junit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="New file to write for CI: JUnit XML.")
+    ] = None,
+) -> None:
+    """Compare recorded versions of a VUT: what broke, and what was fixed.
+
+    Everything is read from the records. Cases that two campaigns share are paired; where each has
+    cases of its own, regions of failures are compared: one broke where the later version fails and
+    the earlier one has passed cases.
+
+    Exit code 1 when a case or a region broke, or the last version was tested in no case.
+
+    Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
+    """
+    from merge_sumo import api
+
+    result = api.compare(runs, out=out, junit=junit)
+    given.print(result, page=out)
+    raise typer.Exit(1 if result.worse else 0)
 
 
 @app.verb(
@@ -309,101 +345,3 @@ def report(given: Given, run: RunArgument) -> None:
     given.print(api.report(opened))
     if sentence := opened.run.interruption:
         say(sentence)
-
-
-@app.verb(
-    "compare-runs",
-    options=["tolerance", "policies"],
-    own={
-        "rerun": option(
-            bool,
-            True,
-            "Run the failures, errors and timeouts of each with the other's VUT.",
-            "--rerun/--no-rerun",
-        )
-    },
-)
-def compare_runs(
-    given: Given,
-    a: Annotated[
-        Path, typer.Argument(help="Folder of the campaign before.", autocompletion=complete.runs)
-    ],
-    b: Annotated[
-        Path, typer.Argument(help="Folder of the campaign after.", autocompletion=complete.runs)
-    ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="New HTML page to write: what changed, in which cases, and both motions.",
-        ),
-    ] = None,
-) -> None:
-    """Compare two VUTs, or two versions of one: what got fixed, and what broke.
-
-    The failures, errors and timeouts of each campaign are run again with the other's VUT. Exit
-    code 1 when B is worse at some level: when one of these grew by more than the tolerance, the
-    share of cases with an error, the share of cases with an error or a timeout, or the failure
-    mode coverage (FMC); and whenever B merged in no case of its campaign.
-
-    Example:  merge-sumo compare-runs runs/design1 runs/design2 --out changes.html
-    """
-    from merge_sumo import api
-
-    tolerance, runs = given.keywords["tolerance"], {"A": api.open_run(a), "B": api.open_run(b)}
-    compared = api.compare_runs(runs["A"], runs["B"], out=out, **given.keywords)
-    why = compared.worse(tolerance)
-    if given.as_json:
-        campaigns = {name.lower(): run.verdict.to_record() for name, run in runs.items()}
-        print_json({**campaigns, **compared.to_record(), **_judgement(why, tolerance)})
-    else:
-        _print_comparison(compared, runs)
-        alone = sum(level.changes["not run again"] for level in compared.levels.values())
-        known = f"; {alone} failure{'s'[: alone > 1]} ran with one of them alone" if alone else ""
-        show(f"B is {compared.judgement(tolerance)}{known}")
-        for sentence in why:
-            show(f"  {sentence}")
-        if out is not None:
-            show(f"page: {out}")
-    raise typer.Exit(1 if why else 0)
-
-
-def _print_comparison(compared: RunComparison, runs: dict[str, CampaignRun]) -> None:
-    for name, run in runs.items():
-        show(f"{name}: {run.folder} ({run.run.vut}): {run.verdict.counts}")
-        for line in run.verdict.trouble_lines():
-            show(line)
-    for line in compared.lines():
-        show(line)
-    first = compared.look_first()
-    if first:
-        show("look first at:")
-    for case in first:
-        show(f"  {case.change}: merge-sumo export {quoted(runs[case.run].folder)} {case.index}")
-
-
-@app.verb()
-def history(
-    given: Given,
-    runs: Annotated[
-        list[Path],
-        typer.Argument(
-            help="Folders of campaigns, the oldest first.", autocompletion=complete.runs
-        ),
-    ],
-    out: Annotated[Path, typer.Option(help="Page to write; nothing may be there.")] = Path(
-        "history.html"
-    ),
-) -> None:
-    """Show several versions of a VUT in one page: failures, and what got fixed or broke.
-
-    Everything is read from the records: no case runs again, and no VUT. A region in which the
-    earlier version failed counts as fixed when the later one tested cases there and none failed;
-    `compare-runs` runs the failures of two versions again and is the better evidence. Campaigns of
-    different scenarios, criteria, initial speeds or POVs are refused.
-
-    Example:  merge-sumo history runs/design1 runs/design2 --out runs/history.html
-    """
-    from merge_sumo import api
-
-    given.print(api.history(runs, out=out), page=out)

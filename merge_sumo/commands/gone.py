@@ -12,12 +12,21 @@ COMMANDS: Final[Mapping[str, str]] = {
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
     "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
     "failures-per-merge": "`merge-sumo probability RUN --traffic NAME` says it",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded, and `merge-sumo "
+    "rerun RUN --vut SPEC` runs the cases of one campaign with another VUT",
+    "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
+    "stress": "`merge-sumo rerun RUN --stress` does it",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
     "bounds how much of the pool can fail",
 }
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
     "--density": "a TOML file for --traffic states density, speeds and their source",
+    "--draws": "`merge-sumo rerun --stress` draws five times",
+    "--rerun": "`merge-sumo rerun RUN --vut SPEC` runs the cases of a campaign with another VUT",
+    "--no-rerun": "`merge-sumo compare` always compares the records alone",
+    "--tolerance": "`merge-sumo rerun` and `merge-sumo compare` end with 1 where any case broke, "
+    "and --json has the number",
     "--audit": "`merge-sumo probability RUN` bounds, with fresh cases, how much fails where the "
     "campaign expects no failure",
     "--certificate": "`merge-sumo probability RUN --cases 100000` says more than a certificate",

@@ -42,9 +42,9 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "traffic",
         ),
         *("param", "cost", "trials", "rounds"),
-        *("draws", "stop_after_converged", "repeat"),
+        *("stress", "stop_after_converged", "repeat"),
     ),
-    "Verdict": (*("fail_when", "tolerate", "gate", "tolerance", "rerun", "confidence"),),
+    "Verdict": (*("fail_when", "tolerate", "gate", "confidence"),),
     "Where it runs, and what it writes": (
         *("out", "resume", "workers", "junit", "figure"),
         *("file_format", "gui", "debug", "quiet", "as_json"),
@@ -103,12 +103,6 @@ VutOption = Annotated[
 RunArgument = Annotated[
     Path, typer.Argument(help="Folder of a campaign.", autocompletion=complete.runs)
 ]
-
-
-def _checked_tolerance(tolerance: float) -> float:
-    if not tolerance >= 0.0:
-        raise UserError(f"--tolerance is {tolerance}: it must be 0 or more")
-    return tolerance
 
 
 def _runs_of_a_case(text: str) -> int | str:
@@ -239,13 +233,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Requirement over time, instead of --fail-when, in signal temporal logic: "
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
-    ),
-    "tolerance": option(
-        float,
-        0.0,
-        "Growth of FMC, or of the share of cases without a verdict, at a level that is still no "
-        "regression.",
-        callback=_checked_tolerance,
     ),
     "engine": option(
         str,

@@ -156,30 +156,6 @@ def probability(given: Given, run: RunArgument) -> None:
     given.print(api.probability(run, **given.written))
 
 
-@app.verb(
-    options=OF_RECORDED,
-    own={
-        "vut": VUT_AGAIN,
-        "draws": option(
-            int, 5, "Times that all cases run where a change is drawn at random, 1 to 1,000."
-        ),
-        "seed": SEED,
-    },
-)
-def stress(given: Given, run: RunArgument) -> None:
-    """Run the cases of a campaign again, a little otherwise: which verdicts hang by a thread?
-
-    With a shorter step, an actuator that lags, limited power, a start that is off by the error of a
-    sensor, and longer cars on the mainline. Failures that fail every time are robust: `report`
-    lists them first.
-
-    Example:  merge-sumo stress runs/design2
-    """
-    from merge_sumo import api
-
-    given.print(api.stress(run, **given.written))
-
-
 @app.verb(options=OF_RECORDED, own={"vut": VUT_AGAIN})
 def explain(
     given: Given,

@@ -23,9 +23,9 @@ from merge_sumo.campaigns.against import AGAINST
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
-from merge_sumo.studies.versions import Change, compare_against
+from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.values.chance import by_case
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
@@ -53,12 +53,15 @@ def write_junit(
     path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> None:
     """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written."""
-    text = etree.tostring(
-        junit(run, facts, verdict, gates),
-        xml_declaration=True,
-        encoding="UTF-8",
-        pretty_print=True,
-    )
+    _write(path, junit(run, facts, verdict, gates))
+
+
+def _write(path: Path, root: etree._Element) -> None:
+    suites = root.findall("testsuite")
+    for key in ("tests", "failures", "errors"):
+        root.set(key, str(sum(int(suite.get(key, "0")) for suite in suites)))
+    root.set("time", f"{sum(float(suite.get('time', '0')) for suite in suites):.1f}")
+    text = etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
     write_new(path, text, "--junit")
 
 
@@ -77,10 +80,6 @@ def junit(
             if outcome.case.level == level:
                 _case(suite, outcome, shares.get(outcome.index, ""))
         _count(suite)
-    suites = root.findall("testsuite")
-    for key in ("tests", "failures", "errors"):
-        root.set(key, str(sum(int(suite.get(key, "0")) for suite in suites)))
-    root.set("time", f"{sum(float(suite.get('time', '0')) for suite in suites):.1f}")
     return root
 
 
@@ -105,17 +104,36 @@ def _gates(
 def _against(root: etree._Element, run: Run) -> None:
     """Add what changed from the version that a campaign is against, if it is against one."""
     compared = compare_against(run)
-    if compared is None:
-        return
-    earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
-    suite = etree.SubElement(root, "testsuite", name=f"against {earlier}")
-    for one in compared.cases:
-        name = f"case {one.index}: {described(one.case)}"
-        time_s = 0.0 if one.b is None else one.b.measures.t_end_s
-        test = _test(suite, name, f"{CLASS}.against", time_s)
-        if one.change is Change.BROKE:
-            _wrong(test, "failure", REGRESSION, one.became)
+    if compared is not None:
+        earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
+        _step(root, f"against {earlier}", compared.steps[0])
+
+
+def _step(root: etree._Element, name: str, step: Step) -> None:
+    """Add a suite of the cases that two versions ran, and of regions of failures that broke."""
+    suite = etree.SubElement(root, "testsuite", name=name)
+    for one in step.cases:
+        if one.change is not Change.BOTH:
+            case = f"case {one.b.index}: {described(one.b.case)}"
+            test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
+            if one.change is Change.BROKE:
+                _wrong(test, "failure", REGRESSION, one.became)
+    for level, regions in step.regions.items():
+        for region in regions:
+            where = f"region at POV level {level_name(level)}: {region.where}"
+            test = _test(suite, where, f"{CLASS}.against", 0.0)
+            if region.change is Change.BROKE:
+                _wrong(test, "failure", REGRESSION, f"{counted(region.failures, 'failure')}")
     _count(suite)
+
+
+def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
+    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
+    root = etree.Element("testsuites", name="merge-sumo compare")
+    for step in compared.steps:
+        before, after = (compared.versions[n - 1] for n in (step.before, step.after))
+        _step(root, printable(f"{before.folder} to {after.folder}"), step)
+    _write(path, root)
 
 
 def _case(suite: etree._Element, outcome: Outcome, runs: str) -> None:

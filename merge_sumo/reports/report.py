@@ -21,11 +21,11 @@ from markupsafe import Markup
 from merge_sumo.analysis.summary import Summary
 from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
+from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import head_words, sections_of, shared_words
-from merge_sumo.reports.version_pages import AGAINST_PAGE, write_against
 from merge_sumo.system.folders import cannot_write, check_own, replace_own
 from merge_sumo.system.workers import Workers
 

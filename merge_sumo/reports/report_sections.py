@@ -24,13 +24,13 @@ from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
+from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_levels import levels_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
-from merge_sumo.reports.version_pages import AGAINST_PAGE
+from merge_sumo.studies.comparison import compare_against
 from merge_sumo.studies.stress import NOTHING
-from merge_sumo.studies.versions import Change, compare_against
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.registry import Registry
 from merge_sumo.values.fmc import radius_for
@@ -215,12 +215,11 @@ def _against(model: ReportModel) -> dict[str, Any] | None:
     compared = compare_against(model.run)
     if compared is None:
         return None
-    levels = compared.levels.items()
     return {
         "earlier": _shown(model.run.settings["against"]),
         "page": AGAINST_PAGE,
-        "rows": [(level_name(level), one, one.changes) for level, one in levels],
-        "change": Change,
+        "headline": compared.headline,
+        "transitions": compared.steps[0].transitions,
     }
 
 

@@ -18,7 +18,7 @@ settings.json           in the folder of a repair: what was asked
 trials.jsonl            one line per trial, in their order, synced
 campaign-1/             the fresh campaign of the first round
 repair.json             the result
-repair.html             its page, and changes.html that of the last comparison
+repair.html             its page, and changes.html that of the comparison with today's values
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
 from importlib.metadata import version
 from importlib.util import find_spec
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Final
@@ -40,18 +40,22 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import numpy as np
 from msgspec import Meta, field
 
+from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.summary import summarise
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, Run, spread_failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.studies.versions import Change, RunComparison
+from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import add_to, make_folder, replace_own
+from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, decode, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
+from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.parameters import Range, spec_with
 from merge_sumo.vuts.registry import VutFactory, values_of
@@ -79,6 +83,8 @@ change: between the cases that ran are others. Chosen, not tuned."""
 NEIGHBOURS: Final = 10
 """Cases that each failure of a fresh campaign brings to the next round besides itself. Chosen, not
 tuned: without any, four failures of design2 moved a threshold by 1 %, just past these four."""
+MOST_INDICES: Final = 30
+"""Indices of cases that a sentence names."""
 MOST_AGAINST: Final = 40
 """Failures of a fresh campaign that join the next round: the worst of each region, the second of
 each, and so on."""
@@ -169,29 +175,45 @@ class RepairSettings:
 
 @dataclass(frozen=True, slots=True)
 class Round:
-    """A round: what was chosen, and what the fresh campaign says of it.
+    """A round: what was chosen, and what a fresh campaign says of it.
 
     Attributes:
         chosen: the trial, with all cases; None where no trial is better than today's values.
         campaign: the fresh campaign.
-        compared: the campaign before (A) and the fresh one (B).
+        compared: what its cases are with today's values, and with the chosen ones.
+        fmc: FMC of the failures of the fresh campaign, summed over the levels.
     """
 
     chosen: Trial | None
     campaign: Run | None = None
-    compared: RunComparison | None = None
+    compared: Comparison | None = None
+    fmc: float = 0.0
 
-    def fmc(self) -> float:
-        """Return the FMC of the fresh campaign's failures, summed over the levels."""
-        known = {} if self.compared is None else self.compared.levels
-        return sum(level.fmc_b for level in known.values())
+    @property
+    def broke(self) -> int:
+        """Number of cases of the fresh campaign that pass with today's values alone."""
+        return 0 if self.compared is None else self.compared.broke
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        if self.chosen is None or self.campaign is None or self.compared is None:
+            return {"values": None}
+        return {
+            "values": self.chosen.values,
+            "campaign": str(self.campaign.folder),
+            "cases": len(self.campaign.outcomes),
+            "failures": sum(not passes(outcome) for outcome in self.campaign.outcomes),
+            "fmc": {level_name(level): row for level, row in self.compared.fmc().items()},
+            "broke": self.broke,
+        }
 
 
-@dataclass(frozen=True, slots=True)
-class Repair:
-    """What a repair found.
+@dataclass(frozen=True, slots=True, repr=False)
+class Repair(Result):
+    """Values of a controller's parameters that repair it, or that there are none.
 
     Attributes:
+        folder: folder of the repair.
         vut: the controller as it is.
         settings: what was asked.
         today: today's values.
@@ -201,6 +223,7 @@ class Repair:
         trials: all trials, in their order.
     """
 
+    folder: Path
     vut: str
     settings: RepairSettings
     today: Mapping[str, float]
@@ -213,7 +236,7 @@ class Repair:
     def best(self) -> Round:
         """The round that counts: that whose fresh campaign has the least FMC, over all levels."""
         tested = [one for one in self.rounds if one.chosen is not None]
-        return min(reversed(tested), key=Round.fmc, default=Round(None))
+        return min(reversed(tested), key=attrgetter("fmc"), default=Round(None))
 
     @property
     def chosen(self) -> Trial | None:
@@ -233,16 +256,9 @@ class Repair:
         return tuple(index for index in self.chosen.fails if index < self.cases)
 
     @property
-    def broke(self) -> int:
-        """Number of cases of its fresh campaign that fail, and pass with today's values."""
-        compared = self.best.compared
-        return 0 if compared is None else sum(c.change is Change.BROKE for c in compared.cases)
-
-    @property
     def verified(self) -> bool:
-        """Whether values were found and the fresh campaign shows nothing that broke or grew."""
-        compared = self.best.compared
-        return compared is not None and not self.broke and not compared.worse(0.0)
+        """Whether values were found, and no case of the fresh campaign broke by them."""
+        return self.best.compared is not None and not self.best.compared.worse
 
     def change(self, trial: Trial) -> float:
         """Return by how much a trial changes today's values."""
@@ -258,6 +274,73 @@ class Repair:
             for trial, own in zip(held, aims, strict=True)
             if not any(other != own and _no_worse(other, own) for other in aims)
         ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `repair.json` holds, and `--json` prints."""
+        chosen, ranges = self.chosen, self.settings.ranges
+        values = {} if chosen is None else chosen.values
+        return {
+            "folder": str(self.folder),
+            "vut": self.vut,
+            "repaired": self.spec,
+            "verified": self.verified,
+            "parameters": [
+                {**asdict(one), "today": self.today[one.name], "repaired": values.get(one.name)}
+                for one in ranges
+            ],
+            "cost": self.settings.cost.value,
+            "cases": self.cases,
+            "failing": list(self.failing),
+            "stays": list(self.stays),
+            "extra": {} if chosen is None else chosen.extra,
+            "change": None if chosen is None else self.change(chosen),
+            "broke": self.best.broke,
+            "rounds": [one.to_record() for one in self.rounds],
+            "trials": len(self.trials),
+            "pareto": [to_plain(trial) for trial in self.pareto()],
+            "seed": self.settings.seed,
+        }
+
+    def lines(self) -> list[str]:
+        """Return the values, what they cost, what a fresh campaign says, and the command."""
+        chosen, page = self.chosen, f"page: {self.folder / PAGE}"
+        failing = f"{counted(len(self.failing), 'case')} of {self.cases}"
+        if chosen is None:
+            return [
+                f"{self.vut}: no values in these ranges let any of the {failing} pass that do not "
+                "today, unless others fail that pass",
+                f"  these stay: {_indices(self.stays)}",
+                page,
+            ]
+        stays = f", {len(self.stays)} still do not: {_indices(self.stays)}" if self.stays else ""
+        lines = [
+            f"{self.vut}: {failing} did not pass; with other values "
+            f"{len(self.failing) - len(self.stays)} of them pass{stays}; none that passed fails"
+        ]
+        for one in self.settings.ranges:
+            today, value = self.today[one.name], chosen.values[one.name]
+            lines.append(f"  {one.name}: {today:g}" + (f" -> {value:g}" if value != today else ""))
+        extra = (
+            f"{chosen.extra[cost]:+.2f} {unit} of {cost}" for cost, (_, unit) in MEASURED_BY.items()
+        )
+        lines.append(f"  cost, mean of a case: {', '.join(extra)}")
+        for number, tested in enumerate(self.rounds, start=1):
+            if tested.campaign is not None and tested.compared is not None:
+                cases = counted(len(tested.campaign.outcomes), "case")
+                lines.append(
+                    f"fresh campaign {number}, {cases}: with today's values and the new ones "
+                    f"{tested.compared.headline}"
+                )
+        if not self.verified:
+            lines.append(f"not verified: {counted(self.best.broke, 'case')} broke")
+        spec = quoted(self.spec or "")
+        return [*lines, f"the repaired controller: merge-sumo campaign --vut {spec}", page]
+
+
+def _indices(indices: Sequence[int]) -> str:
+    """Return indices of cases in words."""
+    shown = ", ".join(map(str, indices[:MOST_INDICES]))
+    return f"{shown}, the first {MOST_INDICES}" if len(indices) > MOST_INDICES else shown
 
 
 def _no_worse(one: Sequence[float], other: Sequence[float]) -> bool:
@@ -375,8 +458,8 @@ def _read(path: Path) -> bytes:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
 
 
-Fresh = Callable[[str, int], tuple[Run, RunComparison]]
-"""Runs the fresh campaign of a spec in a round, and compares the campaign before with it."""
+Fresh = Callable[[str, int], Run]
+"""Runs the fresh campaign of a spec in a round."""
 
 
 class Search:
@@ -420,8 +503,8 @@ class Search:
         self._round = 1
         self._journal: RepairJournal | None = None
 
-    def repaired(self, fresh: Fresh) -> Repair:
-        """Search, test and search again; return what was found.
+    def repaired(self, fresh: Fresh, folder: Path) -> Repair:
+        """Search, test and search again; return what was found, which is in a folder.
 
         Raises `UserError` where no case fails, and for a parameter without an effect.
         """
@@ -442,8 +525,11 @@ class Search:
                 rounds.append(Round(None))
                 break
             spec = spec_with(self._plan.vut.spec, chosen.values, self.today)
-            campaign, compared = fresh(spec, number)
-            rounds.append(Round(chosen, campaign, compared))
+            campaign = fresh(spec, number)
+            with self._opened():
+                compared = self._compared(campaign)
+            found = summarise(campaign.cases, campaign.levels).levels.values()
+            rounds.append(Round(chosen, campaign, compared, sum(one.fmc for one in found)))
             untested = [o for o in campaign.outcomes if not o.is_tested]
             against = [o.case for o in (*spread_failures(campaign.outcomes), *untested)][
                 :MOST_AGAINST
@@ -453,6 +539,7 @@ class Search:
             rng = np.random.default_rng([self._settings.seed, number, 1])
             self.cases += with_neighbours(against, rng)
         return Repair(
+            folder=folder,
             vut=self._plan.vut.spec,
             settings=self._settings,
             today=self.today,
@@ -468,8 +555,17 @@ class Search:
             yield
         self._workers = None
 
+    def _compared(self, campaign: Run) -> Comparison:
+        """Compare a fresh campaign with today's values in the same cases."""
+        cases = [outcome.case for outcome in campaign.outcomes]
+        today = [
+            replace(before, index=after.index)
+            for before, after in zip(self._run(self._plan, cases), campaign.outcomes, strict=True)
+        ]
+        return compare_outcomes(today, campaign, self._plan.vut.spec)
+
     def _passed(self, index: int) -> bool:
-        return _passes(self._before[index])
+        return passes(self._before[index])
 
     def _run_today(self) -> None:
         """Run the cases that have not run with today's values."""
@@ -478,7 +574,9 @@ class Search:
 
     def _outcomes(self, plan: SimulationPlan, indices: Sequence[int]) -> list[Outcome]:
         """Return the outcomes of cases by their numbers, in order."""
-        cases = [self.cases[index] for index in indices]
+        return self._run(plan, [self.cases[index] for index in indices])
+
+    def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
         ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
         return [outcome for _, outcome in sorted(ran, key=itemgetter(0))]
 
@@ -583,8 +681,8 @@ class Search:
         return Trial(
             wanted.round,
             wanted.values,
-            fails=tuple(i for i, old, now in pairs if not _passes(old) and not _passes(now)),
-            broke=tuple(i for i, old, now in pairs if _passes(old) and not _passes(now)),
+            fails=tuple(i for i, old, now in pairs if not passes(old) and not passes(now)),
+            broke=tuple(i for i, old, now in pairs if passes(old) and not passes(now)),
             extra={
                 cost: fmean(_of(now, name) - _of(old, name) for old, now in both) if both else 0.0
                 for cost, (name, _) in MEASURED_BY.items()
@@ -664,11 +762,6 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
     return found
 
 
-def _passes(outcome: Outcome) -> bool:
-    """Return whether the VUT reached M and the case is no failure."""
-    return outcome.is_tested and not outcome.failed
-
-
 def _of(outcome: Outcome, name: str) -> float:
     return float(outcome.measures.value(name) or 0.0)
 
@@ -676,57 +769,3 @@ def _of(outcome: Outcome, name: str) -> float:
 def _outcomes_of(results: CaseResults) -> list[Outcome]:
     """Return the outcomes of a chunk, without motions."""
     return [result.outcome(0) for result in results]
-
-
-def record_of_repair(repair: Repair) -> dict[str, Any]:
-    """Return what `repair.json` holds."""
-    chosen = repair.chosen
-    return {
-        "vut": repair.vut,
-        "repaired": repair.spec,
-        "verified": repair.verified,
-        "parameters": [
-            {
-                "name": one.name,
-                "low": one.low,
-                "high": one.high,
-                "today": repair.today[one.name],
-                "repaired": None if chosen is None else chosen.values[one.name],
-            }
-            for one in repair.settings.ranges
-        ],
-        "cost": repair.settings.cost.value,
-        "cases": repair.cases,
-        "failing": list(repair.failing),
-        "stays": list(repair.stays),
-        "extra": {} if chosen is None else chosen.extra,
-        "change": None if chosen is None else repair.change(chosen),
-        "broke": repair.broke,
-        "rounds": [_round_record(one) for one in repair.rounds],
-        "trials": len(repair.trials),
-        "pareto": [to_plain(trial) for trial in repair.pareto()],
-        "seed": repair.settings.seed,
-    }
-
-
-def _round_record(one: Round) -> dict[str, Any]:
-    if one.chosen is None or one.campaign is None or one.compared is None:
-        return {"values": None}
-    return {
-        "values": one.chosen.values,
-        "campaign": str(one.campaign.folder),
-        "cases": len(one.campaign.outcomes),
-        "failures": sum(not _passes(outcome) for outcome in one.campaign.outcomes),
-        "levels": {
-            str(level): {"fmc_before": of.fmc_a, "fmc_after": of.fmc_b, "fmc_broke": of.fmc_broke}
-            for level, of in one.compared.levels.items()
-        },
-    }
-
-
-def write_repair(repair: Repair, folder: Path) -> Path:
-    """Write the result into the folder of a repair, and return its path."""
-    path = folder / RESULT
-    content = json.dumps(record_of_repair(repair), indent=1, allow_nan=False) + "\n"
-    replace_own(path, content.encode())
-    return path

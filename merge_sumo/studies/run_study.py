@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.campaigns.store import FILES, Run
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.system.hashing import files_now
 from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
+from merge_sumo.values.scenario import level_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,21 @@ class RunStudy:
             if run.settings.get(name) != today[name]:
                 raise UserError(f"{run.folder} was run with {difference}")
         notice_changes(run, self.plan)
+
+    def check_same_road(self, levels: Iterable[int]) -> None:
+        """Raise `UserError` where the campaign had another net, or other POVs at these levels."""
+        run, road = self.run, self.plan.road
+        if run.settings.get("net_sha256", road.sha256) != road.sha256:
+            raise UserError(
+                f"{run.folder} was run on another net than {road.path} is now: put that back"
+            )
+        today = self.record()
+        for level in levels:
+            if not same_pov(run.settings, today, level):
+                raise UserError(
+                    f"{run.folder} was run against another POV of level {level_name(level)} than "
+                    "today's: give its policies"
+                )
 
 
 def notice_changes(run: Run, plan: SimulationPlan) -> None:

@@ -1,8 +1,9 @@
 """Which verdicts of a campaign hang by a thread: its cases run again, each time a little otherwise.
 
-Every rung of the ladder changes one thing that the simulation leaves out or simplifies (`RUNGS`),
-and runs the recorded cases again. A failure is robust where it fails on every rung; a verdict
-flips where a case that failed passes, or the other way round, or has no verdict any more.
+Every rung of the ladder (`RUNGS`) is a change of the plan or of the cases: one thing that the
+simulation leaves out or simplifies. The recorded cases run again with each. A failure is robust
+where it fails on every rung; a verdict flips where a case that failed passes, or the other way
+round, or has no verdict any more.
 
 stress.json             in the folder of a campaign: by rung, the cases whose verdicts flip
 
@@ -21,13 +22,15 @@ from typing import Annotated, Any, Final
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.store import failures
 from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record, read_record, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -91,21 +94,19 @@ class Rung(Record, frozen=True):
         return sum(index in (*run.passes, *run.without_verdict) for run in self.runs)
 
 
-class Stress(Record, frozen=True):
+class Stress(Result, Record, frozen=True):
     """What a stress test of a campaign found.
 
     Attributes:
         cases: recorded cases with a verdict: those that ran again.
         failures: indices of those that had failed, the worst first.
         rungs: what became of them on each rung.
-        seed: of what is drawn at random.
         vut: name of the VUT.
     """
 
     cases: int
     failures: tuple[Index, ...]
     rungs: tuple[Rung, ...]
-    seed: int
     vut: str
 
     @property
@@ -137,8 +138,10 @@ class Stress(Record, frozen=True):
         if not fragile:
             return text
         shown = ", ".join(f"{i} ({self.passes_in(i)})" for i in fragile[:LISTED])
-        more = f" and {len(fragile) - LISTED} more" if len(fragile) > LISTED else ""
-        return f"{text}; others, with the number of runs in which they do not fail: {shown}{more}"
+        return (
+            f"{text}; others, with the number of runs in which they do not fail"
+            f"{cut(len(fragile), LISTED)}: {shown}"
+        )
 
     def passes_in(self, index: int) -> int:
         """Return in how many runs of all rungs a failure does not fail."""
@@ -149,6 +152,28 @@ class Stress(Record, frozen=True):
         verdicts = self.cases * len(rung.runs)
         return rung.flips / verdicts if verdicts else None
 
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        plain: dict[str, Any] = to_plain(self)
+        return {**plain, "robust": self.robust, "fragile": self.fragile}
+
+    def lines(self) -> list[str]:
+        """Return a table of the rungs, and which failures are robust."""
+        lines = [
+            f"{counted(self.cases, 'case')} of {self.vut}, {len(self.failures)} of them "
+            f"failures, {self.runs} times each",
+            "   flips  now pass  now fail  no verdict  what is changed",
+        ]
+        for rung in self.rungs:
+            if rung.skipped:
+                lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
+                continue
+            passes, fails, without = rung.counts
+            numbers = f"{passes:10d}{fails:10d}{without:12d}"
+            drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
+            lines.append(f"{self.share(rung) or 0.0:8.1%}{numbers}  {rung.about}{drawn}")
+        return [*lines, self.sentence]
+
 
 def stress_of(folder: Path) -> Stress | None:
     """Return what the folder of a campaign says of a stress test; None where it says nothing.
@@ -156,17 +181,6 @@ def stress_of(folder: Path) -> Stress | None:
     Raises `UserError` for a file that is not as it was written.
     """
     return read_record(folder / STRESS, Stress)
-
-
-def check_stress_of(run: Run, known: Stress) -> None:
-    """Raise `UserError` where a stress test is of other cases than a run; it may have more."""
-    tested = [outcome for outcome in run.cases if outcome.is_tested][: known.cases]
-    failing = tuple(outcome.index for outcome in failures(tested))
-    if (run.vut, len(tested), failing) != (known.vut, known.cases, known.failures):
-        raise UserError(
-            f"{run.folder / STRESS} is of another campaign, or of cases that {run.folder} no "
-            f"longer has: run `merge-sumo stress {quoted(run.folder)}` again"
-        )
 
 
 # The ladder.
@@ -202,8 +216,8 @@ ERROR_X_M: Final = 0.5
 ERROR_V_MPS: Final = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
 CAR_LENGTH_M: Final = 5.0
-DEFAULT_DRAWS: Final = 5
-MOST_DRAWS: Final = 1000
+DRAWS: Final = 5
+"""Times that all cases run where a change is drawn at random, with the seed of the case."""
 ERRORS_BY_UNIT: Final = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
 OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
 """Coordinates that are no state of another car."""
@@ -282,22 +296,11 @@ RUNGS: Final = (
 """The ladder; the first rung shows whether cases repeat at all."""
 
 
-def stress(study: RunStudy, *, draws: int = DEFAULT_DRAWS, seed: int = 0) -> Stress:
+def stress(study: RunStudy) -> Stress:
     """Run the cases of a campaign on every rung, and write what becomes of them into its folder.
 
-    Args:
-        study: the campaign, and how its cases run.
-        draws: times that all cases run on a rung that draws at random.
-        seed: of the draws; the same for a case wherever it runs.
-
-    Raises:
-        UserError: for numbers that make no sense, and for a campaign without a verdict, or with a
-            net or policies of another day.
+    Raises `UserError` for a campaign without a verdict, or with a net or policies of another day.
     """
-    if not 1 <= draws <= MOST_DRAWS:
-        raise UserError(f"--draws is {draws}: it must be 1 to {MOST_DRAWS:,}")
-    if seed < 0:
-        raise UserError(f"--seed is {seed}: it must be 0 or more")
     study.check_same_system()
     run = study.run
     tested = [outcome for outcome in run.cases if outcome.is_tested]
@@ -305,60 +308,52 @@ def stress(study: RunStudy, *, draws: int = DEFAULT_DRAWS, seed: int = 0) -> Str
         raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
     with workers_or_here(study.workers) as opened:
         plan = study.plan.for_cases(len(tested))
-        ladder = _Ladder(plan, tested, draws, seed, opened, study.on_cases)
-        rungs = tuple(map(ladder.rung, RUNGS))
+        rungs = tuple(_rung(study, plan, tested, change, opened) for change in RUNGS)
     failing = tuple(outcome.index for outcome in failures(tested))
-    found = Stress(len(tested), failing, rungs, seed, run.vut)
+    found = Stress(len(tested), failing, rungs, run.vut)
     content = json.dumps(to_plain(found), indent=1, allow_nan=False) + "\n"
     replace_own(run.folder / STRESS, content.encode())
     return found
 
 
-def runs_of(change: Change, draws: int) -> int:
+def runs_of(change: Change) -> int:
     """Return how many times all cases run for a change."""
-    return 1 if change.case is None else draws
+    return 1 if change.case is None else DRAWS
 
 
-class _Ladder:
-    def __init__(
-        self,
-        plan: SimulationPlan,
-        tested: Sequence[Outcome],
-        draws: int,
-        seed: int,
-        workers: Workers,
-        on_cases: Callable[[int], None],
-    ) -> None:
-        self._plan, self._tested, self._draws, self._seed = plan, tested, draws, seed
-        self._workers, self._on_cases = workers, on_cases
+def _rung(
+    study: RunStudy,
+    plan: SimulationPlan,
+    tested: Sequence[Outcome],
+    change: Change,
+    workers: Workers,
+) -> Rung:
+    """Run all cases with a change; one that cannot be is skipped with its reason."""
+    runs = runs_of(change)
+    flips: list[Flips] = []
+    try:
+        changed = change.plan(plan)
+        for draw in range(runs):
+            cases = [_case(o.case, change, draw, changed.scenario) for o in tested]
+            found: dict[int, Verdict] = {}
+            for place, verdict in evaluate(changed, cases, workers, keep=_verdicts):
+                found[place] = verdict
+                study.on_cases(1)
+            flips.append(flips_of(tested, found))
+    except UserError as error:
+        if change is NOTHING:
+            raise
+        study.on_cases((runs - len(flips)) * len(tested))
+        return Rung(change.name, change.about, change.source, (), str(error))
+    return Rung(change.name, change.about, change.source, tuple(flips))
 
-    def rung(self, change: Change) -> Rung:
-        """Run all cases with a change; one that cannot be is skipped with its reason."""
-        runs = runs_of(change, self._draws)
-        try:
-            flips = tuple(self._run(change, draw) for draw in range(runs))
-        except UserError as error:
-            if change is NOTHING:
-                raise
-            self._on_cases(runs * len(self._tested))
-            return Rung(change.name, change.about, change.source, (), str(error))
-        return Rung(change.name, change.about, change.source, flips)
 
-    def _run(self, change: Change, draw: int) -> Flips:
-        plan = change.plan(self._plan)
-        cases = [self._case(o.case, change, draw, plan.scenario) for o in self._tested]
-        found: dict[int, Verdict] = {}
-        for place, verdict in evaluate(plan, cases, self._workers, keep=_verdicts):
-            found[place] = verdict
-            self._on_cases(1)
-        return flips_of(self._tested, found)
-
-    def _case(self, case: Case, change: Change, draw: int, scenario: Scenario) -> Case:
-        if scenario is not case.scenario:
-            case = replace(case, scenario=scenario)
-        if change.case is None:
-            return case
-        return change.case(case, np.random.default_rng([self._seed, draw, case.seed]))
+def _case(case: Case, change: Change, draw: int, scenario: Scenario) -> Case:
+    if scenario is not case.scenario:
+        case = replace(case, scenario=scenario)
+    if change.case is None:
+        return case
+    return change.case(case, np.random.default_rng([draw, case.seed]))
 
 
 def _verdicts(results: CaseResults) -> list[Verdict]:

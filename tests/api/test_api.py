@@ -123,9 +123,9 @@ class TestWrongValues:
         with pytest.raises(UserError, match="it must be a whole number"):
             ms.truth("design2", 0, **values)
 
-    def test_of_a_history(self, run):
+    def test_of_a_comparison(self, run):
         with pytest.raises(UserError, match="give several campaigns in a list"):
-            ms.history(str(run.folder))
+            ms.compare(str(run.folder))
 
 
 def test_numbers_of_arrays_are_numbers(tmp_path):
@@ -141,7 +141,7 @@ def test_numbers_of_arrays_are_numbers(tmp_path):
 
 
 def test_one_index_is_as_good_as_a_list(run, tmp_path):
-    assert len(ms.rerun(run.folder, 3).before) == 1
+    assert len(ms.rerun(run.folder, 3).steps[0].cases) == 1
     (path,) = ms.export(run.folder, 3, out=tmp_path / "scenarios")
     assert path.is_file()
 

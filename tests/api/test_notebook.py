@@ -122,9 +122,8 @@ def test_an_interrupted_campaign_says_how_to_go_on_and_does(notebook):
     [
         ("ms.run_case(MyVut, level=0, x_pov0_m=-300, v_pov0_mps=33)", "<case: "),
         ("ms.truth(MyVut, 0, cases=20)", "<Truth: "),
-        ("ms.compare_runs('whole', 'whole', rerun=False)", "<RunComparison: level 0: FMC "),
-        ("ms.history(['whole', 'whole'], out='history.html')", "<History: FMC went at "),
-        ("ms.rerun('whole', [0, 1], vut=MyVut)", "<Rerun: recorded: "),
+        ("ms.compare(['whole', 'whole'], out='page.html')", "<Comparison: 0 cases broke"),
+        ("ms.rerun('whole', [0, 1], vut=MyVut)", "<Comparison: "),
         ("ms.open_run('whole').trajectory(0)", "<Trajectory: 2 vehicles, "),
         ("ms.export('whole', [0])", "[PosixPath('whole/scenarios/case-00000/replay.sumocfg')]"),
     ],

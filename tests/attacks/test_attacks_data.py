@@ -101,7 +101,7 @@ class Disk:
             "resume": ("campaign", "--resume", self.folder, "--json", "-q"),
             "export": ("export", self.folder, 0, 7, 59, "--out", self.root / "new"),
             "export csv": ("export", self.folder, *("--format", "csv", "--out"), self.root / "new"),
-            "compare-runs": ("compare-runs", self.folder, self.other, "--no-rerun", "--json"),
+            "compare": ("compare", self.folder, self.other, "--json"),
             "probability": (
                 *("probability", self.folder, "--cases", 3, "--json", "--out"),
                 self.root / "p.json",
@@ -115,7 +115,7 @@ class Disk:
         return code, err, found
 
 
-COMMANDS = ("report", "resume", "export", "export csv", "compare-runs", "probability")
+COMMANDS = ("report", "resume", "export", "export csv", "compare", "probability")
 
 
 @pytest.mark.long
@@ -451,9 +451,17 @@ class TestATextOfAStranger:
         folder = received(honest, tmp_path / "run", TEXTS[name])
         ended = {}
         for arguments in (
-            ("compare-runs", folder, honest, "--no-rerun"),
-            ("compare-runs", folder, honest, "--no-rerun", "--json"),
-            ("compare-runs", honest, folder),
+            ("compare", folder, honest),
+            ("compare", folder, honest, "--json"),
+            (
+                "compare",
+                honest,
+                folder,
+                "--out",
+                tmp_path / "c.html",
+                "--junit",
+                tmp_path / "c.xml",
+            ),
             ("campaign", "--resume", folder, "-q", "--junit", tmp_path / "junit.xml"),
             ("probability", folder, "--cases", 4),
             ("export", folder, 7),
@@ -501,9 +509,9 @@ def test_half_a_character_is_refused_in_a_sentence(half, honest, tmp_path):
     for file in (OUTCOMES, SETTINGS):
         content = (folder / file).read_bytes()
         (folder / file).write_bytes(content.replace(b"MARKED", half.encode()))
-        for command in ("report", "campaign", "export", "compare-runs", "probability"):
+        for command in ("report", "campaign", "export", "compare", "probability"):
             first = ("--resume",) if command == "campaign" else ()
-            more = {"export": (7,), "compare-runs": (honest, "--no-rerun")}.get(command, ())
+            more = {"export": (7,), "compare": (honest,)}.get(command, ())
             code, _, err = call(command, *first, folder, *more)
             assert code == 2, err
             assert file in err or command == "campaign", "which asks for the VUT first"

@@ -173,7 +173,7 @@ class TestAFolderThatIsReadOnly:
         ):
             assert_refused(ended(*arguments), "cannot write")
         for allowed in (
-            ("compare-runs", "run", "run", "--no-rerun"),
+            ("compare", "run", "run"),
             ("export", "run", "59", "--out", "elsewhere"),
             ("probability", "run", "--cases", "4", "--out", "p.json"),
         ):

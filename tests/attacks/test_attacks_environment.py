@@ -38,12 +38,11 @@ COMMANDS = {
     "campaign --vut own.py:Vut --level 0 --cases 4 --out new": 0,
     "run --vut design1 --level 0 --x -200 --v 30 --out new": None,
     "report run": 0,
-    "compare-runs run run": 0,
+    "compare run run": 0,
     "export run --format csv --out new": 0,
     "rerun run --out new": 0,
     "check-vut --vut design1": 0,
     "probability --vut design1 --level 0 --cases 20 --out new": 0,
-    "history . --out new.html": None,
     "truth --vut design1 --level 0 --cases 100 --out new": None,
     "compare --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform --out new": None,
 }

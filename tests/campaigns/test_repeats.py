@@ -25,8 +25,8 @@ from merge_sumo.campaigns.settings import CampaignSettings, controllers
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
+from merge_sumo.studies.comparison import rerun, settings_today
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.versions import rerun, settings_today
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End

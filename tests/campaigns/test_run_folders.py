@@ -86,9 +86,7 @@ class TestARunFolder:
             assert_refused(said, "a run folder names no code to run: name it again, --vut SPEC")
         for command in (("report", "run"), ("replay", "run", 0)):
             assert command_line(*command)[0] == 0
-        code, out, _ = command_line("compare-runs", "run", "run")
-        assert code == 0
-        assert "was not run again" in out or "had nothing to run" in out
+        assert command_line("compare", "run", "run")[0] == 0
         assert not ran(mine)
 
     @pytest.mark.parametrize("by", ["copied", "moved"])

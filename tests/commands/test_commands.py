@@ -81,7 +81,7 @@ class TestOptions:
             for option in ("as_json", "quiet", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
-        again = {"explain", "repair", "stress"}
+        again = {"explain", "repair"}
         fresh = {*again, "probability"}
         runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}

@@ -270,7 +270,7 @@ class TestSettings:
         delays = [row["sense_delay_s"] for row in run.cases]
         assert 0.0 <= min(delays) < 0.2
         assert 0.3 < max(delays) <= 0.5
-        assert ms.rerun(run).changed == []
+        assert not ms.rerun(run).worse
         again = ms.run_case(recorded=(run, 3))
         assert again.measures == run.run.outcome(3).measures
         assert "sensing delay" in run.report().read_text(encoding="utf-8")

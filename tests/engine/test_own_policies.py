@@ -221,16 +221,6 @@ class TestOtherCommands:
         assert code == 0
         assert json.loads(out)["fmc"] == found[1]["truth_fmc"]
 
-    def test_two_campaigns_against_the_same_povs_are(self, call, same, swapped, tmp_path):
-        for name, folder in (("a", None), ("b", same)):
-            run_campaign(settings(folder, cases=100, batch=50), tmp_path / name)
-        pair = (tmp_path / "a", tmp_path / "b")
-        assert call("compare-runs", *pair)[0] == 0
-        assert call("compare-runs", *pair, "--policies", same)[0] == 0
-        code, out, _ = call("compare-runs", *pair, "--policies", swapped)
-        assert code == 0
-        assert "does not do again what case" in out
-
     @pytest.mark.slow
     def test_a_probability_is_of_the_policies_of_its_campaign(self, call, same, swapped, tmp_path):
         run_campaign(settings(swapped), tmp_path / "run")

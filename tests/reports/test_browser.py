@@ -24,12 +24,12 @@ from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.store import Run, failures, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
+from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.version_pages import comparison_page, write_page
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.comparison import compare
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
-from merge_sumo.studies.versions import compare_runs
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.scenario import POV, US23
 
@@ -117,9 +117,9 @@ def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
     browser, made, tmp_path, options
 ):
     other = write_run(tmp_path / "other", 20, vut=EVIL, error=EVIL)
-    compared = compare_runs(made, other, rerun=False)
     file = tmp_path / "compared.html"
-    write_page(comparison_page(compared, made, other, {}), file)
+    compared = comparison_page(compare([made, other]), [made, other])
+    file.write_bytes(compared.encode(errors="backslashreplace"))
     running = tmp_path / "running.html"
     running.write_text(report.report_page(other, learns=False, running=True), encoding="utf-8")
     for page_file in (file, running):

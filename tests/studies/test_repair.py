@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -103,7 +102,7 @@ def test_a_threshold_that_is_known_is_found_with_its_reserve(campaigns, tmp_path
     # It fails where it brakes by more than 2 m/s2: the least change of 3 is to 2.
     run = campaigns("Brakes")
     result = repair(run, ["brake=0..4"], out=tmp_path / "out", **FEW)
-    found = result.repair
+    found = result
     assert found.failing == tuple(range(20))
     assert found.stays == ()
     assert result.verified
@@ -118,7 +117,7 @@ def test_a_threshold_that_is_known_is_found_with_its_reserve(campaigns, tmp_path
     assert found.chosen.extra["braking"] == pytest.approx(chosen - 3.0)
     record = json.loads((tmp_path / "out/repair.json").read_text())
     assert record["repaired"] == found.spec
-    assert record["rounds"][0]["levels"]["0"]["fmc_after"] == 0.0
+    assert record["rounds"][0]["fmc"]["0"][1] == "0.0000"
     page = (tmp_path / "out/repair.html").read_text()
     assert f"Brakes?brake={chosen:g}" in page
     assert "default-src 'none'" in page
@@ -133,19 +132,19 @@ def test_only_the_cases_decide_on_an_attribute(campaigns, tmp_path):
     run = api.open_run(campaigns("Edge"))
     starts_m = [row["x_pov0_m"] for row in run.cases]
     failing = tuple(i for i, x_m in enumerate(starts_m) if x_m < -220.0)
-    result = repair(run, ["edge_m=-345..-200"], out=tmp_path / "out", **FEW)
-    assert result.repair.failing == failing
-    assert result.repair.stays == ()
-    assert result.repair.chosen.values["edge_m"] <= min(starts_m)
+    result = repair(run.folder, ["edge_m=-345..-200"], out=tmp_path / "out", **FEW)
+    assert result.failing == failing
+    assert result.stays == ()
+    assert result.chosen.values["edge_m"] <= min(starts_m)
 
 
 def test_a_failure_that_moves_is_no_repair(campaigns, tmp_path):
     run = campaigns("Sides")
     result = repair(run, ["side=-1..1"], out=tmp_path / "out", **FEW)
-    assert result.repair.chosen is None
-    assert result.repair.stays == result.repair.failing
+    assert result.chosen is None
+    assert result.stays == result.failing
     assert not result.verified
-    assert any(trial.broke and not trial.fails for trial in result.repair.trials)
+    assert any(trial.broke and not trial.fails for trial in result.trials)
     assert "these stay" in str(result)
     assert not (tmp_path / "out/campaign-1").exists()
     assert "No values in these ranges" in (tmp_path / "out/repair.html").read_text()
@@ -153,7 +152,7 @@ def test_a_failure_that_moves_is_no_repair(campaigns, tmp_path):
 
 def test_without_a_value_that_helps_it_says_which_cases_stay(campaigns, tmp_path):
     result = repair(campaigns("Brakes"), ["brake=2.5..4"], out=tmp_path / "out", **FEW)
-    assert result.repair.stays == tuple(range(20))
+    assert result.stays == tuple(range(20))
     assert not result.verified
 
 
@@ -253,11 +252,10 @@ def test_the_round_with_the_least_fmc_counts():
     settings = mending.RepairSettings((Range("a", 0.0, 1.0),))
 
     def tested(a: float, fmc_b: float) -> Round:
-        levels = {level: SimpleNamespace(fmc_b=fmc_b / 2.0) for level in (0, 1)}
-        return Round(Trial(1, {"a": a}), None, SimpleNamespace(levels=levels))  # type: ignore[arg-type]
+        return Round(Trial(1, {"a": a}), None, None, fmc_b)
 
     def chosen(*rounds: Round) -> Trial | None:
-        return mending.Repair("v", settings, {"a": 0.0}, (0,), 1, rounds, ()).chosen
+        return mending.Repair(Path("f"), "v", settings, {"a": 0.0}, (0,), 1, rounds, ()).chosen
 
     rounds = tested(0.1, 0.4), tested(0.2, 0.1), tested(0.3, 0.3)
     assert chosen(*rounds) is rounds[1].chosen
@@ -282,5 +280,7 @@ def test_of_trials_the_pareto_set_is_that_none_is_better_than():
 
     best = [trial(0.0, 4, 0.0), trial(0.2, 2, 0.3), trial(0.6, 0, 0.1), trial(0.4, 0, 0.5)]
     worse = [trial(0.7, 0, 0.1), trial(0.1, 0, 0.0, broke=1), trial(0.5, 3, 0.4)]
-    found = mending.Repair("v", settings, {"a": 0.0}, (0, 1, 2, 3), 4, (), (*worse, *best))
+    found = mending.Repair(
+        Path("f"), "v", settings, {"a": 0.0}, (0, 1, 2, 3), 4, (), (*worse, *best)
+    )
     assert found.pareto() == best

@@ -14,7 +14,7 @@ import merge_sumo as ms
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.studies.stress import RUNGS, STRESS, Flips, Rung, Stress, flips_of, stress_of
+from merge_sumo.studies.stress import DRAWS, RUNGS, STRESS, Flips, Rung, Stress, flips_of, stress_of
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.imperfection import Actuation
 from merge_sumo.values.scenario import US23
@@ -40,7 +40,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def found(run):
-    return ms.stress(run, draws=2).found
+    return ms.stress(run)
 
 
 def rung(found, name):
@@ -71,13 +71,16 @@ def test_the_ladder_says_which_failures_are_robust(found):
     robust = [index for index in found.failures if not any(index in some for some in passing)]
     assert list(found.robust) == robust
     assert set(found.fragile) == set(found.failures) - set(robust)
-    assert found.runs == 2 + len(RUNGS) - 1
+    assert found.runs == DRAWS + len(RUNGS) - 1
 
 
-def test_draws_differ_and_repeat(run, found):
-    assert len(set(rung(found, "start").runs)) == 2
-    assert ms.stress(run, draws=2, seed=1).found != found
-    assert ms.stress(run, draws=2).found == found
+def test_draws_differ_and_repeat(call, run, found):
+    assert len(set(rung(found, "start").runs)) > 1
+    said = call("rerun", run.folder, "--stress", "--json")
+    assert said.code == 0
+    told = json.loads(said.out)
+    assert {name: told[name] for name in to_plain(found)} == json.loads(json.dumps(to_plain(found)))
+    assert told["robust"] == list(found.robust)
 
 
 def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run, found):
@@ -113,12 +116,6 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_sentence(tmp_path,
         stress_of(tmp_path)
 
 
-@pytest.mark.parametrize("draws", [0, 1001, 99_999_999_999])
-def test_numbers_of_draws_that_make_no_sense_are_refused(run, draws):
-    with pytest.raises(UserError, match=f"--draws is {draws}: it must be 1 to 1,000"):
-        ms.stress(run, draws=draws)
-
-
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
@@ -129,22 +126,17 @@ def test_flips_by_hand(run):
     assert flips_of(both, {0: ends, 1: ends}) == Flips((), (), (failed.index, passed.index))
 
 
-def test_numbers_that_make_no_ladder_are_refused(run):
-    with pytest.raises(UserError, match="--draws is 0"):
-        ms.stress(run, draws=0)
-
-
 def test_a_scenario_with_a_lag_of_its_own_skips_the_rungs_that_add_one(tmp_path):
     scenario = replace(US23, act=Actuation(lag_s=0.3))
     own = ms.campaign("design1", cases=6, level=0, scenario=scenario, out=tmp_path / "run")
-    skipped = {one.name: one.skipped for one in ms.stress(own, draws=1).found.rungs}
+    skipped = {one.name: one.skipped for one in ms.stress(own).rungs}
     assert skipped["lag-0.2"] == "the scenario has lag_s of its own"
     assert [name for name, why in skipped.items() if why] == ["lag-0.2", "lag-0.35", "lag-0.5"]
 
 
 def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
     own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
-    skipped = {one.name: one.skipped for one in ms.stress(own, draws=1).found.rungs if one.skipped}
+    skipped = {one.name: one.skipped for one in ms.stress(own).rungs if one.skipped}
     assert skipped == {"step": "--vut sumo:Krauss drives in a SUMO world only"}
 
 

@@ -214,18 +214,9 @@ class TestTheOtherFunctions:
     def test_cases_run_again_with_another_vut(self, run):
         worst = ms.open_run(run.folder).failures[0]["index"]
         found = ms.rerun(run.folder, [worst], vut="design2")
-        assert [(c.index, c.change) for c in found.changed] == [(worst, "fixed")]
-        assert repr(found) == "<Rerun: recorded: 1 failure (1 contact) in 1 case>"
-        assert str(found).endswith(f"  case {worst}: contact -> safe (fixed)")
+        assert [(c.b.index, c.change) for c in found.steps[0].cases] == [(worst, "fixed")]
+        assert repr(found) == "<Comparison: 0 cases broke, 1 fixed>"
         assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
-
-    def test_campaigns_are_compared_by_their_folders(self, run):
-        found = ms.compare_runs(run.folder, ms.open_run(run.folder))
-        assert found.worse(0.0) == []
-        (level,) = found.levels.values()
-        fmc = f"{level.fmc_a:.4f}"
-        assert repr(found) == f"<RunComparison: level 0: FMC {fmc} -> {fmc}>"
-        assert str(found).splitlines()[1].split()[:3] == ["0", fmc, fmc]
 
     def test_cases_are_exported(self, run, tmp_path):
         (config,) = ms.export(run.folder, [3], out=tmp_path / "sumo")

@@ -167,7 +167,7 @@ def test_a_vut_that_is_registered_as_contributing_says_has_parameters(tmp_path, 
     assert of_brake.below == 2.001
     few: dict[str, Any] = {"trials": 6, "rounds": 1, **here}
     repaired = api.repair(run, ["brake_mps2=0..4"], out=tmp_path / "out", **few)
-    assert 0.0 <= repaired.repair.chosen.values["brake_mps2"] <= 2.001  # type: ignore[union-attr]
+    assert 0.0 <= repaired.chosen.values["brake_mps2"] <= 2.001  # type: ignore[union-attr]
 
 
 def test_an_option_is_set_in_the_place_of_an_older_one():

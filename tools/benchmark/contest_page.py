@@ -21,8 +21,8 @@ from jinja2 import Environment, Template
 from markupsafe import Markup
 from problems import Problem
 
+from merge_sumo.reports.comparison_page import STYLES, Frame
 from merge_sumo.reports.pages import source_of
-from merge_sumo.reports.version_pages import STYLES, Frame
 
 FRAME: Final = Frame(34.0, 352.0, 10.0, 150.0)
 PLAIN_COLOUR: Final = "#7B3294"

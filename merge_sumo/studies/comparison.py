@@ -1,0 +1,705 @@
+"""Comparison: what broke and what was fixed from each version of a VUT to the next.
+
+A version is what was recorded of it. Cases that two neighbours both ran are paired, and a case that
+passes with the earlier one and does not pass with the later one broke. Where each has cases of its
+own, regions are compared: failures that are linked at the radius of FMC, and the cases that the
+other version has within that radius of one of them.
+
+`compare` reads recorded campaigns and runs nothing. `compare_against` reads a campaign that ran
+both versions (`campaigns/against.py`). `rerun` runs the recorded cases of one campaign again with a
+changed VUT. All return a `Comparison`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from merge_sumo.analysis.coordinates import coordinates
+from merge_sumo.analysis.merging import merging_of
+from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.summary import LevelSummary, summarise
+from merge_sumo.analysis.verdict import judge
+from merge_sumo.campaigns.against import earlier_run
+from merge_sumo.campaigns.repeats import cause
+from merge_sumo.campaigns.settings import CampaignSettings, same_pov, settings_of
+from merge_sumo.campaigns.store import Run
+from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.engine.plan import versions as versions_of_packages
+from merge_sumo.errors import UserError
+from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.system.hashing import changed
+from merge_sumo.system.printable import counted, quoted
+from merge_sumo.values.case import Case, FloatArray, to_unit
+from merge_sumo.values.chance import RunsOfCase, by_case, one_per_case
+from merge_sumo.values.fmc import fmc, radius_for, regions
+from merge_sumo.values.scenario import level_name
+from merge_sumo.values.score import Outcome
+from merge_sumo.values.severity import Severity
+from merge_sumo.vuts.registry import is_built_in
+
+LISTED: Final = 10
+"""Cases of each kind, and regions, that lines name."""
+SIGNIFICANT: Final = 0.05
+"""Chance of the runs of a case in equal versions, up to which a change is none of chance."""
+ROUNDING: Final = 1e-9
+"""Share of the radius by which two points may be further apart and still count as near."""
+
+
+class Change(StrEnum):
+    """What became of a case, or of a region of failures; in the order of tables.
+
+    A case passes where the VUT arrives and the criterion is met. One whose runs are not alike may
+    pass with one version alone by chance: it is `WITHIN_CHANCE` where Fisher's exact test does not
+    tell the shares of failing runs apart.
+    """
+
+    BROKE = "broke"
+    WITHIN_CHANCE = "within chance"
+    NEITHER = "passes with neither"
+    STILL_CONTACT = "passes, and is a contact"
+    FIXED = "fixed"
+    NOT_SEEN = "not looked at"
+    BOTH = "passes with both"
+
+
+def passes(outcome: Outcome) -> bool:
+    """Return whether the VUT reached its goal and the case is no failure."""
+    return outcome.is_tested and not outcome.failed
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedCase:
+    """A case that two versions ran.
+
+    Attributes:
+        a: its outcome with the earlier version.
+        b: its outcome with the later one.
+        runs_a: its runs with the earlier one, of which `a` decides; None for a single one.
+        runs_b: its runs with the later one.
+    """
+
+    a: Outcome
+    b: Outcome
+    runs_a: RunsOfCase | None = None
+    runs_b: RunsOfCase | None = None
+
+    @property
+    def change(self) -> Change:
+        """What became of it."""
+        before, after = passes(self.a), passes(self.b)
+        if before == after:
+            return Change.BOTH if before else Change.NEITHER
+        if self.chance is not None and self.chance > SIGNIFICANT:
+            return Change.WITHIN_CHANCE
+        if before:
+            return Change.BROKE
+        # The criterion is met, but nobody would say that the case is mended.
+        is_contact = self.b.measures.severity == Severity.CONTACT
+        return Change.STILL_CONTACT if is_contact else Change.FIXED
+
+    @property
+    def chance(self) -> float | None:
+        """The chance of shares of failing runs as different as these, or more, in equal versions.
+
+        By Fisher's exact test; None where the runs with each version are alike.
+        """
+        runs = [one for one in (self.runs_a, self.runs_b) if one is not None]
+        if len(runs) < 2 or not any(one.varies for one in runs):
+            return None
+        from scipy.stats import fisher_exact
+
+        table = [[one.failures, one.runs - one.failures] for one in runs]
+        return float(fisher_exact(table)[1])
+
+    @property
+    def became(self) -> str:
+        """Both outcomes in words, with the runs of each where there are several."""
+        if self.chance is not None and self.runs_a is not None and self.runs_b is not None:
+            shares = f"{self.runs_a.in_words} -> {self.runs_b.in_words}"
+            return f"{shares}, by Fisher's exact test p = {self.chance:.2g}"
+        before, after = _word(self.a), _word(self.b)
+        if before == after and self.change is not Change.BOTH:
+            verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
+            before, after = (f"{before}, {verdict}" for verdict in verdicts)
+        return f"{before} -> {after}"
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        record: dict[str, Any] = {"change": self.change, "level": self.a.case.level}
+        sides = (("before", self.a, self.runs_a), ("after", self.b, self.runs_b))
+        for name, outcome, runs in sides:
+            found = outcome.measures
+            record[f"index_{name}"], record[f"score_{name}"] = outcome.index, outcome.score
+            record[f"end_{name}"], record[f"severity_{name}"] = found.end, found.severity
+            if runs is not None:
+                record |= {f"runs_{name}": runs.runs, f"failed_runs_{name}": runs.failures}
+        return record
+
+
+def _word(outcome: Outcome) -> str:
+    return outcome.measures.became.lower().replace("_", " ")
+
+
+def paired(
+    before: Sequence[Outcome], after: Sequence[Outcome], tolerated: float = 0.0
+) -> list[ComparedCase]:
+    """Return the cases of both, what broke first, the worst first; see `Change` for the order.
+
+    `tolerated` is the share of its runs in which a case may fail.
+    """
+    first, second = _by_case(before, tolerated), _by_case(after, tolerated)
+    cases = []
+    for key in first.keys() & second.keys():
+        (a, runs_a), (b, runs_b) = first[key], second[key]
+        cases.append(ComparedCase(a, b, runs_a, runs_b))
+    order = list(Change)
+    return sorted(cases, key=lambda c: (order.index(c.change), c.b.score or 0.0, c.b.index))
+
+
+def _by_case(
+    outcomes: Sequence[Outcome], tolerated: float
+) -> dict[tuple[Case, int], tuple[Outcome, RunsOfCase | None]]:
+    """Return the deciding run of each case, and all of them where there are several."""
+    repeated = {outcome.case.start for outcome in outcomes if outcome.case.draw}
+    runs: dict[tuple[Case, int], list[Outcome]] = {}
+    times: Counter[Case] = Counter()
+    for outcome in outcomes:
+        start = outcome.case.start
+        # A case without repeats may be there twice.
+        runs.setdefault((start, 0 if start in repeated else times[start]), []).append(outcome)
+        times[start] += 1
+    return {
+        key: (
+            one_per_case(of_case, tolerated)[0],
+            next((one for one in by_case(of_case) if one.runs > 1), None),
+        )
+        for key, of_case in runs.items()
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A region of failures of one of two neighbours, and what the other one did in it.
+
+    Attributes:
+        change: what became of it; `NOT_SEEN` where the other version has no case there.
+        version: number of the version that fails there, from 1.
+        failures: of that version, in the region.
+        worst: index of the worst of them in its campaign.
+        where: the box of these failures, in words.
+        fmc: their volume.
+        cases: cases in the region that the other version tested.
+        failed: those of them that failed.
+        looked_at: share of the volume that these cases cover.
+    """
+
+    change: Change
+    version: int
+    failures: int
+    worst: int
+    where: str
+    fmc: float
+    cases: int
+    failed: int
+    looked_at: float
+
+
+@dataclass(frozen=True)
+class Version:
+    """A version of a VUT: the outcomes that are recorded of it.
+
+    Attributes:
+        vut: name of the VUT.
+        folder: of its campaign; None where it ran in the cases of another one's.
+        outcomes: all runs.
+        tolerated: share of its runs in which a case may fail.
+        levels: POV levels.
+    """
+
+    vut: str
+    folder: str | None
+    outcomes: Sequence[Outcome]
+    tolerated: float
+    levels: Sequence[int]
+
+    @classmethod
+    def of(cls, run: Run) -> Version:
+        """Return a campaign as a version."""
+        levels = sorted({*run.levels, *(outcome.case.level for outcome in run.outcomes)})
+        return cls(run.vut, str(run.folder), run.outcomes, run.tolerated, levels)
+
+    @cached_property
+    def cases(self) -> list[Outcome]:
+        """The deciding run of each case."""
+        return one_per_case(self.outcomes, self.tolerated)
+
+    @cached_property
+    def at(self) -> dict[int, LevelSummary]:
+        """By level, what is known of it."""
+        return summarise(self.outcomes, self.levels, self.tolerated).levels
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it."""
+        levels = {level_name(level): asdict(self.at[level]) for level in self.levels}
+        counts = judge(self.cases).to_record()
+        return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What changed from a version to the next that has a level in common with it.
+
+    Attributes:
+        before: number of the earlier version, from 1.
+        after: number of the later one.
+        cases: the cases that both ran, in the order of `paired`.
+        regions: by level, what became of regions, where each has cases of its own.
+    """
+
+    before: int
+    after: int
+    cases: list[ComparedCase]
+    regions: dict[int, list[Region]]
+
+    @property
+    def transitions(self) -> dict[tuple[Change, str, str], int]:
+        """Cases by what became of them, and the outcome before and after, in words."""
+        found = Counter((one.change, _word(one.a), _word(one.b)) for one in self.cases)
+        order = list(Change)
+        return dict(sorted(found.items(), key=lambda row: (order.index(row[0][0]), -row[1])))
+
+    def count(self, change: Change, level: int | None = None) -> int:
+        """Return the number of cases of which that became, at a level or in all."""
+        return sum(
+            case.change is change for case in self.cases if level in (None, case.a.case.level)
+        )
+
+    def count_regions(self, change: Change) -> int:
+        """Return the number of regions of which that became."""
+        return sum(one.change is change for found in self.regions.values() for one in found)
+
+    def table_lines(self) -> list[str]:
+        """Return the table of transitions as lines."""
+        return [
+            f"{number:8d}  {before} -> {after} ({change})"
+            for (change, before, after), number in self.transitions.items()
+        ]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return it as JSON shows it: counts first, then each case but those that always pass."""
+        return {
+            "before": self.before,
+            "after": self.after,
+            "transitions": [
+                {"change": change, "before": before, "after": after, "cases": number}
+                for (change, before, after), number in self.transitions.items()
+            ],
+            "cases": [one.to_record() for one in self.cases if one.change is not Change.BOTH],
+            "regions": {
+                level_name(level): [asdict(region) for region in found]
+                for level, found in self.regions.items()
+            },
+        }
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Comparison(Result):
+    """Versions of a VUT, the oldest first, and what changed from each to the next.
+
+    Attributes:
+        versions: the versions.
+        steps: what changed.
+        source: a sentence on where the cases come from.
+        notes: sentences on what limits the comparison.
+        unrepeated: indices of the cases that went otherwise although the VUT is the same by its
+            name and its files; empty where it is another one.
+    """
+
+    versions: tuple[Version, ...]
+    steps: tuple[Step, ...]
+    source: str
+    notes: tuple[str, ...] = ()
+    unrepeated: tuple[int, ...] = ()
+
+    @property
+    def broke(self) -> int:
+        """Number of cases that broke in some step."""
+        return sum(step.count(Change.BROKE) for step in self.steps)
+
+    @property
+    def worse(self) -> bool:
+        """Whether a case broke, or a region of failures appeared where the version before passed.
+
+        So also where the last version was tested in no case.
+        """
+        regions = sum(step.count_regions(Change.BROKE) for step in self.steps)
+        untested = not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
+        return self.broke > 0 or regions > 0 or untested
+
+    @property
+    def headline(self) -> str:
+        """How much broke and was fixed, in a sentence."""
+        parts = []
+        for step in self.steps:
+            numbers = [f"{counted(step.count(Change.BROKE), 'case')} broke"]
+            numbers += [
+                f"{number} {change}"
+                for change in Change
+                if change is not Change.BROKE and (number := step.count(change))
+            ]
+            words = ", ".join(numbers) if step.cases else "no case is shared"
+            if step.regions:
+                shown = [
+                    f"{number} {change}"
+                    for change in Change
+                    if (number := step.count_regions(change))
+                ]
+                words += f"; regions of failures: {', '.join(shown) or 'none'}"
+            many = len(self.steps) > 1
+            parts.append(f"from {step.before} to {step.after}: {words}" if many else words)
+        return "; ".join(parts)
+
+    def lines(self) -> list[str]:
+        """Return the numbers, version by version and step by step, and the first of the cases."""
+        text = [self.headline, self.source]
+        for number, version in enumerate(self.versions, start=1):
+            verdict = judge(version.cases)
+            place = f"{version.folder} " if version.folder else "now "
+            text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
+            text += verdict.trouble_lines()
+            merging = merging_of(version.cases)
+            text += [] if merging is None else [f"  {merging.sentence}"]
+        text += [
+            f"level {level_name(level)}: FMC {' -> '.join(row)}"
+            for level, row in self.fmc().items()
+        ]
+        for step in self.steps:
+            text += self._lines_of(step)
+        return [*text, *self.notes]
+
+    def _lines_of(self, step: Step) -> list[str]:
+        named = f"from {step.before} to {step.after}"
+        text = [f"{named}: {counted(len(step.cases), 'case')} with both"] if step.cases else []
+        text += step.table_lines()
+        for change in (Change.BROKE, Change.WITHIN_CHANCE, Change.STILL_CONTACT):
+            cases = [case for case in step.cases if case.change is change]
+            text += [f"{change}{cut(len(cases), LISTED)}:"] if cases else []
+            text += [f"  case {case.b.index}: {case.became}" for case in cases[:LISTED]]
+            folder = self.versions[step.after - 1].folder
+            if cases and folder is not None:
+                text.append(f"  look at one: merge-sumo replay {quoted(folder)} {cases[0].b.index}")
+        for level, regions_there in step.regions.items():
+            shown = [one for one in regions_there if one.change is Change.BROKE]
+            at = f"regions that broke at level {level_name(level)}"
+            text += [f"{at}{cut(len(shown), LISTED)}:"] if shown else []
+            text += [
+                f"  {one.where}: {counted(one.failures, 'failure')}, the other version passed "
+                f"{counted(one.cases, 'case')} there"
+                for one in shown[:LISTED]
+            ]
+        return text
+
+    def fmc(self) -> dict[int, list[str]]:
+        """Return by level the FMC of each version as text, of its own cases; "-" for none."""
+        levels = sorted({level for version in self.versions for level in version.levels})
+        return {
+            level: [
+                f"{version.at[level].fmc:.4f}"
+                if level in version.levels and version.at[level].tested
+                else "-"
+                for version in self.versions
+            ]
+            for level in levels
+        }
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints."""
+        return {
+            "worse": self.worse,
+            "broke": self.broke,
+            "source": self.source,
+            "versions": [version.to_record() for version in self.versions],
+            "steps": [step.to_record() for step in self.steps],
+            "notes": list(self.notes),
+            "unrepeated": list(self.unrepeated),
+        }
+
+
+def cut(number: int, most: int) -> str:
+    """Return how many of a list are shown, as behind its name."""
+    return f", the first {most} of {number}" if number > most else f", {number}"
+
+
+# Recorded campaigns.
+
+
+def compare(runs: Sequence[Run]) -> Comparison:
+    """Compare recorded campaigns, the oldest first; nothing runs.
+
+    Raises `UserError` for fewer than two, and where they differ in the scenario, the criterion or,
+    at a level, the POV: then their failures are not of the same question.
+    """
+    if len(runs) < 2:
+        raise UserError("a comparison needs two campaigns or more: name the older one first")
+    for run in runs[1:]:
+        _check_comparable(runs[0], run)
+    found = [Version.of(run) for run in runs]
+    if not set.intersection(*(set(version.levels) for version in found[:2])):
+        raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
+    return Comparison(
+        versions=tuple(found),
+        steps=tuple(_step(found, number) for number in range(1, len(found))),
+        source=(
+            "each campaign has the cases of its own search: where they share none, regions say "
+            "what broke, and `merge-sumo rerun` pairs the cases of one with another VUT"
+        ),
+        notes=tuple(_notes(runs)),
+    )
+
+
+def compare_against(run: Run) -> Comparison | None:
+    """Compare a campaign's VUT with the version that the campaign is against, in the same cases.
+
+    None where it is against none.
+    """
+    earlier = earlier_run(run)
+    if earlier is None:
+        return None
+    before = Version(
+        earlier.vut,
+        str(earlier.folder),
+        earlier.outcomes[: len(run.outcomes)],
+        run.tolerated,
+        run.levels,
+    )
+    source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
+    return _comparison_of_two(before, Version.of(run), source)
+
+
+def _comparison_of_two(
+    before: Version, after: Version, source: str, notes: Iterable[str] = (), **more: Any
+) -> Comparison:
+    """Return the comparison of two versions that ran the same cases."""
+    step = _step((before, after), 1)
+    return Comparison((before, after), (step,), source, tuple(notes), **more)
+
+
+def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
+    """Compare a campaign with what another VUT does in its cases."""
+    version = Version.of(after)
+    source = f"the cases come from the search of {after.vut}"
+    earlier = Version(vut, None, before, after.tolerated, version.levels)
+    return _comparison_of_two(earlier, version, source)
+
+
+def _check_comparable(a: Run, b: Run) -> None:
+    if a.scenario != b.scenario:
+        raise UserError(
+            f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
+            f"changed one, {b.scenario.name}: compare campaigns of one scenario"
+        )
+    if a.criterion != b.criterion:
+        raise UserError(
+            f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
+            f"{b.criterion.text}: compare campaigns with the same criterion"
+        )
+    if a.tolerated != b.tolerated:
+        raise UserError(
+            f"{a.folder} tolerates {a.tolerated:g} of the runs of a case and {b.folder} "
+            f"{b.tolerated:g}: compare campaigns with the same share"
+        )
+    for level in sorted(set(a.levels) & set(b.levels)):
+        if not same_pov(a.settings, b.settings, level):
+            raise UserError(
+                f"the POV of level {level_name(level)} is another in {a.folder} than in "
+                f"{b.folder}: compare campaigns with the same POVs"
+            )
+
+
+def _notes(runs: Sequence[Run]) -> list[str]:
+    """Return what limits the comparison of campaigns, in sentences."""
+    notes = []
+    if len({str([r.settings.get(k) for k in ("sampler", "cases")]) for r in runs}) > 1:
+        notes.append(
+            "The campaigns differ in sampler or number of cases: FMC, failures and regions are "
+            "what each of them found, and a longer search finds more."
+        )
+    if len({str(run.settings.get("net_sha256")) for run in runs}) > 1:
+        notes.append("The campaigns were not all run on the same net.")
+    for number, run in enumerate(runs, start=1):
+        wanted = run.settings.get("cases")
+        if run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted):
+            notes.append(f"Campaign {number} ended after {len(run.outcomes)} of {wanted} cases.")
+    return notes
+
+
+def _step(found: Sequence[Version], after: int) -> Step:
+    """Return what changed to the version at a place from the one before it."""
+    earlier, later = found[after - 1], found[after]
+    cases = paired(earlier.outcomes, later.outcomes, later.tolerated)
+    own_regions = {}
+    for level in sorted(set(earlier.levels) & set(later.levels)):
+        a, b = (_Tested(version, level) for version in (earlier, later))
+        at_level = sum(case.a.case.level == level for case in cases)
+        if at_level < max(a.count, b.count):
+            own_regions[level] = _regions(after, a, b)
+    return Step(after, after + 1, cases, own_regions)
+
+
+class _Tested:
+    """The cases of a version at a level that have a verdict, and their points, (n, d)."""
+
+    def __init__(self, version: Version, level: int) -> None:
+        own = [outcome for outcome in version.cases if outcome.case.level == level]
+        self.count = len(own)
+        self.outcomes = [outcome for outcome in own if outcome.is_tested]
+        self.failures = [outcome for outcome in self.outcomes if outcome.failed]
+        self.points, self.failing = (
+            to_unit((o.case for o in some), level) for some in (self.outcomes, self.failures)
+        )
+        self._tree = cKDTree(self.points) if self.outcomes else None
+
+    def near(self, points: FloatArray, radius: float) -> list[int]:
+        """Return the places of cases no further than a radius from one of some points, (m, d)."""
+        if self._tree is None:
+            return []
+        return sorted(set().union(*self._tree.query_ball_point(points, radius * (1.0 + ROUNDING))))
+
+    def regions(self, number: int, other: _Tested, none_failed: Change) -> list[Region]:
+        """Return the regions of failures, and what the other version's cases say of them.
+
+        A region where the other one's cases do not fail became `none_failed`.
+        """
+        radius, labels = radius_for(self.points.shape[1]), regions(self.failing)
+        found = []
+        for label in range(int(labels.max(initial=-1)) + 1):
+            points = self.failing[labels == label]
+            own = [self.failures[place] for place in np.flatnonzero(labels == label)]
+            inside, around = (other.near(points, radius * r) for r in (1.0, 2.0))
+            failed = sum(other.outcomes[place].failed for place in inside)
+            volume, seen = fmc(points), other.points[around]
+            shared = volume + fmc(seen) - fmc(np.concatenate([points, seen]))
+            change = none_failed if inside else Change.NOT_SEEN
+            found.append(
+                Region(
+                    change=Change.NEITHER if failed else change,
+                    version=number,
+                    failures=len(own),
+                    worst=min(own, key=lambda o: (o.score, o.index)).index,
+                    where=_box_in_words([o.case for o in own]),
+                    fmc=volume,
+                    cases=len(inside),
+                    failed=failed,
+                    looked_at=min(max(shared / volume, 0.0), 1.0),
+                )
+            )
+        return found
+
+
+def _regions(number: int, earlier: _Tested, later: _Tested) -> list[Region]:
+    """Return the regions of two versions, of which the earlier one has a number; as `Change`."""
+    fixed = earlier.regions(number, later, Change.FIXED)
+    broke = later.regions(number + 1, earlier, Change.BROKE)
+    # Where both fail the region is given once, as one of the earlier version.
+    both = [*fixed, *(region for region in broke if not region.failed)]
+    order = list(Change)
+    return sorted(both, key=lambda one: (order.index(one.change), -one.fmc, one.worst))
+
+
+def _box_in_words(cases: Sequence[Case]) -> str:
+    """Return the smallest box around some cases in words."""
+    parts = []
+    for coordinate in coordinates(cases[0].scenario, (cases[0].level,)):
+        ordered = sorted(cases, key=lambda case: coordinate.of(case) or 0.0)
+        low, high = coordinate.text(ordered[0]), coordinate.text(ordered[-1])
+        span = low if low == high else f"{low} to {high}"
+        parts.append(f"{coordinate.name} {span} {coordinate.unit}")
+    return ", ".join(parts)
+
+
+# Recorded cases with a changed VUT.
+
+
+def settings_today(run: Run, given: Mapping[str, object] | None = None) -> CampaignSettings:
+    """Return the settings of a campaign with what is given in the place of what it recorded.
+
+    A VUT that is not given is that of the campaign, as its files are today (`settings_of`).
+    """
+    return settings_of(run.folder, run.settings, given)
+
+
+def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
+    """Run cases of a campaign again, by default all, with `settings_today` and their plan.
+
+    Raises `UserError` for an index without a case, and where net or POV are not the campaign's:
+    then not only the VUT would have changed.
+    """
+    run, settings, plan = study.run, study.settings, study.plan
+    before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
+    if not before:
+        raise UserError(f"{run.folder} has no case yet")
+    levels = sorted({outcome.case.level for outcome in before})
+    study.check_same_road(levels)
+    # In another order than the campaign's, which a VUT that remembers would repeat.
+    order, by_index = before[::-1], dict[int, Outcome]()
+    with workers_or_here(study.workers) as processes:
+        plan = plan.for_cases(len(before))
+        open_simulators(plan, processes)
+        for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
+            old = order[place]
+            by_index[old.index] = now.outcome(old.index, old.batch)
+            study.on_cases(1)
+    after = [by_index[outcome.index] for outcome in before]
+    source = (
+        f"the cases come from the search of {run.vut}, so what only {settings.vut} fails may lie "
+        f"elsewhere: `merge-sumo campaign --vut {quoted(settings.vut)} --against "
+        f"{quoted(run.vut)}` searches there"
+    )
+    unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
+    notes = []
+    if unrepeated:
+        notes.append(
+            f"{len(unrepeated)} of {counted(len(after), 'case')} went differently, and no file of "
+            f"the VUT has changed (the first is case {unrepeated[0]}). {cause()}."
+        )
+    return _comparison_of_two(
+        Version(run.vut, str(run.folder), before, run.tolerated, levels),
+        Version(settings.vut, None, after, run.tolerated, levels),
+        source,
+        notes,
+        unrepeated=unrepeated,
+    )
+
+
+def _same_vut(run: Run, settings: CampaignSettings) -> bool:
+    """Return whether a VUT that is not of the package is the one that was recorded."""
+    recorded, files = run.settings, run.settings.get("vut_files")
+    return (
+        not is_built_in(settings.vut)
+        and settings.vut == recorded.get("vut")
+        and recorded.get("versions") == versions_of_packages()
+        and isinstance(files, dict)
+        and not changed(files)
+    )
+
+
+def _unrepeated(before: Sequence[Outcome], after: Sequence[Outcome]) -> tuple[int, ...]:
+    """Return the indices of the cases that did not go as before, except those with an error."""
+
+    def motion(outcome: Outcome) -> tuple[object, ...]:
+        found = outcome.measures
+        return found.end, found.t_end_s, found.dx_m, found.dv_mps, found.clipped_steps
+
+    return tuple(
+        a.index
+        for a, b in zip(before, after, strict=True)
+        if not (a.measures.end.is_error or b.measures.end.is_error) and motion(a) != motion(b)
+    )

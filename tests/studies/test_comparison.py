@@ -1,0 +1,396 @@
+"""Versions of a VUT compared: what broke and what is fixed, by cases, by regions, and by chance."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from calling import assert_refused
+from campaigning import campaign_settings, run_campaign
+from handmade import drive
+from lxml import etree, html
+
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.store import Journal, Run, failures
+from merge_sumo.errors import UserError
+from merge_sumo.reports import comparison_page as pages
+from merge_sumo.studies.comparison import (
+    Change,
+    ComparedCase,
+    Region,
+    compare,
+    compare_outcomes,
+    rerun,
+    settings_today,
+)
+from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.values.case import MergeCase, from_unit
+from merge_sumo.values.chance import RunsOfCase
+from merge_sumo.values.scenario import US23
+from merge_sumo.values.score import Measures, Outcome, measure
+from merge_sumo.values.trajectory import End
+
+BALL = math.pi * 0.05**2
+CASE = MergeCase(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
+Point = tuple[float, float, str]
+
+
+def outcome(became: str, index: int = 0) -> Outcome:
+    """Return the outcome of `CASE` by a word, as "contact", "contact, passes" or "timeout"."""
+    if became in ("timeout", "vut error"):
+        end = End[became.replace(" ", "_").upper()]
+        score = None if end.is_error else -1.0
+        return Outcome(index, 0, CASE, Measures(end=end, score=score, t_end_s=60.0))
+    word, _, passes = became.partition(", ")
+    failed = word in ("contact", "conflict") and not passes
+    found = Measures(
+        end=End.MERGED,
+        score=-600.0 if failed else -20.0,
+        t_end_s=8.0,
+        severity=word,  # type: ignore[arg-type]
+    )
+    return Outcome(index, 0, CASE, found)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "change", "words"),
+    [
+        ("contact", "safe", Change.FIXED, "contact -> safe"),
+        ("safe", "contact", Change.BROKE, "safe -> contact"),
+        ("safe", "timeout", Change.BROKE, "safe -> timeout"),
+        ("harsh", "vut error", Change.BROKE, "harsh -> vut error"),
+        ("vut error", "safe", Change.FIXED, "vut error -> safe"),
+        ("contact", "timeout", Change.NEITHER, "contact -> timeout"),
+        ("contact", "conflict", Change.NEITHER, "contact -> conflict"),
+        ("safe", "harsh", Change.BOTH, "safe -> harsh"),
+        # Bodies still touch: nobody would call that fixed, although the criterion is met.
+        (
+            *("contact", "contact, passes", Change.STILL_CONTACT),
+            "contact, a failure -> contact, no failure",
+        ),
+    ],
+)
+def test_what_became_of_a_case(before, after, change, words):
+    one = ComparedCase(outcome(before), outcome(after))
+    assert (one.change, one.became) == (change, words)
+
+
+# Recorded campaigns.
+
+
+@pytest.fixture(scope="module")
+def fixed(tmp_path_factory) -> Run:
+    """Return a campaign of a VUT that does not fail at level 0: design2."""
+    settings = campaign_settings(vut="design2", cases=60, batch=20, seed=1)
+    return run_campaign(settings, tmp_path_factory.mktemp("fixed") / "run")
+
+
+def changed(folder, run, **settings) -> Run:
+    """Return a copy of a run with other settings."""
+    folder.mkdir()
+    for name in ("outcomes.jsonl", "campaign.json"):
+        (folder / name).write_bytes((run.folder / name).read_bytes())
+    record = {**run.settings, **settings}
+    (folder / "campaign.json").write_text(json.dumps(record))
+    return Run(folder)
+
+
+def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> Run:
+    """Write a campaign with cases at points of the unit square that pass, fail or err."""
+    record = {"vut": folder.name, "levels": [level], "sampler": "by hand", "cases": len(points)}
+    journal = Journal.create(folder, record | settings)
+    ran = []
+    for index, (x, v, became) in enumerate(points):
+        case = from_unit(np.array([[x, v]]), level, scenario=US23)[0]
+        trajectory = drive(case, "answered nan" if became == "errs" else None)
+        measures = measure(trajectory)
+        if became != "errs":
+            score = -560.0 if became == "fails" else -100.0 - index
+            measures = replace(measures, end=End.MERGED, score=score)
+        ran.append((Outcome(index, 0, case, measures), trajectory))
+    journal.append(ran)
+    return Run(folder)
+
+
+def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
+    a = write(tmp_path / "a", (0.1, 0.1, "passes"), (0.5, 0.5, "fails"), (0.9, 0.9, "passes"))
+    b = write(tmp_path / "b", (0.5, 0.5, "passes"), (0.9, 0.9, "fails"), (0.1, 0.1, "passes"))
+    found = compare([a, b])
+    (step,) = found.steps
+    assert [(c.change, c.a.index, c.b.index) for c in step.cases] == [
+        (Change.BROKE, 2, 1),
+        (Change.FIXED, 1, 0),
+        (Change.BOTH, 0, 2),
+    ]
+    assert step.regions == {}, "no case is one campaign's alone"
+    assert (found.broke, found.worse) == (1, True)
+    assert sum(step.transitions.values()) == 3
+    # The table of transitions stands before any list of cases.
+    lines = found.lines()
+    assert lines.index("from 1 to 2: 3 cases with both") < lines.index("broke, 1:")
+
+
+class TestARegion:
+    def regions(self, *runs: Run) -> list[Region]:
+        return [one for step in compare(runs).steps for one in step.regions.get(0, [])]
+
+    def test_is_fixed_where_the_later_version_tested_cases_and_none_failed(self, tmp_path):
+        a = write(tmp_path / "a", (0.5, 0.5, "fails"))
+        b = write(tmp_path / "b", (0.5, 0.54, "passes"))
+        (region,) = self.regions(a, b)
+        assert (region.change, region.version) == (Change.FIXED, 1)
+        assert (region.cases, region.failed) == (1, 0)
+        assert region.fmc == pytest.approx(BALL, rel=1e-6)
+        assert 0.4 < region.looked_at < 0.6
+        assert not compare([a, b]).worse
+
+    def test_broke_the_other_way_round_and_the_comparison_is_worse(self, tmp_path):
+        a = write(tmp_path / "a", (0.5, 0.54, "passes"))
+        b = write(tmp_path / "b", (0.5, 0.5, "fails"))
+        (region,) = self.regions(a, b)
+        assert (region.change, region.version) == (Change.BROKE, 2)
+        assert compare([a, b]).worse
+
+    @pytest.mark.parametrize(
+        ("points", "change"),
+        [
+            ([(0.5, 0.54, "fails"), (0.52, 0.5, "passes")], Change.NEITHER),
+            ([(0.9, 0.9, "passes")], Change.NOT_SEEN),
+            ([(0.5, 0.54, "errs"), (0.9, 0.9, "passes")], Change.NOT_SEEN),
+        ],
+    )
+    def test_is_neither_where_a_case_fails_or_none_has_a_verdict(self, tmp_path, points, change):
+        a, b = write(tmp_path / "a", (0.5, 0.5, "fails")), write(tmp_path / "b", *points)
+        assert [region.change for region in self.regions(a, b)] == [change]
+
+
+def test_three_versions_are_two_steps(tmp_path):
+    a = write(tmp_path / "a", (0.5, 0.5, "passes"))
+    b = write(tmp_path / "b", (0.5, 0.5, "fails"))
+    c = write(tmp_path / "c", (0.5, 0.5, "passes"))
+    found = compare([a, b, c])
+    assert [step.count(Change.BROKE) for step in found.steps] == [1, 0]
+    assert found.headline == "from 1 to 2: 1 case broke; from 2 to 3: 0 cases broke, 1 fixed"
+    assert [row[0] for row in found.fmc().values()] == ["0.0000"]
+
+
+def test_a_version_that_was_tested_in_no_case_is_worse(tmp_path):
+    a, b = write(tmp_path / "a", (0.5, 0.5, "fails")), write(tmp_path / "b", (0.1, 0.1, "errs"))
+    assert compare([a, b]).worse
+
+
+def test_what_does_not_compare_is_refused(tmp_path, run):
+    with pytest.raises(UserError, match="needs two campaigns or more"):
+        compare([run])
+    with pytest.raises(UserError, match="no POV level in common"):
+        compare([run, write(tmp_path / "1", (0.1, 0.1, "passes"), level=1)])
+    with pytest.raises(UserError, match="with the same share"):
+        compare([run, changed(tmp_path / "tolerant", run, tolerated=0.2)])
+    assert compare([run, changed(tmp_path / "net", run, net_sha256="0")]).notes
+
+
+# The command and its page.
+
+
+def test_a_list_that_is_cut_says_so_everywhere(call, tmp_path, monkeypatch):
+    points = [(x / 30.0, 0.5) for x in range(25)]
+    a = write(tmp_path / "a", *((x, v, "passes") for x, v in points))
+    b = write(tmp_path / "b", *((x, v, "fails") for x, v in points))
+    monkeypatch.setattr(pages, "SHOWN", 20)
+    files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
+    said = call("compare", a.folder, b.folder, *files)
+    assert said.code == 1
+    assert "25 cases broke" in said.out
+    assert "broke, the first 10 of 25:" in said.out
+    root: Any = html.parse(tmp_path / "page.html").getroot()
+    titles = root.xpath("//h2/text()")
+    assert "Broke: 25, the first 20 of 25" in titles
+    assert titles.index("From 1 to 2") < titles.index("Broke: 25, the first 20 of 25")
+    assert len(root.findall(".//details")) == 20
+    assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "25"
+
+
+def test_json_has_the_transitions_and_every_case(call, run, fixed):
+    told = json.loads(call("compare", run.folder, run.folder, "--json").out)
+    (step,) = told["steps"]
+    assert told["worse"] is False
+    assert sum(row["cases"] for row in step["transitions"]) == 60
+    assert {case["change"] for case in step["cases"]} == {"passes with neither"}
+    assert len(step["cases"]) == len(failures(run.outcomes))
+    assert call("compare", fixed.folder, run.folder).code == 1
+    assert call("compare", run.folder, fixed.folder).code == 0
+
+
+def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run, tmp_path):
+    root: Any = html.fromstring(pages.comparison_page(compare([run, run]), [run, run]))
+    for details in root.xpath("//details"):
+        left, right = details.xpath(".//div[@class='pair']")
+        lines = [line.get("points") for line in left.xpath(".//polyline")]
+        assert lines == [line.get("points") for line in right.xpath(".//polyline")]
+        assert len(lines) == 4, "speeds and positions of two cars"
+        places = [tuple(map(float, p.split(","))) for line in lines for p in line.split()]
+        assert all(pages.OVER_TIME.left <= x <= pages.OVER_TIME.right for x, _ in places)
+        assert max(x for x, _ in places) == pages.OVER_TIME.right
+    assert root.xpath("//script | //@src | //@href | //@style | //img") == []
+    (policy,) = root.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
+    assert policy.startswith("default-src 'none'; style-src 'sha256-")
+    assert "Its motion is not recorded." in pages.comparison_page(compare([run, run]), [None, run])
+
+
+def test_the_page_is_written_nowhere_where_something_is(call, run, tmp_path):
+    file = tmp_path / "page.html"
+    file.write_text("mine")
+    for option in ("--out", "--junit"):
+        assert_refused(call("compare", run.folder, run.folder, option, file), "exists")
+    assert file.read_text() == "mine"
+
+
+# Recorded cases with a changed VUT.
+
+
+def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
+    found = rerun(RunStudy(run, today := settings_today(run), resolve(today)))
+    assert [o.measures for o in found.versions[1].outcomes] == [o.measures for o in run.outcomes]
+    assert found.steps[0].count(Change.BROKE) == found.steps[0].count(Change.FIXED) == 0
+    assert not found.worse
+
+
+def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
+    command_line, run, tmp_path, monkeypatch
+):
+    """Cases that broke decide, and not the volume of failures, which shrinks here."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(run.folder, "campaign")
+    # It fails in other places: further from where design1 does.
+    Path("late.py").write_text("def f(seen):\n    return 1.0 if seen.t_s < 2.0 else 0.0\n")
+    code, out, _ = command_line("rerun", "campaign", "--vut", "late.py:f", "--json")
+    told = json.loads(out)
+    changes = [case["change"] for case in told["steps"][0]["cases"]]
+    assert told["broke"] == changes.count("broke") > 0
+    assert code == 1
+    before, after = (version["levels"]["0"]["fmc"] for version in told["versions"])
+    assert after < before
+    assert told["source"].startswith("the cases come from the search of design1")
+
+
+def test_a_rerun_says_what_is_fixed_and_where_its_cases_come_from(command_line, run, tmp_path):
+    folder = shutil.copytree(run.folder, tmp_path / "campaign")
+    code, out, _ = command_line("rerun", folder, "--vut", "design2")
+    assert code == 0
+    assert f"0 cases broke, {len(failures(run.outcomes))} fixed" in out
+    assert "`merge-sumo campaign --vut design2 --against design1` searches there" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (("60",), "has no case 60"),
+        (("--vut", "design9"), "design9"),
+        (("--tolerance", "1"), "the option --tolerance is gone"),
+        (("3", "--stress"), "--stress runs all cases"),
+    ],
+)
+def test_bad_use_of_rerun_is_refused(command_line, run, arguments, part):
+    assert_refused(command_line("rerun", run.folder, *arguments), part)
+
+
+def test_rerun_on_another_net_is_refused(command_line, run, tmp_path):
+    folder = shutil.copytree(run.folder, tmp_path / "campaign")
+    settings = json.loads((folder / "campaign.json").read_text())
+    settings.pop("sha256")
+    (folder / "campaign.json").write_text(json.dumps({**settings, "net_sha256": "0"}))
+    assert_refused(command_line("rerun", folder), "another net")
+
+
+# Chance.
+
+
+def runs(failing: int, count: int) -> RunsOfCase:
+    """Return runs of a case, the failing ones first."""
+    scores = [-600.0 if draw < failing else -20.0 for draw in range(count)]
+    made = [
+        Outcome(
+            draw,
+            0,
+            replace(CASE, draw=draw),
+            Measures(end=End.MERGED, score=score, t_end_s=8.0, dx_m=score + draw),
+        )
+        for draw, score in enumerate(scores)
+    ]
+    return RunsOfCase(CASE, tuple(made))
+
+
+def compared(before: tuple[int, int], after: tuple[int, int], tolerated: float) -> ComparedCase:
+    a, b = runs(*before), runs(*after)
+    return ComparedCase(a.deciding(tolerated), b.deciding(tolerated), a, b)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "tolerated", "change"),
+    [
+        ((3, 10), (5, 10), 0.4, Change.WITHIN_CHANCE),
+        ((5, 10), (3, 10), 0.4, Change.WITHIN_CHANCE),
+        ((3, 10), (5, 10), 0.0, Change.NEITHER),
+        ((0, 10), (6, 10), 0.4, Change.BROKE),
+        ((6, 10), (0, 10), 0.4, Change.FIXED),
+    ],
+)
+def test_shares_that_chance_may_give_are_no_change(before, after, tolerated, change):
+    assert compared(before, after, tolerated).change is change
+
+
+def test_the_sentence_says_by_what():
+    # Fisher's exact test of 3 of 10 against 5 of 10.
+    one = compared((3, 10), (5, 10), 0.4)
+    assert one.became == ("3 of 10 runs fail -> 5 of 10 runs fail, by Fisher's exact test p = 0.65")
+    record = one.to_record()
+    assert (record["failed_runs_before"], record["runs_before"]) == (3, 10)
+
+
+COIN = """
+import random
+class Coin:
+    def reset(self, seen, seed):
+        self.stops = random.Random(seed).random() < {share}
+    def act(self, seen):
+        return -3.0 if self.stops else 0.5
+"""
+
+
+def test_campaigns_with_repeats_are_compared_case_by_case(tmp_path):
+    made = []
+    for name, share in (("a", 0.3), ("b", 0.4)):
+        (tmp_path / f"{name}.py").write_text(COIN.format(share=share))
+        settings = campaign_settings(
+            vut=f"{tmp_path / name}.py:Coin",
+            sampler="uniform",
+            cases=60,
+            repeat=10,
+            tolerated=0.35,
+            fail_when='end == "TIMEOUT"',
+        )
+        made.append(run_campaign(settings, tmp_path / f"run-{name}"))
+    (step,) = compare(made).steps
+    assert len(step.cases) == 6
+    for one in step.cases:
+        assert (one.runs_a.runs, one.runs_b.runs) == (10, 10)
+        # The same seeds: what stops below .3 stops below .4, too.
+        assert one.runs_a.failures <= one.runs_b.failures
+    assert step.count(Change.BROKE) == 0, "no case is told apart by ten runs"
+    today = settings_today(made[0], {"vut": made[0].vut})
+    again = rerun(RunStudy(made[0], today, resolve(today)))
+    assert {case.change for case in again.steps[0].cases} <= {Change.BOTH, Change.NEITHER}
+
+
+def test_cases_of_a_campaign_with_another_vut(run):
+    before = [replace(one, measures=outcome("safe").measures) for one in run.outcomes]
+    found = compare_outcomes(before, run, "other")
+    assert found.broke == len(failures(run.outcomes))
