@@ -27,6 +27,8 @@ from merge_sumo.values.score import FAILURE_SCORE, Outcome
 from merge_sumo.values.severity import Severity
 
 PERCENT: Final = "%"
+TABLE: Final = ("cases", "without a verdict", "failures", "regions", "FMC")
+"""Facts of levels that stand in the table of a terminal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +96,10 @@ def by_level(facts: Iterable[Fact]) -> tuple[list[Fact], list[tuple[int, list[Fa
 
 def table_lines(facts: Sequence[Fact]) -> list[str]:
     """Return the facts of levels as the lines of a table for a terminal."""
-    columns, rows = by_level(facts)
-    names = [", ".join(filter(None, (c.name, c.unit))) for c in columns]
-    lines = [["level", *names]]
+    columns, rows = by_level(fact for fact in facts if fact.name in TABLE)
+    lines = [["level", *(column.name for column in columns)]]
     for level, row in rows:
-        cells = ["-" if f is None else f.shown.removesuffix(f.unit).strip() for f in row]
-        lines.append([level_name(level), *cells])
+        lines.append([level_name(level), *("-" if fact is None else fact.shown for fact in row)])
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return [
         "  " + "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))

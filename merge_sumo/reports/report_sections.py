@@ -17,6 +17,7 @@ from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE
 from merge_sumo.analysis.plausibility import notes_on
 from merge_sumo.analysis.predictions import prediction_in_words
+from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns import repeats
@@ -27,14 +28,15 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import fragment, source_of
-from merge_sumo.reports.report_levels import levels_of
+from merge_sumo.reports.report_maps import pairs_of
 from merge_sumo.reports.report_model import ERROR_CHARACTERS, LISTED, ReportModel
 from merge_sumo.studies.comparison import compare_against
 from merge_sumo.studies.stress import NOTHING
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.registry import Registry
-from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import MergeScenario, lane_of, level_name
+from merge_sumo.values.case import to_unit
+from merge_sumo.values.fmc import covered, fmc, radius_for
+from merge_sumo.values.scenario import OWN, MergeScenario, lane_of, level_name
 from merge_sumo.values.severity import meanings
 from merge_sumo.vuts.output import LOG, end_of
 
@@ -63,7 +65,7 @@ class ReportSection:
 def shared_words(model: ReportModel) -> dict[str, Any]:
     """Return what the head of the page and several sections need."""
     run, summary = model.run, model.summary
-    levels = levels_of(model)
+    levels = [_level(model, level, found) for level, found in summary.levels.items()]
     return {
         "vut": run.vut,
         "troubles": model.troubles(),
@@ -74,12 +76,42 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "traffic": run.scenario.vehicles > 2,
         "coordinates": model.coordinates,
         "levels": levels,
-        "any_truth": any(level.truth is not None for level in levels),
+        "any_truth": any(level["truth"] is not None for level in levels),
         "counted": summary.cases - len(model.shown),
         "predicted": prediction_in_words(run.outcomes),
         "avoidance": list(REFERENCES) if model.avoidance else [],
         "varied": any(one.varies for one in model.repeated.values()),
         "repeated": model.repeated,
+    }
+
+
+def _level(model: ReportModel, level: int, found: LevelSummary) -> dict[str, Any]:
+    """Return what the page says of a level beside its facts.
+
+    `plausible` is the coverage if all places failed that the surrogate does not exclude; `near`
+    are the failures of the truth within the radius of the FMC of a failure that was found.
+    """
+    surface, truth = model.surfaces[level], model.truths[level]
+    axes = model.coordinates_of(level)
+    failing = () if truth is None else truth.failures
+    failed = (o.case for o in model.cases if o.failed and o.case.level == level)
+    return {
+        "level": level,
+        "found": found,
+        "caption": f"own: {model.run.pov}" if level == OWN else str(level),
+        "about": model.run.scenario.level_about.get(level, ""),
+        "axes": axes,
+        "plausible": None if surface is None else surface.plausible_fmc(),
+        "truth": None if truth is None else fmc(truth.failures),
+        "failing": len(failing),
+        "near": int(covered(failing, to_unit(failed, level)).sum()) if len(failing) else 0,
+        "radius": radius_for(len(axes)),
+        "remarks": [] if truth is None else truth.remarks(),
+        "pairs": [
+            " × ".join(axes[axis].name for axis in pair.axes)
+            + ("" if pair.share is None else f": {pair.share:.0%}")
+            for pair in pairs_of(len(axes), surface)
+        ],
     }
 
 
@@ -201,13 +233,7 @@ def _recorded(run: Run) -> str | None:
     if len(times) < 2:
         return None
     began, took_s = datetime.fromtimestamp(min(times), UTC), max(times) - min(times)
-    took = f"{took_s:.0f} s" if took_s < 100.0 else _duration(took_s)
-    return f"{began:%Y-%m-%d %H:%M} UTC, in {took} (by the times of its files)"
-
-
-def _duration(seconds: float) -> str:
-    minutes = round(seconds / 60.0)
-    return f"{minutes // 60} h {minutes % 60} min" if minutes >= 60 else f"{seconds / 60.0:.1f} min"
+    return f"{began:%Y-%m-%d %H:%M} UTC, in {took_s:.0f} s (by the times of its files)"
 
 
 def _against(model: ReportModel) -> dict[str, Any] | None:

@@ -323,12 +323,6 @@ class TestACampaignWithGates:
         assert said.stderr.count("gate ") == len(gates)
         assert (mixed / "campaign.json").read_bytes() == before
 
-    @pytest.mark.parametrize("gate", ["fmc", "errors>1", "fmc>2"])
-    def test_that_are_none_is_refused_before_the_first_case(self, tmp_path, gate):
-        said = campaign("design2", tmp_path / "run", "--gate", gate)
-        assert isinstance(said.exception, UserError)
-        assert list(tmp_path.iterdir()) == []
-
     def test_writes_junit_and_never_over_a_file(self, vuts, tmp_path, mixed):
         file = tmp_path / "junit.xml"
         options = ("--junit", file, "--gate", "errors")
@@ -377,10 +371,6 @@ class TestACampaignOfFewCasesThatIsResumed:
             run_campaign(settings, tmp_path / "run", check=check)
         assert len(Run(tmp_path / "run").outcomes) == 10
         return tmp_path / "run"
-
-    def test_says_in_json_that_it_ended_by_its_cases(self, stopped):
-        said = invoke("campaign", "--resume", stopped, "-q", "--json")
-        assert json.loads(said.stdout)["stopped"] == "cases"
 
     def test_that_converged_says_so_with_its_own_share(self, stopped, monkeypatch):
         settings = read_settings(stopped)

@@ -87,7 +87,7 @@ def test_a_campaign_shows_lines_and_its_table(notebook):
     outputs = notebook.run("run = ms.campaign(MyVut, **small, out='run')\nrun")
     (shown,) = (o["data"] for o in outputs if o["output_type"] == "execute_result")
     assert shown["text/plain"].startswith("<campaign run: ")
-    assert "<table>" in shown["text/html"]
+    assert "<pre>" in shown["text/html"]
     warning = "".join(o["text"] for o in outputs if o["output_type"] == "stream")
     assert "here:MyVut v level 0: " in warning
     assert "MyVut is known to this process alone, so it drives here" in warning

@@ -9,7 +9,7 @@ import io
 import json
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -525,15 +525,6 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
 
 
-def test_a_long_campaign_opens_too(browser, made, tmp_path, monkeypatch):
-    monkeypatch.setattr(report_facts, "SHOWN", 50)
-    file = tmp_path / "long.html"
-    file.write_text(report.report_page(made), encoding="utf-8")
-    with shown(browser, file) as page:
-        assert page.locator(".map .mark").count() == 50
-        assert page.locator(".map .count").count() > 20
-
-
 def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
     folder = tmp_path / "run"
     shutil.copytree(made.folder, folder)
@@ -563,38 +554,10 @@ def in_traffic(tmp_path_factory) -> Run:
     return run
 
 
-def drawn_at(page, outcome, axes: Sequence[str]) -> tuple[float, float]:
-    """Return how far a mark is from where a case is in two coordinates, as shares of the map."""
-    level = outcome.case.level
-    dims = {d.field: d for d in outcome.case.scenario.dimensions(level)}
-    frame = page.locator(f".map[data-level='{level}'] .frame").bounding_box()
-    box = page.locator(f".map [data-case='{outcome.index}'].mark").bounding_box()
-    x = (box["x"] + box["width"] / 2 - frame["x"]) / frame["width"]
-    y = 1.0 - (box["y"] + box["height"] / 2 - frame["y"]) / frame["height"]
-    u, v = (
-        (getattr(outcome.case, name) - dims[name].low) / (dims[name].high - dims[name].low)
-        for name in axes
-    )
-    return x - u, y - v
-
-
-def test_of_more_coordinates_the_reader_chooses_a_pair(browser, in_traffic):
-    worst = failures(in_traffic.outcomes)[0]
-    level = worst.case.level
-    with shown(browser, in_traffic.folder / report.REPORT, **NARROW) as page:
-        assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["viewport"]["width"]
-        for choice in page.locator(f".map[data-level='{level}'] option").all_inner_texts():
-            page.locator(f".map[data-level='{level}'] select").select_option(choice)
-            axes = [name.strip() for name in choice.partition(":")[0].split("×")]
-            fields = tuple(FIELDS[name] for name in axes)
-            assert drawn_at(page, worst, fields) == pytest.approx((0.0, 0.0), abs=0.02)
-            words = page.locator(f".map[data-level='{level}'] > svg text").all_text_contents()
-            assert [w.partition(",")[0] for w in words[-2:]] == axes
-
-
 def test_all_cars_are_drawn_and_say_which_one_the_vut_meets(browser, in_traffic):
     index = next(o.index for o in in_traffic.outcomes if o.measures.nearest == "behind")
-    with shown(browser, in_traffic.folder / report.REPORT) as page:
+    with shown(browser, in_traffic.folder / report.REPORT, **NARROW) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["viewport"]["width"]
         page.evaluate(f"show(place.get({index}))")
         inside = page.evaluate(INSIDE)
         assert inside == [True] * 4

@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failure
 from merge_sumo.reports import report_data
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.player import SPEED_UNIT_MPS
-from merge_sumo.reports.report import report_page, write_report
+from merge_sumo.reports.report import report_page
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth
@@ -86,12 +85,6 @@ class TestThePage:
             assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
         assert root.xpath("//@style") == []
 
-    @pytest.mark.long
-    def test_is_small(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=267)
-        assert len(run.outcomes) > 800
-        assert write_report(run).stat().st_size < 1e6
-
     def test_is_the_same_when_written_again(self, made, page):
         assert report_page(Run(made.folder)) == page
 
@@ -108,10 +101,6 @@ class TestThePage:
         (title,) = root.xpath("//h1")
         assert title.text == EVIL
         assert data_of(page)["errors"][str(len(run.outcomes) - 1)] == EVIL
-
-    def test_quotes_a_folder_with_a_space(self, tmp_path):
-        run = write_run(tmp_path / "a run", per_level=10)
-        assert data_of(report_page(run))["replay"].endswith(" '" + str(tmp_path / "a run") + "'")
 
     def test_lists_the_worst_and_the_nearest_misses(self, made, page):
         root = root_of(page)
@@ -202,11 +191,6 @@ class TestWhatWasNotTested:
         assert len(others) > 10
         assert others & {0, 1, 2, 3, 4, 6, 9} == set()
 
-    def test_is_no_part_of_a_report_of_a_campaign_without(self, tmp_path):
-        page = report_page(write_run(tmp_path / "run", 10, error=None))
-        assert "untested" not in root_of(page).xpath("//@aria-labelledby")
-        assert "broken" not in "".join(root_of(page).xpath("//body//@class"))
-
     def test_has_no_message_of_megabytes(self, tmp_path):
         page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
         assert len(page) < 1e6
@@ -261,15 +245,6 @@ class TestALongCampaign:
         shown = set(data["cases"]["index"])
         assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
 
-    def test_with_many_failures_has_fewer_points_of_coverage(self, made, monkeypatch):
-        monkeypatch.setattr(report_data, "MOST_BALLS", 60)
-        for level in data_of(report_page(made))["search"]["levels"]:
-            known = [value for value in level["fmc"] if value is not None]
-            assert 1 <= len(known) < len(level["fmc"])
-            assert level["fmc"][-1] is not None
-            # A volume in three dimensions may fall by its rounding.
-            assert (np.diff(known) > -1e-4).all()
-
     def test_is_drawn_in_groups_of_batches(self, tmp_path, monkeypatch):
         monkeypatch.setattr(report_data, "MOST_STEPS", 4)
         run = write_run(tmp_path / "run", per_level=60)
@@ -304,12 +279,6 @@ class TestTheTruth:
         assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
         assert "lie within 0.05 of a failure found" in text_of(page)
 
-    def test_of_a_pool_with_a_range_of_speeds_is_drawn_too(self, tmp_path, cached):
-        net, ranged = road_of().sha256, replace(US23, v_vut0_mps=(14.0, 22.0))
-        run = write_run(tmp_path / "run", 10, (0, 2), scenario=ranged, net_sha256=net)
-        maps = data_of(report_page(run))["maps"]
-        assert {grid["truth"] is None for of in maps.values() for grid in of["grids"]} == {False}
-
     @pytest.mark.parametrize("settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}])
     def test_of_something_else_is_not(self, tmp_path, cached, settings):
         run = write_run(
@@ -329,11 +298,6 @@ class TestTheSurrogate:
             assert chance[failed].min() > np.median(chance[~failed])
             assert chance[failed].mean() > 0.5
             assert chance[~failed].mean() < 0.1
-
-    def test_finds_at_least_plausible_what_was_found(self, made):
-        for level, found in summarise(made.outcomes, (0, 1, 2)).levels.items():
-            surface = learn_surface(made.outcomes, level)
-            assert surface.plausible_fmc() >= found.fmc - 1e-3
 
     def test_finds_no_more_than_the_pool_plausible(self):
         everywhere = Surface(np.array([[0.5, 0.5]]), lambda sets: [np.ones(len(s)) for s in sets])

@@ -147,12 +147,12 @@ class TestWords:
 
     def test_name_the_pairs_and_what_they_explain(self, words):
         zero, _, two = words["levels"]
-        assert len(zero.pairs) == 6
-        assert len(two.pairs) == 10
-        name, _, share = zero.pairs[0].partition(": ")
+        assert len(zero["pairs"]) == 6
+        assert len(two["pairs"]) == 10
+        name, _, share = zero["pairs"][0].partition(": ")
         assert " × " in name
         assert share.endswith("%")
-        assert len(zero.axes) != 3
+        assert len(zero["axes"]) != 3
 
     def test_say_how_large_a_ball_is_where_it_is_not_the_papers(self, words):
         assert [(d, round(r, 2)) for d, r in words["radii"]] == [(4, 0.12), (5, 0.2)]
@@ -167,11 +167,11 @@ class TestWords:
     def test_have_a_slider_for_a_third_coordinate(self, tmp_path):
         run = write_run(tmp_path / "run", 10, levels=(0, 2), error=None, scenario=RANGED)
         zero, two = shared_words(ReportModel(run))["levels"]
-        third = zero.axes[2]
+        third = zero["axes"][2]
         shown = (third.name, third.dimension.low, third.dimension.high)
-        assert (len(zero.axes), shown) == (3, ("v_VUT0", 14.0, 22.0))
-        assert len(two.axes) != 3
-        assert len(two.pairs) == 6
+        assert (len(zero["axes"]), shown) == (3, ("v_VUT0", 14.0, 22.0))
+        assert len(two["axes"]) != 3
+        assert len(two["pairs"]) == 6
 
 
 def test_a_case_is_described_by_its_coordinates():
