@@ -8,26 +8,31 @@ from typing import Final
 from merge_sumo.system.printable import counted
 from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion, condition_of, values_of
-from merge_sumo.values.expression import AllOf, AnyOf, Comparison, Condition, Negation, names_of
+from merge_sumo.values.expression import (
+    AllOf,
+    AnyOf,
+    Comparison,
+    Condition,
+    Negation,
+    names_of,
+)
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.vacuity import KMH_PER_MPS, comparisons_in, text_of
 
+KMH_PER_MPS: Final = 3.6
 CLIPPED_SHARE: Final = 0.01
 """Share of the steps from which on it is said that accelerations were clipped."""
 
 
 def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
-    """Return what is odd about the outcomes of a campaign; nothing for most."""
-    sentences = (_clipped(outcomes), _one_verdict(outcomes, criterion))
-    return [sentence for sentence in sentences if sentence is not None]
+    """Return what is odd about the outcomes of a campaign; nothing for most.
 
-
-def notes_on(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
-    """Return what is odd about a criterion, and about the outcomes under it."""
+    Of a criterion that says the same of all cases, a neighbour that would not.
+    """
     if not outcomes:
         return []
-    return [*criterion.notes(outcomes[0].case.scenario), *doubts(outcomes, criterion)]
+    sentences = (_clipped(outcomes), _one_verdict(outcomes, criterion))
+    return [sentence for sentence in sentences if sentence is not None]
 
 
 def _clipped(outcomes: Sequence[Outcome]) -> str | None:
@@ -61,7 +66,7 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> str | Non
         if 0 < met < len(judged):
             every = "every case fails" if failures else "no case fails"
             return (
-                f"{every} under {criterion.words}; with {text_of(after)} ({why}) "
+                f"{every} under {criterion.words}; with {_text_of(after)} ({why}) "
                 f"{met} of {counted(len(judged), 'case')} would"
             )
     return None
@@ -69,9 +74,7 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> str | Non
 
 def _with_other_thresholds(condition: Condition) -> Iterator[tuple[Comparison, Comparison, str]]:
     """Yield comparisons with a threshold in another unit or of the other sign, and what it is."""
-    for comparison in comparisons_in(condition):
-        if not isinstance(comparison, Comparison):
-            continue
+    for comparison in _comparisons_in(condition):
         sides = (comparison.left, comparison.right)
         numbers = [side for side in sides if isinstance(side, float)]
         names = [side for side in sides if isinstance(side, str)]
@@ -100,3 +103,24 @@ def _with(condition: Condition, before: Comparison, after: Comparison) -> Condit
         case AnyOf(parts):
             return AnyOf(tuple(_with(part, before, after) for part in parts))
     return after if condition == before else condition
+
+
+def _comparisons_in(condition: Condition) -> Iterator[Comparison]:
+    """Yield the comparisons of numbers in a condition, from left to right."""
+    match condition:
+        case Comparison():
+            yield condition
+        case Negation(of):
+            yield from _comparisons_in(of)
+        case AllOf(parts) | AnyOf(parts):
+            for part in parts:
+                yield from _comparisons_in(part)
+
+
+def _text_of(condition: Comparison) -> str:
+    """Return a comparison as a person writes it, with the measure first."""
+    left, right, sign = condition.left, condition.right, "<=" if condition.or_equal else "<"
+    if isinstance(left, float):
+        left, right, sign = right, left, sign.replace("<", ">")
+    shown = [side if isinstance(side, str) else f"{side:.12g}" for side in (left, right)]
+    return f"{shown[0]} {sign} {shown[1]}"

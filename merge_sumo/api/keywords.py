@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import parse_levels, policies_folder
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Counter
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
@@ -256,10 +255,7 @@ def with_criterion(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSettings, Runner]:
-    """Return the settings that keywords of `CampaignKeywords` make, and where their cases run.
-
-    Warns with a `Notice` of what is odd about the criterion.
-    """
+    """Return the settings that keywords of `CampaignKeywords` make, and where their cases run."""
     runner, given = runner_of(given)
     spec, pov_spec, workers = drivers_of(vut, given.get("pov"), runner.workers, stacklevel=4)
     against, workers = _earlier_of(given, workers)
@@ -269,8 +265,6 @@ def settings_for(vut: AnyVut, given: Mapping[str, Any]) -> tuple[CampaignSetting
     policies = policies_folder(fields.get("policies"), scenario)
     levels = parse_levels(level, policies, scenario.levels, own=pov_spec is not None)
     settings = CampaignSettings(vut=spec, levels=levels, **fields)
-    for note in settings.criterion.notes(settings.scenario):
-        warnings.warn(f"note: {note}", Notice, stacklevel=3)
     return settings, replace(runner, workers=workers)
 
 

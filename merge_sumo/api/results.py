@@ -13,7 +13,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.merging import MergeStatistics, merging_of
-from merge_sumo.analysis.plausibility import doubts, notes_on
+from merge_sumo.analysis.plausibility import doubts
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.verdict import (
@@ -212,7 +212,7 @@ class CampaignRun(Result):
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
             "fail_when": criterion.text,
-            "notes": notes_on(outcomes, criterion),
+            "notes": doubts(outcomes, criterion),
             **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
             "repeats": [repeat.to_record() for repeat in self.repeats],
             "run": str(self.folder),

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE
-from merge_sumo.analysis.plausibility import notes_on
+from merge_sumo.analysis.plausibility import doubts
 from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
@@ -124,7 +124,7 @@ def head_words(model: ReportModel) -> dict[str, Any]:
     return {
         "unrepeatable": repeats.unrepeatable(model.repeats),
         "lost": in_words(lost) if lost else "",
-        "notes": [*notes_on(model.cases, run.criterion), *filter(None, [run.ran_again_in_words])],
+        "notes": [*doubts(model.cases, run.criterion), *filter(None, [run.ran_again_in_words])],
         "interruption": run.interruption,
         "resume": f"merge-sumo campaign --resume {quoted(run.folder)}{named_again(run.settings)}",
         "wanted": run.settings.get("cases"),

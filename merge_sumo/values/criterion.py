@@ -24,9 +24,8 @@ from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
 from merge_sumo.values.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, Verdict, measure
 from merge_sumo.values.severity import Severity
-from merge_sumo.values.temporal import check_formula, formula_range, robustness, try_formula
+from merge_sumo.values.temporal import check_formula, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.values.vacuity import Speeds, domain_of, emptiness, idle_parts
 
 SHORT: Final = 120
 """Characters of a condition in a headline."""
@@ -75,8 +74,7 @@ class Criterion:
     def check(self, scenario: Scenario) -> None:
         """Raise `UserError` where it speaks of what an episode of a scenario does not have.
 
-        Also where it is no formula, or what evaluates one is missing, and where no case could fail
-        or every case would (`vacuity.py`).
+        Also where it is no formula, or what evaluates one is missing.
         """
         if self.is_papers and not isinstance(scenario, MergeScenario):
             raise UserError(
@@ -85,8 +83,6 @@ class Criterion:
             )
         if self.require is not None:
             try_formula(self.require)
-            if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:
-                raise UserError(f"--require {printable(self.require[:80])!r}: {why}")
             return
         spoken = _names(self.words)
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
@@ -100,34 +96,6 @@ class Criterion:
                 f"--fail-when speaks of {min(named)}, and {scenario.name} has no acceleration "
                 "lane: choose a scenario with one, such as us23-lane"
             )
-        if (why := self._emptiness(Speeds.possible(scenario), scenario)) is not None:
-            raise UserError(f"--fail-when {printable(self.words[:80])!r}: {why}")
-
-    def notes(self, scenario: Scenario) -> list[str]:
-        """Return in sentences what is odd about it in a scenario, although cases may meet it.
-
-        A part of a condition that is decided without any case, and a whole that no case meets, or
-        every one, at the speeds that the scenario names.
-        """
-        what = "--fail-when" if self.require is None else "--require"
-        remarks = []
-        if self.require is None and self.fail_when not in CRITERIA:
-            domain = domain_of(scenario, Speeds.possible(scenario), _texts())
-            remarks += [f"{what}: {part}" for part in idle_parts(condition_of(self.words), domain)]
-        usual = Speeds.usual(scenario)
-        if not remarks and (why := self._emptiness(usual, scenario)) is not None:
-            remarks.append(f"{what}: at speeds up to {usual.vut_mps:g} m/s {why}")
-        return remarks
-
-    def _emptiness(self, speeds: Speeds, scenario: Scenario) -> str | None:
-        """Return in words that no case fails, or that every case does; None where some may."""
-        if self.require is None:
-            domain = domain_of(scenario, speeds, _texts())
-            return emptiness(condition_of(self.words), domain)
-        limits = formula_range(self.require, scenario, speeds)
-        if limits.low > 0.0:
-            return "it holds in every case, so that none fails"
-        return "it holds in no case, so that every one fails" if limits.high <= 0.0 else None
 
     @property
     def is_papers(self) -> bool:
@@ -220,11 +188,6 @@ def vocabulary() -> Vocabulary:
 def _conditions() -> dict[str, str]:
     """Return the conditions of the named criteria."""
     return {name: criterion.condition for name, criterion in CRITERIA.items()}
-
-
-def _texts() -> dict[str, frozenset[str]]:
-    """Return all that a text can be, also where an episode has none."""
-    return {name: texts | {""} if name in NO_TEXT else texts for name, texts in TEXTS.items()}
 
 
 @lru_cache

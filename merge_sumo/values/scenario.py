@@ -349,11 +349,6 @@ class Scenario:
         return self.reach_m
 
     @property
-    def fastest_start_mps(self) -> float:
-        """Highest speed at which a car other than the VUT starts."""
-        return self.v_start_max_mps
-
-    @property
     def max_steps(self) -> int:
         """Steps after which an episode that has not ended is a TIMEOUT."""
         return round(self.timeout_s / DT_S)
@@ -514,11 +509,6 @@ class MergeScenario(Scenario):
         """Distance to M of the farthest start on the mainline."""
         behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
         return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
-
-    @property
-    def fastest_start_mps(self) -> float:
-        """Highest speed at which a car of the mainline starts."""
-        return self.v_pov0_mps[1]
 
     @property
     def case_fields(self) -> tuple[str, ...]:

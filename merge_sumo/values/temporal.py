@@ -21,9 +21,8 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.expression import ALIKE_MEASURES, LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, Scenario
+from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.values.vacuity import Range, Speeds, robustness_range
 
 SIGNALS: Final = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
@@ -125,15 +124,6 @@ def robustness(text: str, trajectory: Trajectory) -> float:
     value = _robustness(text, signals(trajectory))
     size = min(max(abs(value), LEAST_MARGIN), MOST_MARGIN)
     return size if value > 0.0 else -size
-
-
-def formula_range(text: str, scenario: Scenario, speeds: Speeds) -> Range:
-    """Return between what the robustness of a formula lies at such speeds, by interval arithmetic.
-
-    Raises `ImportError` where rtamt is missing.
-    """
-    (formula,) = _specification(text).ast.specs
-    return robustness_range(formula, scenario, speeds, NEVER_S)
 
 
 def _robustness(text: str, values: dict[str, FloatArray]) -> float:
