@@ -17,22 +17,27 @@ if TYPE_CHECKING:
         Setup,
         benchmark,
         campaign,
+        check_scenario,
         check_vut,
         compare,
         explain,
         export,
+        new_scenario,
         open_in_gui,
         open_run,
         probability,
+        repair,
         replay,
         report,
+        reproduce,
         rerun,
         resume,
-        run_case,
+        run,
+        scenarios,
         stress,
         train,
         truth,
-        truths,
+        vuts,
     )
     from merge_sumo.errors import Notice, UserError
 
@@ -50,22 +55,27 @@ __all__ = [
     "__version__",
     "benchmark",
     "campaign",
+    "check_scenario",
     "check_vut",
     "compare",
     "explain",
     "export",
+    "new_scenario",
     "open_in_gui",
     "open_run",
     "probability",
+    "repair",
     "replay",
     "report",
+    "reproduce",
     "rerun",
     "resume",
-    "run_case",
+    "run",
+    "scenarios",
     "stress",
     "train",
     "truth",
-    "truths",
+    "vuts",
 ]
 
 if not TYPE_CHECKING:
@@ -86,4 +96,4 @@ if not TYPE_CHECKING:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted(__all__)

@@ -18,7 +18,7 @@ import numpy as np
 from bench_record import add_record_option, append_record
 
 from merge_sumo.analysis.exposure import read_distribution
-from merge_sumo.api import truths
+from merge_sumo.api import truth as truth_of
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -48,7 +48,7 @@ def main() -> None:
         plan = resolve(CAMPAIGN)
         study = RunStudy(run_campaign(CAMPAIGN, plan, Path(folder) / "run"), CAMPAIGN, plan)
         cells = expected_cells(study, read_distribution(None, (0,), US23))
-    truth = truths("design1", 0, cases=given.truth_cases).truths[0]
+    truth = truth_of("design1", 0, cases=given.truth_cases).truths[0]
     failing = truth.score < -500.0
     shape = cells_of(US23, 0)
     number = np.ravel_multi_index(tuple((truth.points * shape).astype(np.int64).T), shape)

@@ -61,7 +61,7 @@ def main() -> None:
         print(f"seed {seed}", *found.lines()[:-1], sep="\n  ")
         if found.spec is not None:
             truths = [
-                api.truths(spec, cases=asked.truth_cases, seed=TRUTH_SEED, workers=None).truths
+                api.truth(spec, cases=asked.truth_cases, seed=TRUTH_SEED, workers=None).truths
                 for spec in (asked.vut, found.spec)
             ]
             figures[str(seed)] = {

@@ -74,7 +74,6 @@ from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policie
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine, SimulationPlan
-from merge_sumo.engine.povs import ONE as ONE_LEVEL
 from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
@@ -107,7 +106,7 @@ from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.probability import ProbabilityResult
 from merge_sumo.studies.run_study import RunStudy, notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
-from merge_sumo.studies.truth import Repeats, Truth
+from merge_sumo.studies.truth import Repeats
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
@@ -148,7 +147,7 @@ __all__ += [
     "open_run",
 ]
 __all__ += ["probability", "repair", "replay", "report", "reproduce", "rerun", "resume"]
-__all__ += ["run_case", "scenarios", "stress", "train", "truth", "truths", "vuts"]
+__all__ += ["run", "scenarios", "stress", "train", "truth", "vuts"]
 
 AnyPath = Path | str
 AnyRun = CampaignRun | Path | str
@@ -346,7 +345,7 @@ def _opened(run: AnyRun) -> CampaignRun:
 # Cases
 
 
-def run_case(
+def run(
     vut: AnyVut | None = None,
     case: Mapping[str, Any] | None = None,
     *,
@@ -640,27 +639,6 @@ def compare(
 # Studies
 
 
-def truth(
-    vut: AnyVut,
-    level: int | str,
-    *,
-    cases: int | None = None,
-    seed: int = 0,
-    engine: str | None = None,
-    repeat: int | None = None,
-    tolerated: float = 0.0,
-    **given: Unpack[StudyKeywords],
-) -> Truth:
-    """Return the ground truth of a VUT at one level; see `truths`, whose arguments these are."""
-    check_keywords("truth", given, StudyKeywords)
-    if str(level) == "all":
-        raise UserError(f"--level all does not go here: choose {ONE_LEVEL}")
-    settings, runner = settings_for(vut, {**given, "level": level})
-    with _study(settings, runner, engine) as study:
-        repeats = _repeats_of(settings, repeat, tolerated)
-        return study.truth(settings.levels[0], cases, seed, repeats)
-
-
 def _repeats_of(settings: CampaignSettings, repeat: int | None, tolerated: float) -> Repeats | None:
     """Return how often the cases of a truth run; None for once, also where nothing is random."""
     most = repeat if repeat is not None else MOST_RUNS if tolerated else 1
@@ -668,7 +646,7 @@ def _repeats_of(settings: CampaignSettings, repeat: int | None, tolerated: float
     return repeats if repeats.most > 1 and settings.may_vary else None
 
 
-def truths(
+def truth(
     vut: AnyVut,
     level: int | str = "all",
     *,
@@ -696,7 +674,7 @@ def truths(
     A cached truth is used again. The truth of an object of this process is not kept: its name does
     not tell it from another object.
     """
-    check_keywords("truths", given, StudyKeywords)
+    check_keywords("truth", given, StudyKeywords)
     settings, runner = settings_for(vut, {**given, "level": level})
     with _study(settings, runner, engine) as study:
         repeats = _repeats_of(settings, repeat, tolerated)
@@ -808,7 +786,7 @@ def probability(
         confidence: chance that the interval holds the probability.
         seed: same seed, same cases.
         out: new file to write; `probability.json` in the folder of the campaign by default.
-        engine: "sumo", or "kinematic": see `truths`.
+        engine: "sumo", or "kinematic": see `truth`.
         given: how the drivers run, where it is to change, and where the cases run: see
             `RerunKeywords`.
     """

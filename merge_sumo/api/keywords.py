@@ -60,7 +60,7 @@ class Setup(Hosting, total=False):
 
 
 class CaseKeywords(Setup, total=False):
-    """Keywords of `run_case`: those of `Setup`, and the coordinates of the case.
+    """Keywords of `run`: those of `Setup`, and the coordinates of the case.
 
     Attributes:
         x_pov0_m: initial position of the POV's front bumper, relative to M, in m.

@@ -168,7 +168,7 @@ def run(
 
     options = given.keywords if case is None else given.written
     options = {**options, **_coordinates(at or [])}
-    result = api.run_case(recorded=case, gui=gui, out=out, on_end=ended, **options)
+    result = api.run(recorded=case, gui=gui, out=out, on_end=ended, **options)
     raise typer.Exit(0 if result.passed else 1)
 
 

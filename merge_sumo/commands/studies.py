@@ -69,7 +69,7 @@ def truth(given: Given, vut: VutOption) -> None:
     """
     from merge_sumo import api
 
-    given.print(api.truths(vut, **given.keywords))
+    given.print(api.truth(vut, **given.keywords))
 
 
 @app.verb(

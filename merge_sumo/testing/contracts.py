@@ -265,7 +265,7 @@ class VutContract:
         """A case alone has the outcome that it had among others."""
         for run in self.runs():
             for index in (0, 7):
-                alone = api.run_case(self.vut, recorded=(run.folder, index))
+                alone = api.run(self.vut, recorded=(run.folder, index))
                 assert alone.measures == run.outcome(index).measures
 
     def test_sees_with_late_sensors_what_was_before(self) -> None:

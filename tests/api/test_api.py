@@ -105,7 +105,7 @@ class TestWrongValues:
             ({"batch": 2.5}, "batch is 2.5: it must be a whole number"),
             ({"fail_when": 3}, "fail_when is 3: it must be a text"),
             ({"deadline_s": "x"}, "deadline_s is 'x': it must be a number"),
-            ({"workers": "2"}, "--workers is '2': it must be a whole number, 1 or more"),
+            ({"workers": "2"}, "workers is '2': give a number of processes"),
             ({"workers": 0}, "--workers is 0: it must be a whole number, 1 or more"),
         ],
     )
@@ -117,7 +117,7 @@ class TestWrongValues:
 
     def test_of_a_case(self):
         with pytest.raises(UserError, match="x_pov0_m is 'a': it must be a number"):
-            ms.run_case("design2", {"x_pov0_m": "a"}, v_pov0_mps=30.0)
+            ms.run("design2", {"x_pov0_m": "a"}, v_pov0_mps=30.0)
 
     @pytest.mark.parametrize("values", [{"cases": 2.5}, {"cases": 0}, {"cases": "x"}, {"seed": -1}])
     def test_of_a_truth(self, values):

@@ -120,8 +120,8 @@ def test_an_interrupted_campaign_says_how_to_go_on_and_does(notebook):
 @pytest.mark.parametrize(
     ("source", "shown"),
     [
-        ("ms.run_case(MyVut, level=0, x_pov0_m=-300, v_pov0_mps=33)", "<case: "),
-        ("ms.truth(MyVut, 0, cases=20)", "<Truth: "),
+        ("ms.run(MyVut, level=0, x_pov0_m=-300, v_pov0_mps=33)", "<case: "),
+        ("ms.truth(MyVut, 0, cases=20)", "<TruthResult: "),
         ("ms.compare(['whole', 'whole'], out='page.html')", "<Comparison: 0 cases broke"),
         ("ms.rerun('whole', [0, 1], vut=MyVut)", "<Comparison: "),
         ("ms.open_run('whole').trajectory(0)", "<Trajectory: 2 vehicles, "),

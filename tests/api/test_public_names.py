@@ -9,10 +9,13 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
 
 import merge_sumo as ms
+from merge_sumo import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "python.md"
@@ -49,15 +52,17 @@ for vut in (keep, "design2", Batched, Mine()):
     ms.campaign(vut, deadline_s=1.0)
 worst: int = run.failures[0]["index"]
 print(run.verdict.failures, run.summary.levels[0].fmc, run.report_file, run.facts[0].file)
-case: ms.CaseRun = ms.run_case(Mine, run.failures[0], level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
-again = ms.run_case(recorded=(run, 3), debug=True)
+case: ms.CaseRun = ms.run(Mine, run.failures[0], level=0, x_pov0_m=-300.0, v_pov0_mps=30.0)
+again = ms.run(recorded=(run, 3), debug=True)
 print(case.measures.end, case.failed, again.trajectory.motion[0, 0, 0])
 ms.resume(run, cases=80, workers=2)
 print(ms.rerun(run, [1, 2], vut="design2", level=0).broke, ms.stress(run).robust)
 print(ms.compare([run, "runs/b"], out="page.html", junit="junit.xml").worse)
 print(ms.export(run, 3)[0].name, ms.report(run).lines(), ms.replay(run, 3).diverged_at_s)
 code: int = ms.open_in_gui(run, 3)
-print(ms.truth(Mine, 0, cases=100).failures.shape, ms.truths("fsm").truths[0].score.mean())
+print(ms.truth(Mine, 0, cases=100).truths[0].failures.shape, ms.vuts().lines())
+print(ms.scenarios(), ms.new_scenario("a.toml", net="a.net.xml", mainline="a b", ramp="r b"))
+print(ms.check_scenario("us23"), ms.reproduce(quick=True))
 print(ms.benchmark("fsm", 0, samplers=["uniform"], seeds=2).samplers["uniform"].fmc.median)
 print(ms.probability(run, cases=100).found.overall.low)
 print(ms.repair(run, ["gain=0..1"], trials=9).repair.spec)
@@ -114,7 +119,36 @@ class TestATypeChecker:
         assert mypy(tmp_path, WRONG) == wrong
 
 
+def commands(group: Any, front: str = "") -> set[str]:
+    """Return what a person types for each command."""
+    below = getattr(group, "commands", None)
+    if below is None:
+        return {front}
+    return {
+        name for part, one in below.items() for name in commands(one, f"{front} {part}".strip())
+    }
+
+
+OF_SCENARIO = {
+    "scenario list": "scenarios",
+    "scenario new": "new_scenario",
+    "scenario check": "check_scenario",
+}
+NO_COMMAND = {"open_in_gui", "open_run", "resume"}
+"""Functions for `replay --gui`, for what a command prints, and for `campaign --resume`."""
+
+
 class TestTheNames:
+    def test_are_those_of_the_commands(self):
+        typed = commands(typer.main.get_command(cli.app))
+        verbs = {OF_SCENARIO.get(name, name.replace("-", "_")) for name in typed}
+        assert verbs == {name for name in ms.__all__ if name.islower()} - NO_COMMAND - {
+            "__version__"
+        }
+
+    def test_show_nothing_internal_in_dir(self):
+        assert dir(ms) == sorted(ms.__all__)
+
     def test_are_all_there_and_in_dir(self):
         assert set(ms.__all__) <= set(dir(ms))
         assert all(getattr(ms, name) is not None for name in ms.__all__)

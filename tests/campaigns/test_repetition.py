@@ -217,11 +217,11 @@ class TestACampaign:
         resume_campaign(folder)
         assert path.read_bytes() == before
         assert [one for one in read_repeats(run) if not one.same] == []
-        again = api.run_case(settings.vut, recorded=(folder, repeats[0].index))
+        again = api.run(settings.vut, recorded=(folder, repeats[0].index))
         assert again.outcome.case == repeats[0].case
         assert again.measures == repeats[0].measures
         row = api.open_run(folder).cases[repeats[0].index]
-        as_row = api.run_case(settings.vut, case=row, fail_when=settings.fail_when)
+        as_row = api.run(settings.vut, case=row, fail_when=settings.fail_when)
         assert as_row.outcome.case == repeats[0].case
 
     def test_refuses_other_repeats_of_a_folder(self, tmp_path):

@@ -90,7 +90,7 @@ class World:
     def judged(self, case: Case) -> bool:
         """Return whether a case fails when it is run alone."""
         given = {name: getattr(case, name) for name in OF_A_CASE}
-        found = ms.run_case(
+        found = ms.run(
             self.tried.vut,
             level=self.tried.level,
             scenario=self.scenario,

@@ -237,7 +237,7 @@ class TestEveryKindOfVut:
     @pytest.mark.slow
     def test_behind_traci_no_car_is_shown_where_there_is_no_road(self, tmp_path):
         command = program(tmp_path, TRACI_LAW)
-        ran = ms.run_case(
+        ran = ms.run(
             f"traci:{command}",
             x_pov0_m=-250.0,
             v_pov0_mps=29.0,
@@ -251,7 +251,7 @@ class TestEveryKindOfVut:
 
     def test_but_for_those_that_see_in_sumo(self):
         with pytest.raises(UserError, match="sees other cars in SUMO itself"):
-            ms.run_case("sumo:IDM", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0.1")
+            ms.run("sumo:IDM", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0.1")
 
 
 class TestSettings:
@@ -271,13 +271,13 @@ class TestSettings:
         assert 0.0 <= min(delays) < 0.2
         assert 0.3 < max(delays) <= 0.5
         assert not ms.rerun(run).worse
-        again = ms.run_case(recorded=(run, 3))
+        again = ms.run(recorded=(run, 3))
         assert again.measures == run.run.outcome(3).measures
         assert "sensing delay" in run.report().read_text(encoding="utf-8")
 
     def test_of_a_scenario_file(self, tmp_path):
         (tmp_path / "late.toml").write_text("[sense]\ndelay_s = [0.0, 1.0]\n[act]\nlag_s = 0.3\n")
-        ran = ms.run_case(
+        ran = ms.run(
             "design2",
             {"x_pov0_m": -250.0, "v_pov0_mps": 29.0, "sense_delay_s": 0.4},
             scenario=tmp_path / "late.toml",
@@ -303,11 +303,11 @@ class TestSettings:
     )
     def test_that_make_no_sensors_are_refused_in_a_sentence(self, text, said):
         with pytest.raises(UserError) as error:
-            ms.run_case("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense=text)
+            ms.run("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense=text)
         assert str(error.value).startswith(said)
 
     def test_of_a_range_need_a_number_in_a_case(self):
         with pytest.raises(UserError, match="sense_delay_s=NUMBER is missing"):
-            ms.run_case("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
+            ms.run("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
         with pytest.raises(UserError, match="sense_delay_s=NUMBER is none of the coordinates"):
-            ms.run_case("design2", {"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)
+            ms.run("design2", {"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)

@@ -93,19 +93,19 @@ class TestCampaignOfBraking:
 
     def test_a_case_is_run_again_replayed_and_looked_at(self, run, tmp_path):
         worst = next(o for o in run.run.outcomes if o.failed)
-        again = ms.run_case(keep_distance, recorded=(run, worst.index), out=tmp_path / "case")
+        again = ms.run(keep_distance, recorded=(run, worst.index), out=tmp_path / "case")
         assert again.measures == worst.measures
         assert "contact" in "\n".join(again.lines())
         assert ms.replay(tmp_path / "case").identical
 
     def test_coordinates_are_given_by_name(self):
         keywords: dict[str, Any] = {"scenario": BrakingScenario(), "level": 0}
-        near = ms.run_case(keep_distance, case={"gap0_m": 6.0, "a_pov_mps2": -1.0}, **keywords)
+        near = ms.run(keep_distance, case={"gap0_m": 6.0, "a_pov_mps2": -1.0}, **keywords)
         assert near.outcome.case.gap0_m == 6.0
         with pytest.raises(UserError, match="--at a_pov_mps2=NUMBER is missing"):
-            ms.run_case(keep_distance, case={"gap0_m": 6.0}, **keywords)
+            ms.run(keep_distance, case={"gap0_m": 6.0}, **keywords)
         with pytest.raises(UserError, match="a case has no gap: it has gap0_m"):
-            ms.run_case(keep_distance, **(keywords | {"gap": 6.0}))
+            ms.run(keep_distance, **(keywords | {"gap": 6.0}))
 
     def test_its_road_is_one_lane(self):
         lines = api.check_scenario(BrakingScenario()).lines()

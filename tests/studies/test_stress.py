@@ -59,9 +59,7 @@ def test_verdicts_flip_as_the_cases_by_themselves_say(run, found, name):
     scenario = replace(US23, **TRIED[name])
     chosen = {*flips.passes[:2], *flips.fails[:2], *found.failures[:3]}
     for row in (run.cases[index] for index in chosen):
-        now = ms.run_case(
-            "design2", row, level=row["level"], scenario=scenario, fail_when=FAIL_WHEN
-        )
+        now = ms.run("design2", row, level=row["level"], scenario=scenario, fail_when=FAIL_WHEN)
         index = row["index"]
         assert now.failed == ((index in found.failures) != (index in (*flips.passes, *flips.fails)))
 

@@ -39,7 +39,7 @@ def truth_of(**keywords: float) -> Truth:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # it says that an object drives in this process
         fails = 'end == "TIMEOUT"'
-        return ms.truth(Coin, 0, cases=12, fail_when=fails, workers=1, **keywords)  # type: ignore[arg-type]
+        return ms.truth(Coin, 0, cases=12, fail_when=fails, workers=1, **keywords).truths[0]  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("tolerated", "most"), [(0.0, 3), (0.6, MOST_RUNS), (0.2, 5)])
@@ -66,4 +66,4 @@ def test_runs_that_are_no_number_of_runs_are_refused():
 
 
 def test_what_is_known_to_have_no_chance_runs_once():
-    assert ms.truth("design2", 0, cases=20, tolerated=0.2, workers=1).runs is None
+    assert ms.truth("design2", 0, cases=20, tolerated=0.2, workers=1).truths[0].runs is None

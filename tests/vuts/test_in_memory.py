@@ -68,7 +68,7 @@ class TestASpec:
 
     def test_that_was_an_object_of_another_process_says_so(self):
         with pytest.raises(ms.UserError, match="was an object of a Python process"):
-            ms.run_case("here:gone", x_pov0_m=-300, v_pov0_mps=30)
+            ms.run("here:gone", x_pov0_m=-300, v_pov0_mps=30)
 
 
 class TestWhatTravels:
@@ -192,16 +192,16 @@ def test_the_main_module_is_whole_again_after_processes_have_started():
 
 class TestTheOtherFunctions:
     def test_one_case_shows_itself(self):
-        found = ms.run_case("design2", level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
+        found = ms.run("design2", level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
         assert found.failed
         assert repr(found).startswith("<case: MERGED at 9.3 s, contact")
         assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
 
     def test_one_case_takes_a_row_of_a_campaign(self, run):
         row = ms.open_run(run.folder).failures[0]
-        again = ms.run_case("design1", row)
+        again = ms.run("design1", row)
         assert again.outcome.measures.score == row["score"]
-        assert not ms.run_case("design2", row, v_pov0_mps=25).failed
+        assert not ms.run("design2", row, v_pov0_mps=25).failed
 
     @pytest.mark.parametrize(
         ("values", "part"),
@@ -209,7 +209,7 @@ class TestTheOtherFunctions:
     )
     def test_one_case_is_refused(self, values, part):
         with pytest.raises(ms.UserError, match=part):
-            ms.run_case("design2", **values)
+            ms.run("design2", **values)
 
     def test_cases_run_again_with_another_vut(self, run):
         worst = ms.open_run(run.folder).failures[0]["index"]
@@ -230,7 +230,7 @@ class TestTheOtherFunctions:
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = ms.truth(lambda _: 0.0, 0, cases=20)
+            found = ms.truth(lambda _: 0.0, 0, cases=20).truths[0]
         assert found.points.shape == (20, 2)
         assert [*tmp_path.glob("*.npz")] == []
         ms.truth("level0", 0, cases=20)
