@@ -7,7 +7,6 @@
     python tools/bench_samplers.py --trials --seeds 10 --first 1000
     python tools/bench_samplers.py --held-out --seeds 6 --first 2000
     python tools/bench_samplers.py --dense --vut design1 --level 0 --seeds 10 --first 1000
-    python tools/bench_samplers.py --dense --cases 100 --batch 2 --learned-from old.py:Vut
 
 The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
 own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
@@ -20,8 +19,7 @@ and prints medians with the least and the most after 100 and 400 cases.
 
 `--dense` measures against a dense truth of 1,000,000 cases by the kinematic engine: the share of
 its FMC after few cases, and the cases to .9 of it as a ratio to those of an oracle, which knows all
-failures of the truth and takes the most useful one each time. With `--learned-from` the twin has
-learned from a campaign of 100 cases on another version of the VUT.
+failures of the truth and takes the most useful one each time.
 """
 
 from __future__ import annotations
@@ -147,7 +145,6 @@ LEARNED_CASES = 100
 def print_dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     """Print and return how soon samplers find the failures of a dense truth."""
     vut, level, cases = options.vut, options.level, options.cases
-    learned_from = options.learned_from
     plan = resolve(CampaignSettings(vut=vut, levels=(level,), scenario=US23)).with_engine(
         Engine.KINEMATIC
     )
@@ -164,8 +161,7 @@ def print_dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, 
     for name in names:
         shares, needed = [], []
         for seed in range(options.first, options.first + options.seeds):
-            others = [] if learned_from is None else _motions(learned_from, level, seed)
-            points, index = _failures(plan, name, level, seed, others, options.batch, cases)
+            points, index = _failures(plan, name, level, seed, options.batch, cases)
             shares.append([fmc(points[index < n]) / whole for n in soon])
             needed.append(_cases_to(MOST * whole, points, index, cases))
         low, median, high = np.quantile(needed, (0.25, 0.5, 0.75), method="nearest").tolist()
@@ -184,27 +180,17 @@ def _failures(
     name: str,
     level: int,
     seed: int,
-    others: Sequence[Any],
     batch: int | None,
     cases: int,
 ) -> tuple[Any, Any]:
     """Return the failures that a sampler finds, (m, d), and their indices, (m,)."""
     pool = Pool(levels=(level,), scenario=US23)
-    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed, others))
+    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
     batch = batch or (None if sampler.predictor else BATCH)
     batches = conduct(sampler, lambda asked: enumerate(run_cases(plan, asked)), cases, batch)
     failed = [outcome for ran in batches for outcome, _ in ran if outcome.failed]
     points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
     return points, np.array([outcome.index for outcome in failed], dtype=np.int64)
-
-
-def _motions(vut: str, level: int, seed: int) -> list[Any]:
-    """Return the motions of a campaign on another version of a VUT."""
-    settings = CampaignSettings(vut=vut, levels=(level,), scenario=US23)
-    plan, pool = resolve(settings), settings.pool
-    sampler = make_sampler("coverage", pool, seed, Twin(pool, plan.povs, seed))
-    batches = conduct(sampler, lambda cases: enumerate(run_cases(plan, cases)), LEARNED_CASES, None)
-    return [trajectory.motion for ran in batches for _, trajectory in ran]
 
 
 def _cases_to(wanted: float, points: Any, index: Any, most: int) -> float:
@@ -362,7 +348,6 @@ def main() -> None:
         f"{', '.join(DEVELOPMENT)}",
     )
     parser.add_argument("--dense", action="store_true", help="beside a dense truth and an oracle")
-    parser.add_argument("--learned-from", metavar="VUT", help="of --dense: an earlier version")
     parser.add_argument("--batch", type=int, help="of --dense: cases of a batch")
     parser.add_argument("--cases", type=int, default=max(SOON), help="of --dense: cases in all")
     parser.add_argument("--time", action="store_true", help="time batches up to N = 5,000")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypedDict
@@ -93,7 +93,6 @@ class Settings(Setup, total=False):
         repeat: how often each case runs, once by default, with another draw of what is random;
             "auto" repeats cases where chance decides. Runs count as cases.
         tolerated: share of its runs in which a case may fail, 0 by default: it fails where more do.
-        learn_from: folders of earlier campaigns to learn the VUT from.
         against: an earlier version of the VUT, anything that `vut` takes but "traci": the sampler
             looks for cases that the VUT alone fails.
     """
@@ -107,7 +106,6 @@ class Settings(Setup, total=False):
     stop_after_converged: float | None
     repeat: int | Literal["auto"]
     tolerated: float
-    learn_from: Sequence[Path | str] | None
     against: AnyVut | None
 
 
@@ -242,8 +240,6 @@ def recordable(given: Mapping[str, Any]) -> dict[str, Any]:
         del fields["fail_when"]
     if fields.get("policies") is not None:
         fields["policies"] = str(fields["policies"])
-    if "learn_from" in fields:
-        fields["learn_from"] = tuple(map(str, fields["learn_from"] or ()))
     return fields
 
 

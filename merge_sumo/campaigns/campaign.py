@@ -18,7 +18,6 @@ from merge_sumo.campaigns.repeats import repeat, write_repeats
 from merge_sumo.campaigns.sampler_copy import search_on_two_cores
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.campaigns.store import FILES, RAN_AGAIN, Batch, Journal, Run, spread_failures
-from merge_sumo.campaigns.transfer import lessons
 from merge_sumo.engine.evaluate import (
     CaseResult,
     evaluate,
@@ -439,11 +438,9 @@ class _Noted:
 
 
 def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
-    """Return the twin of the VUT, which has learned from earlier campaigns."""
-    learned = lessons(settings.learn_from, settings.scenario)
-    others = [motion for motions in learned.values() for motion in motions]
+    """Return the twin of the VUT."""
     lines = centre_lines(plan.road)
-    return Twin(settings.pool, plan.povs, settings.seed, others, plan.criterion, lines)
+    return Twin(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
 
 
 def twins_of(settings: CampaignSettings, new: SimulationPlan, old: SimulationPlan) -> TwinPair:

@@ -10,7 +10,6 @@ from typing import Any, Final, Literal
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.stopping import StoppingRule
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
-from merge_sumo.campaigns.transfer import hashes, lessons
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
@@ -51,7 +50,6 @@ class CampaignSettings:
     policies: str | None = None
     pov: str | None = None
     against: str | None = None
-    learn_from: tuple[str, ...] = ()
     scenario: Scenario
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
@@ -103,7 +101,6 @@ class CampaignSettings:
             ("--policies", self.policies),
             ("--pov", self.pov),
             ("--against", self.against),
-            *(("--learn-from", folder) for folder in self.learn_from),
         ):
             if text is not None and not _is_text(text):
                 raise UserError(
@@ -112,13 +109,7 @@ class CampaignSettings:
                 )
 
     def _check_sampler(self) -> None:
-        sampler = self.new_sampler()
-        if self.learn_from and not sampler.uses_predictions:
-            able = [name for name, kind in SAMPLERS.items() if kind.uses_predictions]
-            raise UserError(
-                f"--learn-from needs a sampler that plays cases out: choose --sampler "
-                f"{' or '.join(able)}"
-            )
+        self.new_sampler()
 
     def _check_in_flight(self, in_flight: int) -> None:
         if self.batch is not None:
@@ -140,7 +131,6 @@ class CampaignSettings:
     def _check_against(self, against: str) -> None:
         for option, given in (
             ("--in-flight", self.in_flight),
-            ("--learn-from", self.learn_from or None),
             ("--repeat", None if self.repeat == 1 else self.repeat),
             ("--tolerate", self.tolerated or None),
         ):
@@ -247,7 +237,6 @@ def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any
         "pov_files": plan.povs.files or None,
         "net_sha256": plan.road.sha256,
         "policies_sha256": dict(plan.policies_sha256),
-        "learn_from_sha256": hashes(lessons(settings.learn_from, settings.scenario)) or None,
     }
 
 

@@ -25,9 +25,7 @@ from merge_sumo.errors import UserError
 if TYPE_CHECKING:
     from merge_sumo.api import CaseRun
 
-SETTINGS: Final = (
-    *("vut", "against", "level", "sampler", "cases", "in_flight", "seed", "learn_from"),
-)
+SETTINGS: Final = (*("vut", "against", "level", "sampler", "cases", "in_flight", "seed"),)
 COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
 
 

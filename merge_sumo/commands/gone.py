@@ -39,6 +39,7 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--dask": "--workers takes the address of a Dask scheduler, too: --workers tcp://HOST:PORT",
     "--dense": "`merge-sumo truth --cases 1000000` makes a dense truth, which is used from then on",
     "--no-dense": "a dense truth is used where `merge-sumo truth --cases 1000000` has made one",
+    "--learn-from": "a campaign learns by itself; --against OLD searches for what changed",
     "--limit": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--problems": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--samplers": "`merge-sumo benchmark` compares samplers on a VUT",

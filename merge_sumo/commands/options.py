@@ -51,7 +51,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
     ),
     "Limits": ("vut_memory",),
     "For experts": (
-        *("require", "pov", "policies", "sampler", "batch", "in_flight", "learn_from"),
+        *("require", "pov", "policies", "sampler", "batch", "in_flight"),
         *("engine", "deadline"),
     ),
 }
@@ -197,13 +197,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="N",
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
-    "learn_from": optional(
-        list[Path],
-        "An earlier campaign, of another version or at other levels, to learn the VUT from. May be "
-        "given several times.",
-        metavar="RUN",
-        autocompletion=complete.runs,
-    ),
     "stop_after_converged": optional(
         float,
         "Stop early when, three batches in a row, the next batch is expected to add less than this "

@@ -378,7 +378,6 @@ def fresh_settings(
         vut=spec,
         seed=today.seed + asked.seed + number,
         cases=cases,
-        learn_from=(),
         stop_after_converged=None,
         **few,
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.engine.povs import Povs
 from merge_sumo.samplers.prediction_skill import Query
-from merge_sumo.twin.experts import GROUPS, LABELS, Expert, Forest, Steps
+from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
 from merge_sumo.twin.observation import HISTORY, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.values.bodies import CentreLines
@@ -20,8 +20,6 @@ from merge_sumo.values.scenario import VUT
 from merge_sumo.values.score import Outcome
 
 EXPERTS: Final = (Expert(history=False), Expert(history=True))
-TAUGHT: Final = (Expert(history=False, others=True), Expert(history=True, others=True))
-"""Experts, and those that there are besides where other campaigns are learned from."""
 FEWEST: Final = 4
 """Cases that it takes to play at all."""
 AT_ONCE: Final = 100
@@ -46,14 +44,10 @@ class Twin:
         pool: Pool,
         povs: Povs,
         seed: int,
-        others: Sequence[FloatArray] = (),
         criterion: Criterion = PAPER_CRITERION,
         lines: CentreLines | None = None,
     ) -> None:
-        """Know the pool and its POVs, what counts as a failure, and the road's centre lines.
-
-        `others` are motions, (T + 1, A, 3), of campaigns that are learned from.
-        """
+        """Know the pool and its POVs, what counts as a failure, and the road's centre lines."""
         self._pool, self._seed = pool, seed
         self._now = Observation(pool.scenario, 0).now
         self._rollout = TwinRollout(pool, povs, criterion, lines)
@@ -63,8 +57,6 @@ class Twin:
         """What the VUT saw and did, of cases that were learned from lately."""
         self._learned: dict[int, tuple[int, ...]] = {}
         """By group, the cases that its members learn from; empty after each new outcome."""
-        self._others = self._observed_steps(others, own=False)
-        self._experts = (*EXPERTS, *TAUGHT) if self._others else EXPERTS
         self._members: dict[tuple[int, int], tuple[tuple[int, ...], Any]] = {}
         """By expert and group: from which cases it has learned, and what."""
         self._asks: tuple[list[Any], Forest] | None = None
@@ -80,8 +72,7 @@ class Twin:
 
     def can_predict(self, level: int) -> bool:
         """Return whether it has seen enough, and the POV is no program of a person's own."""
-        known = len(self._motions) >= FEWEST or bool(self._others)
-        return known and self._rollout.can_predict(level)
+        return len(self._motions) >= FEWEST and self._rollout.can_predict(level)
 
     def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
         """Return the gaps at M of each query; see `Predictor`.
@@ -91,8 +82,7 @@ class Twin:
         asked = [self._asked(query) for query in queries]
         starts = []
         for query, (members, places) in zip(queries, asked, strict=True):
-            labels = np.ones((LABELS, sum(map(len, places))), dtype=np.float32)
-            labels[-1] = np.repeat(members, list(map(len, places)))
+            labels = np.repeat(members, list(map(len, places)))[None].astype(np.float32)
             starts.append(Starts(query.level, query.points[np.concatenate(places)], labels))
         gaps_m = self._rollout.play(starts, self._forest().answer)
         return [
@@ -106,7 +96,7 @@ class Twin:
         if query.screening is not None:
             member = query.screening * GROUPS + self._last_batch() % GROUPS
             return [member], [everywhere]
-        members = list(range(len(self._experts) * GROUPS))
+        members = list(range(len(EXPERTS) * GROUPS))
         if not query.held_out:
             return members, [everywhere] * len(members)
         group = np.array(query.held_out) % GROUPS
@@ -119,27 +109,18 @@ class Twin:
         if not query.held_out:
             groups = GROUPS if query.screening is None else 1
             return found_m.reshape(-1, groups, len(query.points))
-        gaps_m = np.empty((len(self._experts), len(query.points)))
+        gaps_m = np.empty((len(EXPERTS), len(query.points)))
         expert = np.repeat(np.arange(len(places)) // GROUPS, list(map(len, places)))
         gaps_m[expert, np.concatenate(places)] = found_m
         return gaps_m
 
-    def _speakers(self) -> list[int]:
-        """Return who speaks for each expert: who knows nothing of this VUT lets others speak."""
-        first = 0 if self._motions else len(EXPERTS)
-        return [max(e, e % len(EXPERTS) + first) for e in range(len(self._experts))]
-
     def _forest(self) -> Forest:
         """Return the trees of all members, those of an expert together."""
-        speakers = self._speakers()
-        trees = [self._member(e, g) for e in speakers for g in range(GROUPS)]
+        trees = [self._member(e, g) for e in range(len(EXPERTS)) for g in range(GROUPS)]
         if self._asks is None or any(
             one is not other for one, other in zip(self._asks[0], trees, strict=True)
         ):
-            inputs = self._now + HISTORY
-            places = [self._experts[e].places(self._now, inputs) for e in speakers]
-            places = [place for place in places for _ in range(GROUPS)]
-            self._asks = trees, Forest(trees, places, inputs + LABELS)
+            self._asks = trees, Forest(trees, self._now + HISTORY)
         return self._asks[1]
 
     def _last_batch(self) -> int:
@@ -152,10 +133,9 @@ class Twin:
         indices = self._learned[group]
         known = self._members.get((expert, group))
         if known is None or known[0] != indices:
-            cases = [steps for place, steps in enumerate(self._others) if place % GROUPS != group]
-            cases += self._steps_of(indices)
-            seed = (self._seed * len(self._experts) + expert) * GROUPS + group
-            known = indices, self._experts[expert].learn(cases, seed % 2**32)
+            cases = self._steps_of(indices)
+            seed = (self._seed * len(EXPERTS) + expert) * GROUPS + group
+            known = indices, EXPERTS[expert].learn(cases, seed % 2**32)
             self._members[expert, group] = known
         return known[1]
 
@@ -180,7 +160,7 @@ class Twin:
         self._steps.update(zip(new, watched, strict=True))
         return [self._steps[index] for index in indices]
 
-    def _observed_steps(self, motions: Sequence[FloatArray], *, own: bool = True) -> list[Steps]:
+    def _observed_steps(self, motions: Sequence[FloatArray]) -> list[Steps]:
         """Return what the VUT saw and did in motions, (T + 1, A, 3) each."""
         if not motions:
             return []
@@ -201,7 +181,6 @@ class Twin:
                 np.ascontiguousarray(inputs[: len(motion) - 1, place]),
                 observation.now,
                 motion[:-1, VUT, 2],
-                own,
             )
             for place, motion in enumerate(motions)
         ]

@@ -157,7 +157,6 @@ class TestRefuses:
         ("changes", "sentence"),
         [
             ({"in_flight": 4}, "--in-flight does not go with --against"),
-            ({"learn_from": ("run",)}, "--learn-from does not go with --against"),
             ({"against": "traci"}, "name an earlier version that needs none"),
             ({"against": "new.py:f"}, "name two versions"),
         ],

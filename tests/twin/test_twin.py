@@ -150,16 +150,14 @@ class TestForest:
     def test_answers_as_each_of_its_trees(self, count):
         rng = np.random.default_rng(count)
         cases = [
-            Steps(rng.random((30, 6)).astype(np.float32), 4, rng.random(30), own=bool(index))
-            for index in range(2)
+            Steps(rng.random((30, 6)).astype(np.float32), 4, rng.random(30)) for index in range(2)
         ]
-        experts = [Expert(history=bool(k % 2), others=k > 2) for k in range(count)]
+        experts = [Expert(history=bool(k % 2)) for k in range(count)]
         trees = [expert.learn(cases, seed) for seed, expert in enumerate(experts)]
-        forest = Forest(trees, [expert.places(4, 6) for expert in experts], 8)
-        inputs = rng.random((50, 8)).astype(np.float32)
-        inputs[:, 6] = 1.0
+        forest = Forest(trees, 6)
+        inputs = rng.random((50, 7)).astype(np.float32)
         for number, (expert, tree) in enumerate(zip(experts, trees, strict=True)):
-            inputs[:, 7] = number
+            inputs[:, 6] = number
             alone = tree.predict(expert.sees(inputs[:, :6], 4))[:, 0]
             assert forest.answer(inputs).tolist() == alone.tolist()
 
@@ -246,15 +244,6 @@ class TestTwin:
             motions,
         )
         assert not twin.can_predict(0)
-
-    def test_lets_others_speak_for_a_vut_that_it_has_not_seen(self, seen):
-        outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0, list(motions.values()))
-        assert twin.can_predict(0)
-        points = np.random.default_rng(3).random((60, 2))
-        found = twin.predict([Query(0, points)])[0]
-        off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes))
-        assert np.median(off) < 1.0
 
 
 def outcome(
@@ -351,29 +340,6 @@ class TestACampaign:
     def test_asks_for_few_cases_while_it_is_young(self, whole):
         sizes = np.bincount([o.batch for o in whole.outcomes])
         assert sizes.tolist() == [10] * 6
-
-    def test_learns_from_another_and_records_what(self, whole, tmp_path):
-        settings = replace(SETTINGS, cases=10, learn_from=(str(whole.folder),))
-        run = run_campaign(settings, tmp_path / "run")
-        recorded = run.settings["learn_from_sha256"]
-        assert list(recorded) == [str(whole.folder)]
-        assert len(recorded[str(whole.folder)]) == 64
-        assert all(o.prediction is not None for o in run.outcomes)
-
-    def test_learns_from_no_other_scenario(self, whole, tmp_path):
-        settings = replace(
-            SETTINGS,
-            cases=10,
-            scenario=named_scenario("us23-traffic"),
-            learn_from=(str(whole.folder),),
-        )
-        with pytest.raises(UserError, match="was run on us23, which is not the scenario"):
-            run_campaign(settings, tmp_path / "run")
-        assert not (tmp_path / "run").exists()
-
-    def test_learns_only_where_the_sampler_makes_something_of_it(self):
-        with pytest.raises(UserError, match="choose --sampler coverage"):
-            replace(SETTINGS, sampler="uniform", learn_from=("a",))
 
 
 def test_a_sampler_without_games_is_the_surrogate_alone():
