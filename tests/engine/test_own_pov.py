@@ -384,7 +384,8 @@ class TestResuming:
 
     def test_is_refused_by_name_when_its_file_has_changed(self, stopped, call):
         Path("my_pov.py").write_text(KEEPS)
-        assert_refused(call("campaign", "--resume", stopped), "pov_files.my_pov.py differs")
+        said = call("campaign", "--resume", stopped, "--pov", "my_pov.py:Pov", "-q")
+        assert_refused(said, "pov_files.my_pov.py differs")
 
 
 class TestOtherCommands:
