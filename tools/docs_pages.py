@@ -1,7 +1,7 @@
-"""Pages of the site that are made from the code, and what it shows from other folders.
+"""Pages of the reference that are made from the code, and what the site shows from other folders.
 
-MkDocs calls `on_files` and `on_page_markdown` (see `mkdocs.yml`);
-python tools/docs_pages.py reference/cli.md prints one.
+`python tools/docs_pages.py --write` writes those pages into docs/; a test compares them with the
+code. MkDocs calls `on_files` and `on_page_markdown` (see `mkdocs.yml`).
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ import inspect
 import re
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
 ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
 SHOWN = (
     *("CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "tests/README.md"),
     *("policies/README.md", "policies/roundabout/README.md", "policies/human/README.md"),
@@ -87,10 +89,69 @@ def measures_page() -> str:
     return f"# Measures\n\n{about}\n\n{head}{rows}"
 
 
-GENERATED: dict[str, Callable[[], str]] = {
+NAMED: Final = re.compile(r"^<!-- ([\w.]+) -->$", re.MULTILINE)
+"""A line of docs/reference/python.md that names what the text below it describes."""
+SECTION: Final = re.compile(r"^(Args|Attributes|Returns|Raises|Yields):$")
+
+
+def python_page() -> str:
+    """Return docs/reference/python.md with a description of each function and class it names."""
+    page = (DOCS / "reference/python.md").read_text(encoding="utf-8")
+    # The last one of a section is followed by a heading and perhaps text, which stay.
+    parts = re.split(r"^(?=## )", page, flags=re.MULTILINE)
+    return "".join(_described(part) for part in parts)
+
+
+def _described(part: str) -> str:
+    names = NAMED.findall(part)
+    if not names:
+        return part
+    before = part.partition("<!-- ")[0]
+    return before + "".join(f"<!-- {name} -->\n{_description(name)}\n" for name in names)
+
+
+def _description(path: str) -> str:
+    """Return heading, signature, docstring, and the methods and properties of a class."""
+    module, _, name = path.rpartition(".")
+    one = getattr(import_module(module), name)
+    lines = [f"### {name}", ""]
+    if inspect.isfunction(one):
+        given = inspect.signature(one)
+        bare = [p.replace(annotation=p.empty) for p in given.parameters.values()]
+        shown = given.replace(parameters=bare, return_annotation=given.empty)
+        lines += ["```python", f"{name}{shown}", "```", ""]
+    lines += _docstring(one)
+    for of, member in vars(one).items() if inspect.isclass(one) else ():
+        about = inspect.getdoc(member.fget if isinstance(member, property) else member)
+        shows = isinstance(member, property) or inspect.isfunction(member)
+        if shows and about and not of.startswith("_"):
+            call = "()" if inspect.isfunction(member) else ""
+            lines.append(f"- `.{of}{call}`: {' '.join(about.partition(chr(10) * 2)[0].split())}")
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _docstring(one: Any) -> list[str]:
+    """Return a docstring in Google style as Markdown; its sections become lists."""
+    lines, section = [], False
+    for line in inspect.cleandoc(one.__doc__ or "").splitlines():
+        if SECTION.match(line):
+            lines += [f"**{line}**", ""]
+        elif section := (section or line.startswith("    ")) and line[:1] in ("", " "):
+            item = line[4:]
+            named, colon, about = item.partition(": ")
+            new = item[:1] != " " and colon
+            lines.append(f"- `{named}`: {about}" if new else f"  {item.strip()}".rstrip())
+        else:
+            lines.append(line)
+    return [*lines, ""]
+
+
+WRITTEN: dict[str, Callable[[], str]] = {
     "reference/cli.md": cli_page,
     "reference/measures.md": measures_page,
+    "reference/python.md": python_page,
 }
+"""Pages below docs/ that are written from the code."""
 
 
 def vut_kinds_table() -> str:
@@ -140,8 +201,6 @@ def on_files(files: Any, config: Any) -> Any:
     """Add to the files of the site what docs/ does not hold (MkDocs calls this)."""
     from mkdocs.structure.files import File
 
-    for page, made in GENERATED.items():
-        files.append(File.generated(config, page, content=made()))
     for path in (*SHOWN, *(p.relative_to(ROOT).as_posix() for p in ROOT.glob(PICTURES))):
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     return files
@@ -160,6 +219,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == [] or sys.argv[1] not in GENERATED:
-        sys.exit(f"name one of the pages {', '.join(GENERATED)}")
-    print(GENERATED[sys.argv[1]]())
+    if sys.argv[1:] != ["--write"]:
+        sys.exit(f"say --write to write {', '.join(WRITTEN)} into docs/")
+    for page, made in WRITTEN.items():
+        (DOCS / page).write_text(made(), encoding="utf-8")

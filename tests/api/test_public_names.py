@@ -134,8 +134,8 @@ OF_SCENARIO = {
     "scenario new": "new_scenario",
     "scenario check": "check_scenario",
 }
-NO_COMMAND = {"open_in_gui", "open_run", "resume"}
-"""Functions for `replay --gui`, for what a command prints, and for `campaign --resume`."""
+NO_COMMAND = {"open_in_gui", "open_run", "resume", "stress"}
+"""Functions for `replay --gui`, what a command prints, `campaign --resume`, `rerun --stress`."""
 
 
 class TestTheNames:
@@ -167,12 +167,12 @@ class TestTheNames:
         assert len(shown) + more <= 62
 
     def test_are_on_the_page(self):
-        shown = set(re.findall(r"^::: [\w.]+\.(\w+)$", PAGE.read_text(), re.MULTILINE))
+        shown = set(re.findall(r"^<!-- [\w.]+\.(\w+) -->$", PAGE.read_text(), re.MULTILINE))
         assert set(ms.__all__) - {"__version__"} <= shown
 
     @pytest.mark.parametrize("name", FUNCTIONS)
     def test_return_what_is_on_the_page(self, name):
-        shown = set(re.findall(r"^::: [\w.]+\.(\w+)$", PAGE.read_text(), re.MULTILINE))
+        shown = set(re.findall(r"^<!-- [\w.]+\.(\w+) -->$", PAGE.read_text(), re.MULTILINE))
         returned = str(inspect.signature(getattr(ms, name)).return_annotation)
         ours = set(re.findall(r"[A-Z]\w+", returned)) - {"Path"}
         assert ours <= shown
@@ -190,7 +190,7 @@ def classes_of_the_package() -> set[str]:
 
 
 def test_classes_of_attributes_of_what_is_returned_are_on_the_page():
-    paths = re.findall(r"^::: ([\w.]+)$", PAGE.read_text(), re.MULTILINE)
+    paths = re.findall(r"^<!-- ([\w.]+) -->$", PAGE.read_text(), re.MULTILINE)
     shown = {path.rpartition(".")[2] for path in paths}
     named = {}
     for path in paths:
