@@ -290,7 +290,7 @@ class TestACampaignThatTestedNothing:
 @pytest.fixture(scope="module")
 def mixed(vuts, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("mixed") / "run"
-    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, batch=10, seed=1)
+    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, seed=1)
     found = judge(run_campaign(settings, folder).outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
     return folder

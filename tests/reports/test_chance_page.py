@@ -67,7 +67,7 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
     text = " ".join(page.text_content().split())
     totals = page.xpath("//tr[@class='all']//b/text()")
     assert totals == [str(len(cases)), str(len(failing))]
-    runs = page.xpath("//tr[th='runs']/td/b/text()")
+    runs = page.xpath("//dl/div[dt/text()='runs']/dd/text()")
     assert runs == [str(30 * RUNS)]
     assert "arc: the share of its runs that fail" in text
     assert "chance of a run to fail, by the surrogate" in text or len(failing) < 5

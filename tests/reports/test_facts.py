@@ -71,10 +71,11 @@ def test_are_all_in_the_report_and_in_its_json(made, facts):
     cells = {
         (row[0].text_content(), n): c.text_content() for row in rows for n, c in enumerate(row)
     }
+    listed = {div[0].text: (div[0][0].text, div[1].text) for div in page.xpath("//dl/div")}
     for (name, level), fact in facts.items():
-        if level is None and (name, 1) in cells:
-            assert cells[name, 1] == fact.shown
-            assert cells[name, 2] == f"{fact.file}: {fact.key}"
+        if level is None and name in listed:
+            assert listed[name] == (f"{fact.file}: {fact.key}", fact.shown)
+    assert {name for name, level in facts if level is None} - listed.keys() == {"cases", "failures"}
     heads = [head.text for head in page.xpath("//table[contains(@class, 'levels')]//th[@class]")]
     for column, head in enumerate(heads, start=1):
         name, _, unit = head.partition(", ")
