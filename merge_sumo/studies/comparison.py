@@ -658,10 +658,12 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
             by_index[old.index] = now.outcome(old.index, old.batch)
             study.on_cases(1)
     after = [by_index[outcome.index] for outcome in before]
+    search = f"merge-sumo campaign --vut {quoted(settings.vut)}"
+    if settings.vut != run.vut:
+        search += f" --against {quoted(run.vut)}"
     source = (
-        f"the cases come from the search of {run.vut}, so what only {settings.vut} fails may lie "
-        f"elsewhere: `merge-sumo campaign --vut {quoted(settings.vut)} --against "
-        f"{quoted(run.vut)}` searches there"
+        f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
+        f"now alone fails may lie elsewhere: `{search}` searches there"
     )
     unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
     notes = []

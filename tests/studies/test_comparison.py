@@ -289,6 +289,18 @@ def test_a_rerun_says_what_is_fixed_and_where_its_cases_come_from(command_line, 
     assert "`merge-sumo campaign --vut design2 --against design1` searches there" in out
 
 
+def test_a_rerun_of_a_changed_file_names_no_campaign_of_a_version_against_itself(
+    command_line, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    Path("my_vut.py").write_text("def f(seen):\n    return 1.0\n")
+    settings = campaign_settings(vut="my_vut.py:f", cases=4, batch=4)
+    run_campaign(settings, tmp_path / "run")
+    Path("my_vut.py").write_text("def f(seen):\n    return 0.0\n")
+    _, out, _ = command_line("rerun", "run", "--vut", "my_vut.py:f")
+    assert "`merge-sumo campaign --vut my_vut.py:f` searches there" in out
+
+
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
