@@ -1,4 +1,4 @@
-"""The page of a repair: values, what they cost, the best of the trials, the fresh campaigns.
+"""The page of a repair: values, what they cost, the fresh campaigns.
 
 It is one HTML file without scripts that loads nothing.
 """
@@ -20,8 +20,6 @@ from merge_sumo.system.printable import quoted
 
 MOST_STAYING: Final = 50
 """Cases that are listed of those that still fail."""
-MOST_TRADES: Final = 20
-"""Rows of the table of trade-offs."""
 
 
 def write_repair(repair: Repair, before: Run) -> None:
@@ -37,9 +35,7 @@ def write_repair(repair: Repair, before: Run) -> None:
 
 def repair_page(repair: Repair, before: Run) -> str:
     """Return the page of a repair as HTML; `before` is the campaign that it repairs."""
-    chosen, cost = repair.chosen, repair.settings.cost
-    by_values = {tuple(trial.values.values()): trial for trial in repair.pareto()}
-    trades = sorted(by_values.values(), key=lambda t: (len(t.fails), t.extra[cost]))
+    chosen = repair.chosen
     spec = repair.spec
     return page(
         "repair.html.jinja",
@@ -47,10 +43,7 @@ def repair_page(repair: Repair, before: Run) -> str:
         repair=repair,
         before=before,
         chosen=chosen,
-        unit=MEASURED_BY[cost][1],
         costs=MEASURED_BY,
-        trades=trades[:MOST_TRADES],
-        trades_cut=cut(len(trades), MOST_TRADES),
         stays=[(index, described(before.outcome(index).case)) for index in repair.stays][
             :MOST_STAYING
         ],

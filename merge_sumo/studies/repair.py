@@ -264,17 +264,6 @@ class Repair(Result):
         """Return by how much a trial changes today's values."""
         return change_of(trial.values, self.today, self.settings.ranges)
 
-    def pareto(self) -> list[Trial]:
-        """Return the trials of its round that no other is better than in all objectives."""
-        number = 1 if self.chosen is None else self.chosen.round
-        held = [trial for trial in self.trials if trial.holds and trial.round == number]
-        aims = [(len(t.fails), _extra(t, self.settings.cost), self.change(t)) for t in held]
-        return [
-            trial
-            for trial, own in zip(held, aims, strict=True)
-            if not any(other != own and _no_worse(other, own) for other in aims)
-        ]
-
     def to_record(self) -> dict[str, Any]:
         """Return what `repair.json` holds, and `--json` prints."""
         chosen, ranges = self.chosen, self.settings.ranges
@@ -297,7 +286,6 @@ class Repair(Result):
             "broke": self.best.broke,
             "rounds": [one.to_record() for one in self.rounds],
             "trials": len(self.trials),
-            "pareto": [to_plain(trial) for trial in self.pareto()],
             "seed": self.settings.seed,
         }
 
@@ -341,10 +329,6 @@ def _indices(indices: Sequence[int]) -> str:
     """Return indices of cases in words."""
     shown = ", ".join(map(str, indices[:MOST_INDICES]))
     return f"{shown}, the first {MOST_INDICES}" if len(indices) > MOST_INDICES else shown
-
-
-def _no_worse(one: Sequence[float], other: Sequence[float]) -> bool:
-    return all(a <= b for a, b in zip(one, other, strict=True))
 
 
 def _extra(trial: Trial, cost: Cost) -> float:

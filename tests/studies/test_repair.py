@@ -269,18 +269,3 @@ def test_values_have_few_digits_and_stay_in_their_range():
     assert Range.parsed("headway_s=0.5..3").rounded(1.23456) == 1.235
     assert Range.parsed("x_m=-345..-200").rounded(-344.96) == -345.0
     assert Range("tiny", 0.0, 1e-5).rounded(1.23456e-6) == 1.23e-6
-
-
-def test_of_trials_the_pareto_set_is_that_none_is_better_than():
-    settings = mending.RepairSettings((Range("a", 0.0, 1.0),))
-
-    def trial(a: float, fails: int, extra_s: float, broke: int = 0) -> Trial:
-        cases = tuple(range(fails))
-        return Trial(1, {"a": a}, cases, tuple(range(broke)), {"time": extra_s, "braking": 0.0})
-
-    best = [trial(0.0, 4, 0.0), trial(0.2, 2, 0.3), trial(0.6, 0, 0.1), trial(0.4, 0, 0.5)]
-    worse = [trial(0.7, 0, 0.1), trial(0.1, 0, 0.0, broke=1), trial(0.5, 3, 0.4)]
-    found = mending.Repair(
-        Path("f"), "v", settings, {"a": 0.0}, (0, 1, 2, 3), 4, (), (*worse, *best)
-    )
-    assert found.pareto() == best
