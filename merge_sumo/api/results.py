@@ -239,9 +239,8 @@ class CampaignRun(Result):
         for outcome in failures(run.cases)[:1]:
             folder = quoted(run.folder / SCENARIOS / case_name(outcome.index))
             optional.append(f"worst case: merge-sumo replay {folder} --gui")
-        if self.named_again:
-            again = f"merge-sumo rerun {quoted(self.folder)}{self.named_again}"
-            optional.append(f"run it again: {again}")
+        if again := named_again(self.settings):
+            optional.append(f"run it again: merge-sumo rerun {quoted(self.folder)}{again}")
         return [line for line in optional if line is not None]
 
     def _against_lines(self) -> list[str]:
@@ -256,8 +255,8 @@ class CampaignRun(Result):
 
     @property
     def named_again(self) -> str:
-        """Options that name again the controllers that are code, which no run folder does."""
-        return named_again(self.settings)
+        """Options that name again, to go on, the controllers that are code."""
+        return named_again(self.settings, goes_on=True)
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""

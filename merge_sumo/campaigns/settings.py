@@ -301,12 +301,13 @@ def controllers(record: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def named_again(record: Mapping[str, Any]) -> str:
+def named_again(record: Mapping[str, Any], *, goes_on: bool = False) -> str:
     """Return the options that name the controllers of a record again, for the end of a command.
 
-    Empty where a run folder names them all.
+    Empty where a run folder names them all. Only a campaign that goes on runs an earlier version.
     """
-    return "".join(f" --{name} {quoted(spec)}" for name, spec in controllers(record).items())
+    named = controllers(record if goes_on else {**record, "against": None})
+    return "".join(f" --{name} {quoted(spec)}" for name, spec in named.items())
 
 
 def _check_still_there(folder: Path, policies: str) -> None:

@@ -183,7 +183,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
 
 
 @app.verb(
-    options=("level", *HOSTING, "policies", *RUNNING),
+    options=("level", *HOSTING, "pov", "policies", *RUNNING),
     own={"vut": VUT_AGAIN},
 )
 def rerun(

@@ -126,7 +126,8 @@ def head_words(model: ReportModel) -> dict[str, Any]:
         "lost": in_words(lost) if lost else "",
         "notes": [*doubts(model.cases, run.criterion), *filter(None, [run.ran_again_in_words])],
         "interruption": run.interruption,
-        "resume": f"merge-sumo campaign --resume {quoted(run.folder)}{named_again(run.settings)}",
+        "resume": f"merge-sumo campaign --resume {quoted(run.folder)}"
+        f"{named_again(run.settings, goes_on=True)}",
         "wanted": run.settings.get("cases"),
     }
 

@@ -131,6 +131,8 @@ class TestARunFolder:
             ran(mine)
             assert_refused(command_line("campaign", "--resume", name, "-q"), f"--{name} SPEC")
             assert not ran(mine)
+            again = shlex.split(named_again(read_settings(Path(name))))
+            assert command_line("rerun", name, 0, *again, "-q")[0] == 0
 
     @pytest.mark.parametrize("options", [(), ("--gate", "errors")])
     def test_is_gone_on_with_by_what_is_printed(
