@@ -17,11 +17,6 @@ LIKELY: Final = 0.5
 """Predicted chance of failing from which a case is a likely failure. Chosen, not tuned."""
 
 
-def has_predictions(outcomes: Sequence[Outcome]) -> bool:
-    """Return whether some cases have a prediction."""
-    return any(outcome.prediction is not None for outcome in outcomes)
-
-
 def prediction_error_m(outcome: Outcome) -> float | None:
     """Return the error of the predicted gap in m; None without a prediction or a gap."""
     if outcome.prediction is None or outcome.measures.score is None:

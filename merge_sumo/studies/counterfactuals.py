@@ -101,11 +101,6 @@ class Avoidance:
         if [name for name in REFERENCES if name in self.avoided_by] != list(self.avoided_by):
             raise UserError(f"avoided_by is {self.avoided_by}: choose from {', '.join(REFERENCES)}")
 
-    @property
-    def by_careful(self) -> bool:
-        """Whether a careful and competent driver avoids it in the VUT's place."""
-        return CAREFUL in self.avoided_by
-
 
 # The file of a campaign.
 

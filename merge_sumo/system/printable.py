@@ -18,11 +18,6 @@ def printable(text: str) -> str:
     )
 
 
-def two_digits(value: float) -> str:
-    """Return a number with two significant digits: 110, 6.9, 0.42."""
-    return f"{float(f'{value:.2g}'):.12g}"
-
-
 def counted(number: int, what: str) -> str:
     """Return a number of things in words."""
     return f"{number} {what}" if number == 1 else f"{number} {what}s"

@@ -27,9 +27,6 @@ from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
 
-SHORT: Final = 120
-"""Characters of a condition in a headline."""
-
 TEXTS: Final = {
     "end": frozenset(end.value for end in End if not end.is_error),
     "severity": frozenset(severity.value for severity in Severity),
@@ -111,12 +108,6 @@ class Criterion:
     def words(self) -> str:
         """Return when a case fails, as a condition."""
         return CRITERIA[self.text].condition if self.text in CRITERIA else self.text
-
-    @property
-    def in_short(self) -> str:
-        """Return when a case fails, by name where there is one, at a length for a headline."""
-        condition = f"{self.text}: {self.words}" if self.text in CRITERIA else self.text
-        return condition if len(condition) <= SHORT else f"{condition[: SHORT - 3]}..."
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
         """Return the margin of an episode; None under the paper's criterion and after an error."""
