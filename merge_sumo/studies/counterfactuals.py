@@ -59,7 +59,7 @@ from merge_sumo.vuts.registry import VutFactory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
-"""The reference driver that the headline counts."""
+"""The reference driver that takes the place of a careful one."""
 TAKES_OVER: Final = "fsm"
 """The reference driver that takes over. From the start it avoids what can be avoided; the careful
 driver brakes only 2 s before a collision, and would tell of itself more than of the VUT."""
