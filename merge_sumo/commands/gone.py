@@ -49,6 +49,7 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--force": "a campaign with something changed begins anew, in a folder of its own",
     "--vut-command": 'the spec has the command, as in --vut "traci:python my.py {port}"',
     "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
+    "export commonroad": "`--format openscenario` writes the motion for other simulators",
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "campaign --batch": "a sampler chooses the size of its batches; `ms.campaign(batch=20)` in "
     "Python has another",
