@@ -64,7 +64,7 @@ class Change(StrEnum):
     BROKE = "broke"
     WITHIN_CHANCE = "within chance"
     NEITHER = "passes with neither"
-    STILL_CONTACT = "passes, and is a contact"
+    STILL_CONTACT = "contact without failure"
     FIXED = "fixed"
     NOT_SEEN = "not looked at"
     BOTH = "passes with both"
