@@ -19,7 +19,6 @@ from campaigning import campaign_settings, resume_campaign, run_campaign
 from numpy.typing import NDArray
 from plans import key_of, plan_for
 
-import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, read_settings
@@ -114,18 +113,6 @@ class TestACampaign:
         hashes = {name: entry["sha256"] for name, entry in networks(swapped).items()}
         assert recorded["policies_sha256"] == hashes
         assert run_campaign(settings(None), tmp_path / "shipped").settings["policies"] is None
-
-    def test_has_its_learned_vut_from_there_too(self, swapped, tmp_path):
-        for name, folder in (("shipped", None), ("swapped", swapped)):
-            values: dict[str, Any] = {**SMALL, "levels": (0,)}
-            named = None if folder is None else str(folder)
-            level1 = CampaignSettings(vut="level1", policies=named, **{"scenario": US23, **values})
-            run_campaign(level1, tmp_path / name)
-        assert outcomes(tmp_path / "swapped") != outcomes(tmp_path / "shipped")
-
-    def test_from_python_takes_them(self, swapped, tmp_path):
-        options = {"level": 1, "cases": 4, "out": tmp_path / "run", "policies": swapped}
-        assert ms.campaign("design2", **options).settings["policies"] == str(swapped)
 
     def test_of_all_levels_is_of_those_that_are_trained_there(self, call, one):
         code, out, err = call(
