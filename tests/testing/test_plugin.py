@@ -66,7 +66,8 @@ def test_help_and_lists_name_what_it_brings(merge_sumo):
 
 
 def test_the_page_of_measures_has_its_measure(merge_sumo):
-    page = merge_sumo("reference/measures.md", program=(str(TOOLS / "docs_pages.py"),))
+    made = f"import sys; sys.path.append({str(TOOLS)!r}); import docs_pages as d"
+    page = merge_sumo(f"{made}; print(d.measures_page())", program=("-c",))
     assert "| `closest_m` | m | least distance of the front bumpers" in page
 
 
