@@ -33,7 +33,7 @@ from functools import partial
 from importlib import import_module
 from multiprocessing.synchronize import Semaphore
 from numbers import Integral
-from typing import Any, Final, Generic, ParamSpec, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.blame import Blame
@@ -57,7 +57,6 @@ TRIED: Final = 8
 
 T = TypeVar("T")
 R = TypeVar("R")
-P = ParamSpec("P")
 
 
 class Workers(AbstractContextManager["Workers"]):
@@ -133,29 +132,6 @@ class Workers(AbstractContextManager["Workers"]):
         if self._beside is None:
             self._beside = self._open_beside()
         return self._beside
-
-    def begin_beside(
-        self, function: Callable[P, R], *args: P.args, **kw: P.kwargs
-    ) -> Callable[[], R]:
-        """Begin some work in the process beside this one; return what waits for its result.
-
-        Where that process was not started, or has died, the work is done here, and only then.
-        """
-        here = partial(function, *args, **kw)
-        if self._beside is None:
-            return here
-        try:
-            future: Future[R] = self._beside.submit(function, *args, **kw)
-        except BrokenExecutor:
-            return here
-
-        def result() -> R:
-            try:
-                return future.result()
-            except BrokenExecutor:
-                return here()
-
-        return result
 
     @property
     def here(self) -> bool:
