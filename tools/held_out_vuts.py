@@ -154,3 +154,24 @@ class NoisySensors:
         hurries = (gap <= -4.0) & (gap > -14.0) & (distance < 60.0)
         answer = np.where(hurries, 2.0, profile(seen.v_vut_mps))
         return np.asarray(np.where(yields & (seen.v_vut_mps > SLOWEST_MPS), -2.0, answer))
+
+
+class Slots:
+    """Reserves slots of time at M: the slot after the POV's where its own is the POV's.
+
+    Neighbouring slots are taken to be apart, so that it fails where both arrive about a boundary.
+    """
+
+    SLOT_S = 2.0
+
+    def __init__(self, corridors: int) -> None:
+        """Prepare for K corridors."""
+
+    def act_batch(self, seen: Any) -> FloatArray:
+        """Return accelerations, (K,)."""
+        v, distance = np.maximum(seen.v_vut_mps, 1.0), np.maximum(-seen.x_vut_m, 0.0)
+        due_s = seen.t_s + distance / (0.5 * (v + CRUISE_MPS))
+        pov_s = seen.t_s - seen.x_pov_m / np.maximum(seen.v_pov_mps, 1.0)
+        same = np.floor(due_s / self.SLOT_S) == np.floor(pov_s / self.SLOT_S)
+        waits = same & (distance > 5.0) & (seen.v_vut_mps > SLOWEST_MPS)
+        return np.asarray(np.where(waits, -2.0, profile(seen.v_vut_mps)))

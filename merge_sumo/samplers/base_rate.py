@@ -10,7 +10,7 @@ on with it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -29,6 +29,10 @@ SAME: Final = 1e-6
 PRIOR_FAILURES: Final = 0.5
 PRIOR_CASES: Final = 10.0
 """Failures and cases that the base rate begins with."""
+OFFERED: Final = 4000
+"""Points of another sequence, among which cases are chosen by the score alone."""
+LEAST_OF_SEQUENCE: Final = 0.25
+"""Least share of the stand-ins that the sequence gives: only it comes everywhere."""
 JUDGED: Final = 100
 """Last picks that are judged by."""
 
@@ -38,7 +42,7 @@ class BaseRate:
 
     Attributes:
         chance: base rate of failures.
-        following: next points of the sequence, (n, d).
+        following: next points that stand in for picks, (n, d): of the sequence, and by the score.
     """
 
     def __init__(
@@ -49,6 +53,7 @@ class BaseRate:
         n: int,
         proposed: int,
         rng: np.random.Generator,
+        by_score: Callable[[FloatArray, int], FloatArray],
     ) -> None:
         """Judge by a history and what was predicted of each of its cases.
 
@@ -59,21 +64,37 @@ class BaseRate:
             n: points of the sequence that are wanted.
             proposed: number of cases proposed at the level.
             rng: generator with which the first batch of the level began the sequence.
+            by_score: chooses so many of some points by the score alone.
         """
         self._history = history
+        offered = spread_out(OFFERED, history.dims, np.random.default_rng([OFFERED, history.dims]))
         sequence = spread_out(proposed + n, history.dims, rng)
         distance, place = cKDTree(sequence).query(np.concatenate([history.points, unknown]))
         begun = int(place[distance < SAME].max(initial=-1)) + 1
-        self.following = sequence[begun : begun + n]
         anywhere = distance[: len(history.points)] < SAME
-        failures = float(history.share[anywhere].sum())
-        self.chance = (failures + PRIOR_FAILURES) / (float(anywhere.sum()) + PRIOR_CASES)
+        scored = cKDTree(offered).query(history.points)[0] < SAME
+        chances = [self._rate(of) for of in (scored, anywhere)]
+        self.chance = max(chances)
+        share = max(chances[1] / sum(chances), LEAST_OF_SEQUENCE)
+        spread = int((anywhere & (history.batch > history.batch.min(initial=0))).sum())
+        first = np.arange(1, n + 1)
+        stood_in = spread + int(scored.sum()) + first
+        wanted = np.clip((stood_in * share).astype(np.int64) - spread, 0, first)
+        from_sequence = np.diff(wanted, prepend=0) > 0
+        self.following = by_score(offered, n)
+        self.following[from_sequence] = sequence[begun : begun + int(from_sequence.sum())]
+        anywhere |= scored
         said = np.array([np.nan if one is None else one.p_fail for one in predictions])
         picks = np.flatnonzero(~anywhere & ~np.isnan(said))[-JUDGED:]
         far = self._far_then(picks)
         promised = np.bincount(far, said[picks], minlength=2)
         failed = np.bincount(far, history.share[picks], minlength=2)
         self._credit = np.minimum((failed + 1.0) / (promised + 1.0), 1.0)
+
+    def _rate(self, of: NDArray[np.bool_]) -> float:
+        """Return the share of failures among some cases, (N,)."""
+        failures = float(self._history.share[of].sum())
+        return (failures + PRIOR_FAILURES) / (float(of.sum()) + PRIOR_CASES)
 
     def mixed(self, picks: Proposal, following: Proposal) -> Proposal:
         """Return picks with points of the sequence, which come last, in the place of worse ones."""

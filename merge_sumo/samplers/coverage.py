@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from typing import Final, Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.coverage_grid import CoverageGrid
+from merge_sumo.samplers.gpr import exploiting
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
@@ -221,7 +223,8 @@ class CoverageSampler(Sampler):
         ]
         unknown = np.concatenate([pending, to_unit(errors, level, self.pool.scenario)])
         begins = np.random.default_rng([self.seed, 0, level])
-        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins)
+        by_score = partial(exploiting, history, pending)
+        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins, by_score)
 
     def _skill(self, level: int) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""

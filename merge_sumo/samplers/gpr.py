@@ -88,6 +88,14 @@ class GprSampler(LevelwiseSampler):
         return queries[picks]
 
 
+def exploiting(
+    history: LevelHistory, pending: FloatArray, queries: FloatArray, n: int
+) -> FloatArray:
+    """Return `n` of some queries, (n, d), where the process on the score expects most."""
+    posterior = _Posterior(history, queries, pending)
+    return queries[[posterior.pick(*Z_EXPLOIT) for _ in range(n)]]
+
+
 class _Posterior:
     """The fitted surrogate at the queries, with a variance that knows the picks of the batch.
 

@@ -116,15 +116,27 @@ class TestTheBaseRate:
         history = known(np.concatenate([sequence[:4], picks]), failed, [0, 0, 0, 0, 1, 1])
         predictions = [None] * 4 + [said(0.5)] * 2
         rng = np.random.default_rng(3)
-        return BaseRate(history, predictions, np.empty((0, 2)), n, 6, rng), sequence
+
+        def by_score(points: FloatArray, n: int) -> FloatArray:
+            return points[:n]
+
+        made = BaseRate(history, predictions, np.empty((0, 2)), n, 6, rng, by_score)
+        return made, sequence
 
     def test_is_the_share_of_the_sequence_that_failed(self):
         base_rate, _ = self.made()
         assert base_rate.chance == (1.0 + PRIOR_FAILURES) / (4.0 + PRIOR_CASES)
 
-    def test_goes_on_with_the_sequence(self):
+    def test_goes_on_with_both_arms_by_what_each_has_found(self):
         base_rate, sequence = self.made()
-        assert base_rate.following == pytest.approx(sequence[4:7])
+        # The sequence found 1 of 4, the score nothing of 0: shares of .107 and .05.
+        offered = spread_out(4000, 2, np.random.default_rng([4000, 2]))
+        wanted = np.array([offered[0], sequence[4], sequence[5]])
+        assert base_rate.following == pytest.approx(wanted)
+
+    @pytest.mark.parametrize("seed", range(100, 124))
+    def test_comes_everywhere_also_where_the_score_leads_astray(self, seed):
+        assert search(shell_m, 60, seed)[1].any()
 
     def test_stands_in_for_the_picks_that_are_worth_less(self):
         base_rate, sequence = self.made()
@@ -137,7 +149,9 @@ class TestTheBaseRate:
         following = Proposal(base_rate.following, gain, np.full(3, 0.03), (None,) * 3)
         mixed = base_rate.mixed(picks, following)
         chance = base_rate.chance
-        assert mixed.points == pytest.approx(np.array([points[0], points[1], sequence[4]]))
+        assert mixed.points == pytest.approx(
+            np.array([points[0], points[1], base_rate.following[0]])
+        )
         assert mixed.gain.tolist() == pytest.approx([0.15, 0.12, chance])
         assert mixed.probability.tolist() == [0.4, 0.2, 0.03]
 
