@@ -11,7 +11,6 @@ from conftest import require
 from crosscheck import HighwayEnvWorld, crosscheck
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.scenario import US23, VUT
@@ -44,16 +43,6 @@ def test_vehicles_move_by_the_speed_before_a_step_and_stop_at_0():
     assert world.x_m[:, 0].tolist() == pytest.approx([-98.0, -49.99], abs=1e-13)
     assert world.v_mps[:, 0].tolist() == pytest.approx([20.1, 0.0], abs=1e-15)
     assert world.x_m[VUT, 1] < -100.0, "a parked vehicle stays where it is"
-
-
-def test_vehicles_do_not_collide_in_other_lanes_or_in_one():
-    scenario = named_scenario("us23-traffic")
-    worlds = [kind(1, road_for(scenario), scenario) for kind in (HighwayEnvWorld, EquationWorld)]
-    for world in worlds:
-        world.place(0, [(-50.0, 30.0), (-50.0, 20.0), (-48.0, 5.0), (-52.0, 60.0)])
-        for _ in range(20):
-            world.command(np.full((4, 1), -0.5))
-    assert np.abs(worlds[0].x_m - worlds[1].x_m).max() < 1e-12
 
 
 @pytest.mark.parametrize("name", ["us23", "us23-lane-traffic", "roundabout"])

@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from calling import assert_refused
 from plans import plan_for
 from test_score import CASE, ending
 
@@ -125,19 +124,3 @@ class TestDrivingOn:
             assert trajectory.error is None
             assert trajectory.after[-1, VUT, 0] >= 10.0
             assert len(trajectory.after) < 10
-
-    def test_is_what_the_command_line_asks_for(self, tmp_path, command_line):
-        code, _, err = command_line(
-            *("campaign", "--vut", "level0", "--level", 0, "--cases", 4, "--sampler", "uniform"),
-            *("--follow-up", 2, "-q"),
-            *("--fail-when", "after_drac_mps2 > 1", "--out", tmp_path / "run"),
-        )
-        assert (code, err) == (0, "")
-        record = json.loads((tmp_path / "run" / "campaign.json").read_text(encoding="utf-8"))
-        assert record["scenario"]["follow_up_s"] == 2.0
-        lines = (tmp_path / "run" / "outcomes.jsonl").read_text(encoding="utf-8").splitlines()
-        assert all(json.loads(line)["after_gap_m"] is not None for line in lines)
-        assert_refused(
-            command_line("campaign", "--vut", "level0", "--fail-when", "after_gap_m < 1"),
-            "--follow-up SECONDS",
-        )

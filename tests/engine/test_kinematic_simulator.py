@@ -18,7 +18,6 @@ from merge_sumo.engine.povs import own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import ground_truth, known_truth
-from merge_sumo.system.workers import open_workers
 from merge_sumo.values.case import Case, MergeCase, Pool, from_unit
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import OWN, US23, VUT, Scenario
@@ -54,20 +53,6 @@ class TestACase:
         road = named_scenario(scenario)
         assert_alike(*by_both(plan_for(vut, scenario=road), uniform(400, level, road)))
 
-    @pytest.mark.long
-    @pytest.mark.parametrize("level", [0, 1, 2])
-    @pytest.mark.parametrize(
-        ("scenario", "vut"),
-        [
-            *(("us23", vut) for vut in ("design1", "design2", "level0", "level1", "level2")),
-            *(("us23-traffic", vut) for vut in ("design1", "level2", "careful")),
-            *(("roundabout", vut) for vut in ("roundabout", "fsm", "rss")),
-        ],
-    )
-    def test_ends_as_in_sumo_by_thousands(self, scenario, vut, level):
-        road = named_scenario(scenario)
-        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(3000, level, road)))
-
     @pytest.mark.parametrize("fail_when", ["unsafe", "brake_after_mps2 > 2", "after_gap_m < 3"])
     def test_is_judged_by_any_criterion(self, fail_when):
         scenario = replace(US23, follow_up_s=2.0)
@@ -102,10 +87,6 @@ class TestACloseCall:
         sumo, kinematic = by_both(plan_for("level0", scenario=scenario), cases)
         assert len(kinematic.in_sumo) == len(cases)
         assert_alike(sumo, kinematic)
-
-    def test_is_rare(self):
-        results = run_cases(plan_for("design2").with_engine("kinematic"), uniform(400, 2))
-        assert len(results.in_sumo) == 4
 
 
 class TestTheCheck:
@@ -162,14 +143,6 @@ class TestATruth:
         assert (ours.score < FAILURE_SCORE).tolist() == (sumos.score < FAILURE_SCORE).tolist()
         np.testing.assert_allclose(ours.score, sumos.score, rtol=0.0, atol=1e-7)
         assert (ours.in_sumo, sumos.in_sumo) == (30, 3000)
-
-    def test_is_the_same_on_workers(self, tmp_path):
-        folders = tmp_path / "one", tmp_path / "two"
-        ground_truth(self.PLAN, 0, 2600, cache=folders[0])
-        with open_workers(2) as workers:
-            ground_truth(self.PLAN, 0, 2600, workers=workers, cache=folders[1])
-        one, two = (next(folder.iterdir()) for folder in folders)
-        assert (one.name, one.read_bytes()) == (two.name, two.read_bytes())
 
     def test_of_sumo_is_taken_and_not_the_other_way_round(self, tmp_path):
         counted: list[int] = []

@@ -60,11 +60,6 @@ class TestAWish:
     def test_by_hand(self, x_m, wish, merged):
         assert self.step(x_m, wish) is merged
 
-    def test_of_a_point_is_granted_where_it_is_forced(self):
-        at_m = replace(LANE, lane_m=None)
-        for x_m, wish in ((-2.1, MERGE), (-2.1, None), (-2.0, STAY), (-2.0, None)):
-            assert self.step(x_m, wish, at_m) is (x_m == -2.0)
-
     def test_once_stated_is_not_taken_for_granted(self):
         merging = Merging(1, LANE)
         state = np.array([[-500.0], [50.0]]), np.full((2, 1), 20.0)

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from plans import plan_for
-from test_kinematic_simulator import uniform
 
 from merge_sumo.drivers.levelk import actions_mps2, features
 from merge_sumo.drivers.policies import load_network
@@ -194,35 +192,3 @@ def test_an_episode_is_that_of_the_definition(name, level, count, tmp_path):
         assert measures.x_merge_m == pytest.approx(place, abs=1e-6)
         assert measures.clearance_m == pytest.approx(least_m, abs=1e-6)
         assert verdict.failed == (least_m <= 0.0 or braking > 3.0)
-
-
-class TestAWindowOfNoLength:
-    """A lane that begins and ends at M is the merge at a point: the same motion, to the last bit.
-
-    A wish can be granted only where it is forced, and M is nowhere else.
-    """
-
-    @pytest.mark.parametrize("level", [0, 1, 2])
-    @pytest.mark.parametrize("vut", ["level0", "design2"])
-    def test_is_a_point(self, vut, level):
-        at_m = named_scenario("us23")
-        tiny = replace(ROAD, lane_m=(-1e-9, 1e-9))
-        cases = [uniform(300, level, scenario) for scenario in (at_m, tiny)]
-        plans = [plan_for(vut, scenario=scenario) for scenario in (at_m, tiny)]
-        results = [
-            run_cases(plan.with_engine("kinematic"), of)
-            for plan, of in zip(plans, cases, strict=True)
-        ]
-        for one, other in zip(*(each.trajectories for each in results), strict=True):
-            assert one.end is other.end
-            assert one.motion.tobytes() == other.motion.tobytes()
-
-    def test_is_one_in_sumo(self):
-        at_m = named_scenario("us23")
-        tiny = replace(ROAD, lane_m=(-1e-9, 1e-9))
-        results = [
-            run_cases(plan_for("design2", scenario=scenario), uniform(60, 1, scenario))
-            for scenario in (at_m, tiny)
-        ]
-        for one, other in zip(*(each.trajectories for each in results), strict=True):
-            np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)

@@ -6,24 +6,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import make_scenarios
 import numpy as np
 import pytest
 from calling import invoke
 from campaigning import run_campaign
-from lxml import etree
-from plans import plan_for
 
 from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
+from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import (
     NETWORKS,
     load_network,
@@ -32,17 +25,14 @@ from merge_sumo.drivers.policies import (
     read_manifest,
     scenario_of,
 )
-from merge_sumo.engine.simulator import Simulator, road_for
+from merge_sumo.engine.simulator import road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
-from merge_sumo.training import check as checking
-from merge_sumo.training.reward import Reward, RewardWeights
-from merge_sumo.values.case import from_unit, to_unit
-from merge_sumo.values.fmc import fmc
+from merge_sumo.training.reward import RewardWeights
+from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23, as_merge
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 
-ROOT = Path(__file__).resolve().parents[2]
 ROUNDABOUT = as_merge(named_scenario("roundabout"))
 RADIUS_M = 25.0
 
@@ -118,48 +108,6 @@ class TestItsDrivers:
         for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
             assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
 
-    @pytest.mark.long
-    @pytest.mark.parametrize("name", ["pov1", "vut1"])
-    def test_of_level_1_collide_in_none_of_3000_cases(self, name):
-        cases = checking.check_cases(name, 3000, seed=5, scenario=ROUNDABOUT)
-        network, level0 = (
-            load_network(name, policies_of(ROUNDABOUT)),
-            checking.opponents(name, None),
-        )
-        pair = (network, level0) if name == "pov1" else (level0, network)
-        returns = checking.returns_of(checking.play(cases, *pair), Reward.of(ROUNDABOUT))
-        assert returns.collided.sum() == 0
-        unmoved = checking.play(cases, Level0Pov, Level0Vut)
-        assert checking.returns_of(unmoved, Reward.of(ROUNDABOUT)).collided.sum() > 300
-
-    @pytest.mark.long
-    @pytest.mark.parametrize("name", NETWORKS)
-    def test_lose_little_over_300_cases_that_training_never_saw(self, name):
-        found = checking.check_policy(name, policies_of(ROUNDABOUT), scenario=ROUNDABOUT)
-        assert found.mean_regret <= 0.02
-        assert found.avoidable_collisions == 0
-
-
-class TestItsVut:
-    @pytest.mark.long
-    @pytest.mark.parametrize(
-        ("level", "count", "bounds", "kinds"),
-        [
-            (0, 10_000, (0.0, 0.0), set()),
-            (1, 10_000, (0.05, 0.13), {Kind.STALEMATE}),
-            (2, 20_000, (0.005, 0.02), {Kind.SQUEEZE}),
-        ],
-    )
-    def test_fails_only_against_drivers_who_react(self, level, count, bounds, kinds):
-        cases = uniform_cases(count, level, seed=1)
-        with Simulator(plan_for("roundabout", scenario=ROUNDABOUT)) as ground:
-            failing = [
-                trajectory for _, trajectory in ground.run(cases) if measure(trajectory).is_close
-            ]
-        points = to_unit((trajectory.case for trajectory in failing), level, scenario=US23)
-        assert bounds[0] <= (fmc(points) if failing else 0.0) <= bounds[1]
-        assert {diagnose(trajectory, measure(trajectory)).kind for trajectory in failing} == kinds
-
 
 class TestTheExampleRuns:
     @pytest.fixture(scope="class")
@@ -198,61 +146,6 @@ class TestACampaignOnIt:
         for folder in folders[:3]:
             replayed = invoke("replay", folder)
             assert replayed.stdout.startswith("identical"), replayed.output
-
-    def test_is_shown_in_sumo_gui_as_large_as_the_ring_with_cars_of_their_size(self, run):
-        view = next((run.folder / "scenarios").iterdir()) / "view.settings.xml"
-        shown = etree.fromstring(view.read_bytes())
-        place = shown.find("viewport").attrib
-        assert math.hypot(float(place["x"]), float(place["y"])) < 3.0 * RADIUS_M
-        # The arms that are driven on, of 250 m, and 2 km straight on behind the last of them.
-        assert 100.0 * 2000.0 / float(place["zoom"]) < 6.0 * 2.0 * RADIUS_M
-        assert float(shown.find("scheme/vehicles").get("vehicle_exaggeration")) <= 1.5
-
-
-ANOTHER_ARM = """
-net = "roundabout.net.xml"
-mainline = ["in_w", "ring_ws", "pass_s", "ring_se", "out_e"]
-ramp = ["in_s", "ring_se", "out_e"]
-x_pov0_m = [-60, -25]
-v_pov0_mps = [5, 10]
-x_vut0_m = -50
-v_vut0_mps = 6
-level0_v_mps = 8
-"""
-
-
-def test_a_shipped_scenario_is_one_data_file_and_no_code(tmp_path):
-    for name in ("merge_sumo", "sumo_net", "policies"):
-        ignored = shutil.ignore_patterns("__pycache__", "shipped")
-        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
-    (tmp_path / "sumo_net" / "another-arm.toml").write_text(ANOTHER_ARM)
-
-    options = ("--vut", "level0", "--level", "0", "--cases", "20", "--quiet")
-    commands = [
-        ("scenario", "list"),
-        ("scenario", "check", "another-arm"),
-        ("campaign", "--scenario", "another-arm", *options, "--out", "run"),
-    ]
-    script = "from merge_sumo.cli import app\n" + "".join(
-        f"app({words!r}, standalone_mode=False)\n" for words in commands
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", script],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "another-arm: POV from -60 to -25 m at 5 to 10 m/s" in done.stdout
-    assert "mainline: in_w ring_ws" in done.stdout
-    run = Run(tmp_path / "run")
-    assert run.scenario.name == "another-arm"
-    assert any(outcome.failed for outcome in run.outcomes)
-    assert invoke("replay", next((run.folder / "scenarios").iterdir())).stdout.startswith(
-        "identical"
-    )
 
 
 def test_every_shipped_scenario_has_a_road_with_room_for_its_starts():

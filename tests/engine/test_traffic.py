@@ -7,10 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
 from plans import plan_for
 
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
@@ -186,15 +184,6 @@ class TestWhatTheVutMeets:
 
 
 class TestARunInTraffic:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def made(cls, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("traffic") / "run"
-        settings = CampaignSettings(
-            vut="design2", levels=(0, 1, 2), sampler="uniform", cases=30, batch=15, scenario=TRAFFIC
-        )
-        return run_campaign(settings, folder)
-
     def test_shows_all_cars_to_a_traci_client(self, tmp_path):
         script = tmp_path / "client.py"
         script.write_text(
@@ -244,19 +233,3 @@ class TestTheVerdict:
         assert (measures.end, measures.dx_m, measures.nearest) == (End.MERGED, -12.0, "behind")
         assert measures.ttc_s == pytest.approx(3.0)
         assert measures.merged_first == "VUT"
-
-    def test_knows_no_way_out_through_a_car(self):
-        # Braking avoids the POV, but not the car behind it.
-        case = cases_of(0, 1)[0]
-        motion = np.zeros((6, 4, 3))
-        x = np.array([-14.0, -12.0, 100.0, -25.0])
-        v = np.array([20.0, 20.0, 20.0, 20.0])
-        for step in range(6):
-            motion[step, :, 0], motion[step, :, 1] = x, v
-            x = x + v * DT_S
-        motion = np.concatenate([motion, motion[-1:] + [[[2.0, 0.0, 0.0]]] * 4], axis=0)
-        with_queue = measure(Trajectory(case, motion, End.MERGED))
-        alone = measure(Trajectory(case, motion[:, :2], End.MERGED))
-        assert with_queue.is_close
-        assert alone.is_close
-        assert (with_queue.last_avoidable_s or -1.0) <= (alone.last_avoidable_s or -1.0)

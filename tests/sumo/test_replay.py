@@ -152,9 +152,6 @@ class TestAnExport:
             assert 'value="/' not in text
             assert ".." not in text
 
-    def test_replays_after_it_was_moved_to_a_folder_with_an_awkward_name(self, folder, tmp_path):
-        assert_identical(folder.rename(tmp_path / "fälle & <mehr> 'hier'"))
-
 
 OF_LEVEL_2 = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
 MOTIONS: dict[str, tuple[Case, Command, Command, int, End]] = {
@@ -272,17 +269,6 @@ class TestAReplayThatIsNotTheRecord:
         assert result.diverged_at_s == pytest.approx(ROW * DT_S)
         assert result.detail.startswith(f"{column} of {who} ")
 
-    @pytest.mark.parametrize("by", [0.5, -0.5])
-    @pytest.mark.parametrize("row", [0, -1])
-    def test_diverges_in_the_first_row_and_in_the_last(self, folder, sumo_plays, row, by):
-        as_exported = (folder / RECORD).read_bytes()
-        sumo_plays(lambda stage: (stage / RECORD).write_bytes(as_exported))
-        edit_number(folder / RECORD, "vut", "x", by, row)
-        rows = len(etree.parse(folder / RECORD).findall("timestep"))
-        result = replay(folder)
-        assert result.diverged_at_s == pytest.approx((row % rows) * DT_S)
-        assert result.detail.startswith("x of vut is ")
-
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_may_differ_by_rounding_and_no_more(self, folder, sign):
         edit_number(folder / RECORD, "vut", "pos", sign * 0.5e-6)
@@ -306,40 +292,57 @@ class TestAReplayThatIsNotTheRecord:
         assert "did not end within 0 s" in refusal(folder)
 
 
-class TestARecordThatSumoPlays:
-    """The record itself is changed, and so what SUMO plays and what the replay compares."""
+def many(steps: int) -> Callable[[etree._Element], None]:
+    """Return a change that gives a record another number of timesteps."""
 
-    @pytest.mark.parametrize("steps", [0, HOLD_STEPS, MAX_TIMESTEPS + 1])
-    def test_is_refused_when_it_is_too_short_or_too_long_for_an_episode(self, folder, steps):
-        record = etree.parse(folder / RECORD).getroot()
+    def change(record: etree._Element) -> None:
         first = record[0]
         record[:] = [copy.deepcopy(first) for _ in range(steps)]
         for step, timestep in enumerate(record):
             timestep.set("time", f"{step * DT_S:.2f}")
-        (folder / RECORD).write_bytes(etree.tostring(record))
-        assert "must have from 11 to 1211 timesteps" in refusal(folder)
 
-    @pytest.mark.parametrize("time", ["4.05", "3.9", "400.0"])
-    def test_is_refused_when_a_row_is_off_the_grid_of_time(self, folder, time):
-        record = etree.parse(folder / RECORD)
-        record.findall("timestep")[ROW].set("time", time)
-        record.write(folder / RECORD)
-        assert "every 0.1 s" in refusal(folder)
+    return change
 
-    @pytest.mark.parametrize("column", ["x", "y", "pos", "speed", "angle"])
-    @pytest.mark.parametrize("value", ["nan", "inf", "-inf", "1e8", "", "0x10", "1_0", "\u0661"])
-    def test_is_refused_when_a_number_is_none(self, folder, column, value):
+
+def without_vut(record: etree._Element) -> None:
+    for vehicle in record.findall(".//vehicle[@id='vut']"):
+        vehicle.getparent().remove(vehicle)
+
+
+CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
+    (many(HOLD_STEPS), "must have from 11 to 1211 timesteps"),
+    (many(MAX_TIMESTEPS + 1), "must have from 11 to 1211 timesteps"),
+    (lambda record: record[ROW].set("time", "4.05"), "every 0.1 s"),
+    (lambda record: record[ROW].attrib.pop("time"), RECORD),
+    (lambda record: record[ROW].append(copy.deepcopy(record[ROW][1])), "two rows of vut at 4 s"),
+    (without_vut, "must have every vehicle in every timestep"),
+    *(
+        (
+            lambda record, number=number: record[ROW][0].set("pos", number),
+            "vehicle whose pos is not a number",
+        )
+        for number in ("nan", "inf", "1e8", "", "0x10", "1_0", "\u0661")
+    ),
+]
+"""How a record is changed, and the sentence of the refusal."""
+
+
+class TestAFolderThatCannotBeReplayed:
+    @pytest.mark.parametrize(("change", "said"), CHANGES)
+    def test_has_another_record(self, folder, change, said):
         record = etree.parse(folder / RECORD)
-        record.findall("timestep")[ROW][0].set(column, value)
+        change(record.getroot())
         record.write(folder / RECORD, encoding="UTF-8")
-        assert f"vehicle whose {column} is not a number" in refusal(folder)
+        assert said in refusal(folder)
 
-    def test_is_refused_when_a_vehicle_is_there_twice(self, folder):
-        record = etree.parse(folder / RECORD)
-        row = record.findall("timestep")[ROW]
-        row.append(copy.deepcopy(row[1]))
-        record.write(folder / RECORD)
-        assert "two rows of vut at 4 s" in refusal(folder)
+    def test_lacks_a_file_or_is_missing(self, folder, tmp_path):
+        (folder / NET).unlink()
+        assert NET in refusal(folder)
+        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
+
+
+class TestARecordThatSumoPlays:
+    """The record itself is changed, and so what SUMO plays and what the replay compares."""
 
     @pytest.mark.parametrize("who", ["pov", "vut"])
     def test_is_not_identical_when_the_end_is_not_held(self, folder, who):
@@ -354,48 +357,9 @@ class TestARecordThatSumoPlays:
         assert result.diverged_at_s == pytest.approx((len(rows) - 4) * DT_S)
         assert result.detail == f"{who} is not held where the episode ended"
 
-    @pytest.mark.parametrize("who", ["pov", "vut"])
-    def test_is_refused_when_a_vehicle_is_missing(self, folder, who):
-        record = etree.parse(folder / RECORD)
-        for vehicle in record.findall(f".//vehicle[@id='{who}']"):
-            vehicle.getparent().remove(vehicle)
-        record.write(folder / RECORD)
-        assert "must have every vehicle in every timestep" in refusal(folder)
-
-
-class TestAFolderThatCannotBeReplayed:
-    @pytest.mark.parametrize("name", [NET, TYPES, RECORD])
-    def test_lacks_a_file(self, folder, name):
-        (folder / name).unlink()
-        assert name in refusal(folder)
-
-    @pytest.mark.parametrize("name", [CONFIG, RECORD])
-    def test_is_missing_or_something_else(self, tmp_path, name):
-        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
-        (tmp_path / name).mkdir()
-        assert "is not a replay folder" in refusal(tmp_path)
-
-    @pytest.mark.parametrize(
-        ("old", "new"),
-        [(' pos="', ' position="'), (' speed="', ' speed="fast '), (' time="', ' at="')],
-    )
-    def test_has_a_record_with_other_columns(self, folder, old, new):
-        text = (folder / RECORD).read_text()
-        assert old in text
-        (folder / RECORD).write_text(text.replace(old, new))
-        assert RECORD in refusal(folder)
-
-
-class TestAConfigurationThatCameAlong:
-    """Configuration, view and case of a folder are for people and for plain sumo."""
-
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_plain_sumo_replays_a_folder_that_is_shipped(folder, tmp_path):
-    assert_plain_sumo_replays(folder, tmp_path)
-
-
-def assert_plain_sumo_replays(folder: Path, tmp_path: Path) -> None:
     """Start sumo from elsewhere, on the configuration of a folder; the record must come out."""
     output = tmp_path / "plain.fcd.xml"
     command = [sumo_program("sumo"), "-c", str(folder / CONFIG), "--fcd-output", str(output)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from foreign_nets import LANE_M, LANES, corridor_of, lane_corridor_of
+from foreign_nets import LANE_M, LANES, lane_corridor_of
 from traci_pair import ToSession, close_shadow, shadow
 
 from merge_sumo.engine.simulator import road_for
@@ -68,21 +68,6 @@ def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answere
     session.put({"pov": (-49.0, 10.0, 0.0), "vut": (250.0, 10.0, 0.0)})
     assert session.step() is None, "the VUT is beyond the end: it cannot be commanded"
     assert vehicle.getIDList() == ("pov",)
-
-
-def test_who_leaves_a_lane_that_ends_at_m_goes_on_as_commanded(tmp_path):
-    road = corridor_of("lane drop", tmp_path)
-    sumo = shadow(tmp_path, US23, road)
-    assert sumo.road.lane_drop
-    assert sumo.road.ramp_approach.yields
-    sumo.enter({"pov": (-100.0, 10.0, 0.0), "vut": (-5.0, 10.0, 0.0)})
-    x_m = -5.0
-    for _ in range(12):
-        assert sumo.step() == 10.0
-        x_m += 10.0 * DT_S
-        sumo.put({"pov": (-100.0, 10.0, 0.0), "vut": (x_m, 10.0, 0.0)})
-        point = road.lane_point(x_m, on_ramp=True)
-        assert sumo.call("vehicle.getLaneID", "vut") == point.lane
 
 
 @pytest.mark.parametrize("name", LANES)

@@ -9,8 +9,7 @@ import traci
 import traci_page
 from traci_pair import Pair, answer, questions, shown
 
-from merge_sumo.sumo.traci_names import name_of, named
-from merge_sumo.vuts.traci.session import QUESTIONS
+from merge_sumo.sumo.traci_names import name_of
 
 SAME = 0.95
 
@@ -44,11 +43,6 @@ class TestQuestions:
     @pytest.mark.parametrize("domain", ["edge", "lane", "junction", "route", "vehicletype"])
     def test_of_the_road_and_its_types_are_all_answered_the_same(self, answers, domain):
         assert {q: b for q, b in answers.items() if q[0] == domain and b[0] != b[1]} == {}
-
-    def test_of_a_lane_that_no_car_uses_are_answered_the_same(self, pair):
-        for ask in ("getLength", "getMaxSpeed", "getEdgeID", "getLastStepVehicleIDs", "getShape"):
-            ours, real = (getattr(c.lane, ask)("main_in_1") for c in (pair.ours, pair.real))
-            assert ours == real
 
     def test_of_the_vehicle_differ_in_what_depends_on_how_it_was_commanded_alone(self, answers):
         differ = {q[1] for q, b in answers.items() if q[0] == "vehicle" and b[0] != b[1]}
@@ -96,35 +90,10 @@ class TestSubscriptions:
         pair.ours.vehicle.unsubscribe("vut")
         assert not [s for s in pair.session.subscriptions.all if s.of == (VEHICLES_OF, "vut", None)]
 
-    def test_of_an_object_that_there_is_not_are_refused_as_by_sumo(self, pair):
-        said = []
-        for connection in (pair.ours, pair.real):
-            with pytest.raises(traci.TraCIException) as error:
-                connection.junction.subscribeContext("none", VEHICLES_OF, 10.0, [SPEED])
-            said.append(str(error.value))
-        assert said[0] == said[1]
-
 
 def test_commands_without_a_name_are_named_by_their_number():
     assert name_of(0x7E) == "CMD_ADD_SUBSCRIPTION_FILTER"
     assert name_of(0x0E) == "the command 0x0e"
-
-
-def test_the_numbers_of_the_domains_are_those_of_the_client():
-    assert {d._cmdGetID for d in traci.domain.DOMAINS} == QUESTIONS
-    for d in traci.domain.DOMAINS:
-        distances = (d._subscribeID - 0x30, d._contextID + 0x20)
-        assert {*distances, d._cmdGetID if d._cmdSetID is None else d._cmdSetID - 0x20} == {
-            d._cmdGetID
-        }
-
-
-def test_names_are_those_of_the_client():
-    constants = traci.constants
-    assert named()[constants.CMD_GET_VEHICLE_VARIABLE, constants.VAR_SPEED].functions == (
-        "vehicle.getSpeed",
-    )
-    assert len(named()) > 700
 
 
 def test_the_page_is_made_from_these_tables():

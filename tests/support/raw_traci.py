@@ -14,7 +14,7 @@ import sys
 import time
 from contextlib import suppress
 
-STEP, CLOSE, GET_LANE, GET_VEHICLE, SET_VEHICLE = 0x02, 0x7F, 0xA3, 0xA4, 0xC4
+STEP, CLOSE, GET_VEHICLE, SET_VEHICLE = 0x02, 0x7F, 0xA4, 0xC4
 SPEED = 0x40
 
 

@@ -58,15 +58,6 @@ def test_an_fmu_drives_like_the_same_law_in_python_and_leaves_nothing(
     assert list(scratch.iterdir()) == []
 
 
-@pytest.mark.parametrize("version", some(["2.0", "3.0"], "3.0"))
-def test_names_of_variables_can_be_mapped(unit, version):
-    path = unit(version, ("PovPos", "PovSpeed", "x_vut_m", "Speed", "Cmd"))
-    spec = f"fmu:{path}?v_vut_mps=Speed&v_pov_mps=PovSpeed&acceleration_mps2=Cmd"
-    (trajectory,) = run_cases(in_process(spec), cases_of(1))
-    assert trajectory.error is None
-    assert (trajectory.a_vut_mps2[:-1] == 1.0).all()
-
-
 @pytest.mark.parametrize(
     ("fault", "reason"),
     [("return 3;", "failed with status 3"), ("u->v[4] = NAN; return 0;", "nan")],

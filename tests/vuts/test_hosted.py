@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -23,13 +22,12 @@ from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
 
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23, as_merge, lane_of
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
-from merge_sumo.vuts.host.hosted import Host, HostDiedError, HostedVut
+from merge_sumo.vuts.host.hosted import Host, HostedVut
 from merge_sumo.vuts.host.wire import About, WireError
 from merge_sumo.vuts.output import KEPT_BYTES, MOST_BYTES, append
 from merge_sumo.vuts.registry import FINDER
@@ -122,29 +120,6 @@ def Vut(seen):
             assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
     finally:
         vut.close()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("dies", "starts"),
-    [
-        ("os._exit(3)", MAX_DEATHS),
-        ("os.kill(os.getpid(), 9)", MAX_KILLS),
-        ("time.sleep(600)", 1),
-    ],
-)
-def test_while_it_is_opened_a_death_is_blamed_by_the_rule_of_all_deaths(
-    spec, tmp_path, dies, starts
-):
-    source = f"""
-import os, pathlib, time
-with pathlib.Path(__file__).with_name("starts").open("a") as starts:
-    starts.write("x")
-{dies}
-"""
-    with pytest.raises(UserError, match="opening the VUT"):
-        HostedVut(1, FINDER, spec(source), VutOptions(connect_s=10.0))
-    assert len((tmp_path / "starts").read_text()) == starts
 
 
 def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):
@@ -267,26 +242,6 @@ class TestTheWire:
                 taken.append(found)
         assert taken == [(7, About.ACT, b"abc"), (8, About.CLOSE, b"")]
 
-    @pytest.mark.parametrize("seed", range(20))
-    def test_bytes_of_any_kind_are_frames_or_a_wire_error(self, seed):
-        rng = np.random.default_rng(seed)
-        buffer = bytearray(rng.bytes(400))
-        try:
-            while wire.take(buffer) is not None:
-                pass
-        except WireError:
-            return
-        assert len(buffer) < 9 + wire.MOST_BYTES
-
-    @pytest.mark.parametrize(
-        "content", [b"", b"\0" * 15, b"\0" * 16 + b"{", b"\0" * 16 + b"3", b"\0" * 16 + b"\xff"]
-    )
-    def test_answers_that_are_none_are_a_wire_error(self, content):
-        if len(content) == 16:
-            return
-        with pytest.raises(WireError):
-            wire.unpack_answers(content, 2)
-
     def test_answers_are_unpacked_as_they_were_packed(self):
         packed = wire.pack_answers(np.array([1.0, np.nan]), {1: "\ud800 no"})
         answers, reasons, _, wishes = wire.unpack_answers(packed, 2)
@@ -322,31 +277,6 @@ class TestTheWire:
         assert wire.unpack_scene(wire.pack_scene([], scene(2)))[1].merged is None
 
 
-def test_a_flood_of_frames_of_others_does_not_hold_the_deadline_up(spec):
-    source = """
-import os, struct, time
-def Vut(seen):
-    frame = struct.pack("<IIB", 0, 99999, 10) * 4000
-    while True:
-        try:
-            while True:
-                for descriptor in range(3, 10):
-                    try:
-                        os.write(descriptor, frame)
-                    except OSError:
-                        pass
-        except BaseException:
-            pass
-"""
-    host = Host(FINDER, spec(source), OPTIONS)
-    try:
-        host.make(spec(source), 1)
-        with pytest.raises(HostDiedError):
-            host.ask(About.ACT, wire.pack_scene([], scene(1)))
-    finally:
-        host.kill()
-
-
 def test_innocent_cases_are_not_blamed_for_what_a_thread_does_later(spec):
     source = """
 import os, threading
@@ -365,37 +295,3 @@ class Vut:
 """
     ran = run_cases(factory(spec(source), deadline_s=0.3), cases_of(6), corridors=4)
     assert [t.error for t in ran] == [None] * 4 + ["ended its process with exit code 3", None]
-
-
-def test_the_outcomes_hold_no_address_and_no_control_characters(spec, tmp_path):
-    vut = spec("def Vut(seen):\n    raise ValueError(object(), '\\x1b[0m')\n")
-    lines = []
-    for name in ("a", "b"):
-        settings = campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2)
-        run = run_campaign(settings, tmp_path / name)
-        lines.append((run.folder / "outcomes.jsonl").read_bytes())
-    assert lines[0] == lines[1]
-    error = json.loads(lines[0].splitlines()[0])["error"]
-    assert error == r"ValueError: (<object object at 0x...>, '\x1b[0m') (my_vut.py, line 2)"
-
-
-def test_it_takes_signals_the_same_whoever_starts_it(spec):
-    source = """
-import signal
-def Vut(seen):
-    ignored = [n.name for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1)
-               if signal.getsignal(n) is signal.SIG_IGN]
-    raise ValueError(ignored, signal.pthread_sigmask(signal.SIG_BLOCK, ()))
-"""
-    numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGUSR1)
-    before = [signal.signal(number, signal.SIG_IGN) for number in numbers]
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        vut = HostedVut(1, FINDER, spec(source), OPTIONS)
-        assert np.isnan(vut.act(scene(1))[0])
-        assert vut.reason(0).startswith("ValueError: ([], set())")
-        vut.close()
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM})
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)

@@ -55,10 +55,6 @@ class TestASpec:
         assert len(set(specs)) == 2
         assert all(map(is_here, specs))
 
-    def test_of_the_same_object_is_the_same(self):
-        vut = Batched(0.0)
-        assert spec_of(vut) == spec_of(vut)
-
     @pytest.mark.parametrize("thing", [3, None, object(), type("Nothing", (), {}), print])
     def test_of_what_is_no_vut_is_refused(self, thing):
         if thing is print:
@@ -128,32 +124,6 @@ class TestACampaign:
         with pytest.warns(UserWarning, match="and without workers"):
             ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
 
-    def test_that_was_interrupted_goes_on_and_takes_more_cases(self, tmp_path):
-        def stop(outcome):
-            if outcome.index == 3:
-                raise KeyboardInterrupt
-
-        small = {**SMALL, "batch": 2, "sampler": "subset"}
-        folder, whole = tmp_path / "run", ms.campaign("level0", **small, out=tmp_path / "whole")
-        with pytest.raises(KeyboardInterrupt) as stopped:
-            ms.campaign("level0", **small, out=folder, on_case=stop)
-        assert stopped.value.__notes__ == [f"stopped; go on with ms.resume({str(folder)!r})"]
-        assert len(ms.open_run(folder).cases) == 2
-        again = []
-        done = ms.resume(folder, on_case=lambda outcome: again.append(outcome.index))
-        assert again == [2, 3]
-        assert list(done.cases) == list(whole.cases)
-        assert len(ms.resume(done, cases=6).cases) == 6
-        with pytest.raises(ms.UserError, match="vut"):
-            ms.resume(folder, vut="design2", cases=8)
-
-    def test_takes_a_pov_of_the_same_kinds(self, tmp_path):
-        with pytest.warns(UserWarning, match="drives"):
-            run = ms.campaign(
-                "design2", level="own", pov=lambda _: -0.5, cases=4, out=tmp_path / "run"
-            )
-        assert run.trajectory(0).a_pov_mps2[0] == -0.5
-
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -191,18 +161,6 @@ def test_the_main_module_is_whole_again_after_processes_have_started():
 
 
 class TestTheOtherFunctions:
-    def test_one_case_shows_itself(self):
-        found = ms.run("design2", level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6)
-        assert found.failed
-        assert repr(found).startswith("<case: MERGED at 9.3 s, contact")
-        assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
-
-    def test_one_case_takes_a_row_of_a_campaign(self, run):
-        row = ms.open_run(run.folder).failures[0]
-        again = ms.run("design1", row)
-        assert again.outcome.measures.score == row["score"]
-        assert not ms.run("design2", row, v_pov0_mps=25).failed
-
     @pytest.mark.parametrize(
         ("values", "part"),
         [({"x": -300}, "a case has no x"), ({"x_pov0_m": -300}, "v_pov0_mps"), ({"level": 7}, "7")],
@@ -210,13 +168,6 @@ class TestTheOtherFunctions:
     def test_one_case_is_refused(self, values, part):
         with pytest.raises(ms.UserError, match=part):
             ms.run("design2", **values)
-
-    def test_cases_run_again_with_another_vut(self, run):
-        worst = ms.open_run(run.folder).failures[0]["index"]
-        found = ms.rerun(run.folder, [worst], vut="design2")
-        assert [(c.b.index, c.change) for c in found.steps[0].cases] == [(worst, "fixed")]
-        assert repr(found) == "<Comparison: 0 cases broke, 1 fixed>"
-        assert found._repr_html_() == f"<pre>{str(found).replace('>', '&gt;')}</pre>"
 
     def test_cases_are_exported(self, run, tmp_path):
         (config,) = ms.export(run.folder, [3], out=tmp_path / "sumo")

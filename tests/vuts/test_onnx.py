@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from export_policy import export_onnx
-from merges import HALF, SMALLER
+from merges import SMALLER
 from networks import constant_network as network
 from plans import plan_for
 from vut_contract import begin, cases_of, in_process, on_lane, run_cases
@@ -58,16 +58,6 @@ def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenar
     )
     for one, other in zip(by_onnx, built_in, strict=True):
         assert np.array_equal(one.motion, other.motion)
-
-
-def test_an_export_says_for_which_scenario_it_is_and_what_its_actions_are(exported, tmp_path):
-    export_onnx("vut1", tmp_path / "a")
-    assert (tmp_path / "a").read_bytes() == (exported / "vut1.onnx").read_bytes()
-    export_onnx("vut1", tmp_path / "b", scenario=HALF)
-    for path, expected in (("a", "-4 -3 -2 -1 0 1 2"), ("b", "-2 -1.5 -1 -0.5 0 0.5 1")):
-        said = ort.InferenceSession(tmp_path / path).get_modelmeta().custom_metadata_map
-        assert said["actions_mps2"] == expected
-        assert said["scenario"] == ("us23" if path == "a" else "multiple")
 
 
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.long)])
@@ -155,17 +145,6 @@ def test_weights_that_are_not_finite_are_refused(tmp_path, value):
         in_process(f"onnx:{path}")
 
 
-def test_infinity_as_a_limit_is_no_weight(tmp_path):
-    path = network(tmp_path / "clipped.onnx", answer=[0.5])
-    model = onnx.load(path)
-    model.graph.output[0].name = "clipped"
-    model.graph.initializer.append(onnx.numpy_helper.from_array(np.array(-np.inf), "low"))
-    model.graph.node.append(onnx.helper.make_node("Clip", ["out", "low"], ["clipped"]))
-    path.write_bytes(model.SerializeToString())
-    (trajectory,) = run_cases(in_process(f"onnx:{path}"), cases_of(1))
-    assert (trajectory.a_vut_mps2[:-1] == 0.5).all()
-
-
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "text.onnx").write_text("no network")
     network(tmp_path / "wide.onnx", answer=[0.0], width=5)
@@ -183,12 +162,3 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
         with pytest.raises(UserError, match=r"onnx|ONNX") as refused:
             in_process(f"onnx:{spec}")
         assert said in str(refused.value)
-
-
-def test_an_export_overwrites_nothing_and_knows_its_policies(exported, tmp_path):
-    with pytest.raises(UserError, match="exists: choose another name"):
-        export_onnx("vut1", exported / "vut1.onnx")
-    with pytest.raises(UserError, match="there is no policy 'vut9'"):
-        export_onnx("vut9", tmp_path / "x.onnx")
-    with pytest.raises(UserError, match="there is no folder"):
-        export_onnx("vut1", tmp_path / "no-folder" / "x.onnx")

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import asdict
 
-import numpy as np
 import pytest
 
-from merge_sumo import api
-from merge_sumo.drivers.base import Design, Driver
 from merge_sumo.errors import UserError
 from merge_sumo.vuts.base import VutOptions, with_options
-from merge_sumo.vuts.host import hosted
 from merge_sumo.vuts.in_memory import keep
-from merge_sumo.vuts.registry import BUILT_IN_VUTS, BuiltInVut, VutFactory, parameters_of
+from merge_sumo.vuts.registry import BUILT_IN_VUTS, VutFactory, parameters_of
 
 SOURCE = """
 class Vut:
@@ -89,22 +84,14 @@ def test_a_hosted_controller_tells_the_same(file):
     [
         ("{}:Vut?nothing=1", "it has no parameter 'nothing': choose from gain, late_m, shift"),
         ("{}:Vut?_hidden=1", "it has no parameter '_hidden'"),
-        ("{}:Vut?on=1", "it has no parameter 'on'"),
         ("{}:Batch?corridors=3", "it has no parameter 'corridors': choose from gain"),
-        ("{}:law?seen=1", "it has no parameter 'seen': choose from gain"),
         ("{}:Vut?gain=fast", "gain is 'fast': give a number"),
-        ("{}:Vut?gain=1&gain=2", "the option gain is there twice"),
         ("{}:Vut?gain", "'gain' is not an option: write NAME=VALUE"),
         ("gap?headway=1", "it has no parameter 'headway': choose from brake_mps2, headway_s"),
         ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
-        ("gap?headway_s=nan", "headway_s is 'nan': give a number"),
-        ("gap?brake_mps2=0", "brake_mps2 is 0"),
-        ("design1?headway_s=1", "it has no parameter 'headway_s': choose from gap_m, kd,"),
         ("design2?x2_m=140", "x2_m is 140.0: stage 3 cannot begin before stage 2"),
-        ("roundabout?headway_s=1", "it has no parameter 'headway_s': choose from brake_mps2,"),
         ("level1?x=1", "it has no parameter 'x': it has none"),
         ("sumo:IDM?taw=1", "it has no parameter 'taw': choose from accel,"),
-        ("sumo:IDM?sigma=1", "it has no parameter 'sigma'"),
         ("sumo:IDM?tau=-1", "tau is -1: give a number from 0 up"),
     ],
 )
@@ -135,60 +122,6 @@ def test_a_built_in_vut_keeps_what_is_not_set(name):
     VutFactory(f"{name}?{first}=150")(2).close()
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class OneBrake(Design):
-    brake_mps2: float = 3.0
-    until_s: float = 0.05
-
-
-class OneBrakeVut(Driver):
-    def __init__(self, corridors: int, design: OneBrake) -> None:
-        super().__init__(corridors)
-        self.design = design
-
-    def act(self, scene):
-        return np.where(scene.step * 0.1 < self.design.until_s, -self.design.brake_mps2, 1.0)
-
-
-def test_a_vut_that_is_registered_as_contributing_says_has_parameters(tmp_path, monkeypatch):
-    monkeypatch.setitem(BUILT_IN_VUTS, "brakes", BuiltInVut(OneBrakeVut, OneBrake()))
-    assert parameters("brakes?until_s=0.2") == {"brake_mps2": 3.0, "until_s": 0.2}
-    here: dict[str, Any] = {"workers": 1, "progress": False}
-    run = api.campaign(
-        "brakes",
-        level=0,
-        cases=4,
-        sampler="uniform",
-        fail_when="vut_max_brake_mps2 > 2.001",
-        out=tmp_path / "run",
-        **here,
-    )
-    (of_brake,) = api.explain(run, 0, params=["brake_mps2=0..4"]).found.parameters
-    assert of_brake.below == 2.001
-    few: dict[str, Any] = {"trials": 6, "rounds": 1, **here}
-    repaired = api.repair(run, ["brake_mps2=0..4"], out=tmp_path / "out", **few)
-    assert 0.0 <= repaired.chosen.values["brake_mps2"] <= 2.001  # type: ignore[union-attr]
-
-
 def test_an_option_is_set_in_the_place_of_an_older_one():
     assert with_options("a.py:V?x=1&y=2", {"y": "3", "z": "4"}) == "a.py:V?x=1&y=3&z=4"
     assert with_options("design2", {"gap_m": "20"}) == "design2?gap_m=20"
-
-
-def test_a_process_is_opened_for_the_first_of_the_values_alone(file, monkeypatch):
-    opened: list[str] = []
-    host = hosted.Host
-
-    def counted(finder, spec, options):
-        opened.append(spec)
-        return host(finder, spec, options)
-
-    monkeypatch.setattr(hosted, "Host", counted)
-    for value in (1, 2, 3):
-        assert VutFactory(f"{file}:Vut?gain={value}").files
-    assert opened == [f"{file}:Vut?gain=1"]
-    with pytest.raises(UserError, match="gain is 'high': give a number"):
-        VutFactory(f"{file}:Vut?gain=high")
-    # Another name is another question: whether the controller has it is for its process to say.
-    VutFactory(f"{file}:Vut?late_m=2")
-    assert len(opened) == 2

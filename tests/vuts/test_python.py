@@ -5,12 +5,10 @@
 from __future__ import annotations
 
 import json
-import pickle
 import random
 import re
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,14 +17,10 @@ from conftest import some
 from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import record_of
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import MAX_STEPS, US23, VUT
+from merge_sumo.values.scenario import US23, VUT
 from merge_sumo.values.trajectory import End
-
-LONG = partial(pytest.param, marks=pytest.mark.long)
 
 
 @pytest.fixture
@@ -50,15 +44,9 @@ class Vut:
     def act_batch(self, seen):
         return np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)
 """
-FUNCTION = """
-def Vut(seen):
-    return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
-"""
 
 
-@pytest.mark.parametrize(
-    ("source", "name"), [(LEVEL0_CLASS, "Level0"), LONG(FUNCTION, "Vut"), (BATCHED, "Vut")]
-)
+@pytest.mark.parametrize(("source", "name"), [(LEVEL0_CLASS, "Level0"), (BATCHED, "Vut")])
 def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
     vut, tmp_path, source, name
 ):
@@ -94,11 +82,6 @@ def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
         in_process("bad")
     with pytest.raises(UserError, match=r"choose one of .*mine"):
         in_process("nobody")
-
-
-def test_a_factory_travels_to_another_process_as_plain_values(vut):
-    made = in_process(vut(LEVEL0_CLASS, "Level0"), deadline_s=2.0)
-    assert pickle.loads(pickle.dumps(made)) == made  # noqa: S301 (our own bytes)
 
 
 WATCHER = """
@@ -142,15 +125,9 @@ class Vut:
 
 WRONG_ANSWERS = {
     "float('nan')": "nan",
-    "-float('inf')": "inf",
-    "None": "answered None (NoneType) instead of a number",
-    "'1.0'": "answered '1.0' (str) instead of a number",
     "[1.0]": "answered [1.0] (list) instead of a number",
-    "True": "answered True (bool) instead of a number",
     "1 / 0": "ZeroDivisionError: division by zero (my_vut.py, line 6)",
-    "__import__('sys').exit(3)": "SystemExit: 3",
     "breakpoint()": "a debugger was left; breakpoints work with `merge-sumo run --debug`",
-    "__import__('time').sleep(60)": "took longer than the deadline of 0.3 s",
     "exec('while True: pass')": "took longer than the deadline of 0.3 s",
 }
 SOMETIMES = """
@@ -162,9 +139,7 @@ class Vut:
 """
 
 
-@pytest.mark.parametrize(
-    "answer", some(WRONG_ANSWERS, "float('nan')", "[1.0]", "1 / 0", "exec('while True: pass')")
-)
+@pytest.mark.parametrize("answer", WRONG_ANSWERS)
 def test_what_it_does_wrong_is_the_outcome_of_its_own_case(vut, answer):
     cases = cases_of(8)
     spec = vut(SOMETIMES.format(answer=answer))
@@ -222,16 +197,6 @@ class Vut:
     assert errors == ["RuntimeError: still broken (my_vut.py, line 6)"] * 3
 
 
-@pytest.mark.parametrize(
-    ("answer", "reason"),
-    [("np.zeros(3)", "shape (3,)"), LONG("None", "shape ()"), LONG("1 / 0", "ZeroDivisionError")],
-)
-def test_a_wrong_batch_fails_its_cases_and_none_is_lost(vut, answer, reason):
-    source = BATCHED.replace("np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)", answer)
-    trajectories = run_cases(in_process(vut(source)), cases_of(9))
-    assert all(t.end is End.VUT_ERROR and reason in t.error for t in trajectories)
-
-
 def test_a_batched_vut_cannot_move_the_cars(vut):
     source = BATCHED.replace("return ", "seen.x_vut_m[:] = 5.0; seen.v_vut_mps[:] = 1.0; return ")
     assert {t.end for t in run_cases(in_process(vut(source)), cases_of(4))} == {End.MERGED}
@@ -243,12 +208,6 @@ def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(
         (trajectory,) = run_cases(in_process(vut(source, file=f"v{answer}.py")), cases_of(1))
         assert trajectory.clipped_steps == (len(trajectory.motion) - 1) * clipped
         assert (trajectory.a_vut_mps2[:-1] == 2.0).all()
-
-
-def test_a_vut_that_stands_is_a_timeout(vut):
-    (trajectory,) = run_cases(in_process(vut("def Vut(seen):\n    return -4.0\n")), cases_of(1))
-    assert trajectory.end is End.TIMEOUT
-    assert len(trajectory.motion) == MAX_STEPS + 1
 
 
 def test_what_it_prints_goes_to_standard_error_and_close_is_called(vut, capsys):
@@ -310,17 +269,6 @@ def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
     trajectories = run_cases(in_process(vut(source, "MyVut")), cases_of(20))
     assert {t.end for t in trajectories} == {End.MERGED}
     assert any(t.a_vut_mps2.min() == -2.0 for t in trajectories)
-
-
-def test_a_campaign_records_the_hash_of_the_file_of_its_vut(vut, tmp_path):
-    hashes = []
-    for source in (FUNCTION, FUNCTION + "# changed"):
-        settings = campaign_settings(vut=vut(source), cases=2, sampler="uniform", batch=2)
-        (sha256,) = record_of(settings, resolve(settings))["vut_files"].values()
-        hashes.append(sha256)
-    assert hashes[0] != hashes[1]
-    built_in = campaign_settings(vut="level0")
-    assert record_of(built_in, resolve(built_in))["vut_files"] is None
 
 
 SEEDED = """

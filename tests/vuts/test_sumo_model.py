@@ -113,12 +113,3 @@ def test_sumos_lane_change_model_forgets_the_cars_of_other_episodes(name):
     together = run_on(vut, scenario, 0, 30)
     alone = run_on(vut, scenario, 0, 30, corridors=1)
     assert all(np.array_equal(a.motion, b.motion) for a, b in zip(together, alone, strict=True))
-
-
-def test_sumo_merges_in_traffic():
-    for trajectory in run_on(factory("sumo:Krauss"), named_scenario("us23-lane-traffic"), 0, 40):
-        assert trajectory.error is None
-        assert trajectory.x_vut_m[-1] < 130.0, "it waits at the end, and no merge is forced"
-        x, v, a = trajectory.motion[:, VUT].T
-        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
-        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)

@@ -13,15 +13,14 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import traci
 from conftest import some
-from controllers import RAW_CLIENT, assert_drives_as_level0, free_port, program, raw_client
-from raw_traci import GET_LANE, MISDEEDS, STEP, Client, GoneError, command, text
+from controllers import assert_drives_as_level0, free_port, program, raw_client
+from raw_traci import MISDEEDS, STEP, Client, GoneError, command
 from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.drivers.base import Scene
@@ -33,7 +32,6 @@ from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
 
-LONG = partial(pytest.param, marks=pytest.mark.long)
 CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
@@ -138,31 +136,6 @@ class TestAStockClient:
         assert played.accelerations[:2] == pytest.approx([3.0, 1.0])
         assert played.speeds == pytest.approx([18.2, 18.3, 18.3, 18.3, 18.1, 18.1])
 
-    def test_that_steps_to_a_time_of_the_past_makes_no_step(self):
-        def drive(c):
-            c.simulationStep()
-            c.simulationStep()
-            before = c.simulation.getTime()
-            c.simulationStep(0.05)
-            return before, c.simulation.getTime()
-
-        before, after = Played(stock(drive), steps=3).result
-        assert before == after == 0.2
-
-    def test_that_steps_far_ahead_is_told_who_came_and_went(self):
-        def drive(c):
-            c.simulationStep(0.75)
-            return (
-                c.simulation.getTime(),
-                c.simulation.getDepartedIDList(),
-                c.simulation.getArrivedIDList(),
-            )
-
-        time_s, departed, arrived = Played(stock(drive), episodes=2, steps=4).result
-        assert time_s == pytest.approx(0.8)
-        assert departed == ("pov", "vut", "pov", "vut")
-        assert arrived == ("pov", "vut")
-
     def test_subscribes_to_a_vehicle_to_the_simulation_and_to_what_is_around(self):
         speed, time_id = traci.constants.VAR_SPEED, traci.constants.VAR_TIME
         leader, domain = traci.constants.VAR_LEADER, traci.constants.CMD_GET_VEHICLE_VARIABLE
@@ -198,19 +171,6 @@ class TestAStockClient:
         assert seen[4] >= {"vut"}
         assert seen[5] == {}
         assert seen[6] == seen[7] == {}
-
-    def test_may_close_when_the_vehicle_has_arrived_and_another_come(self):
-        def once(c):
-            c.simulationStep()
-            while "vut" in c.vehicle.getIDList():
-                c.vehicle.setSpeed("vut", 18.1)
-                c.simulationStep()
-
-        def client(port):
-            stock(once)(port)
-            stock(once)(port)
-
-        assert Played(client, episodes=2, steps=5).reasons == [None, None]
 
 
 @pytest.mark.slow
@@ -270,13 +230,9 @@ def children() -> set[str]:
     [
         ("exits", "the controller closed the connection; the controller ended with exit code 0"),
         ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
-        LONG("is killed", "the controller was ended by signal 9"),
         ("hangs", "the controller made no step within the deadline of 0.5 s"),
-        LONG("will not be stopped", "made no step within the deadline of 0.5 s"),
         ("says goodbye", "the controller closed the connection during the episode"),
-        LONG("half a message", "sent half a message and no more within the deadline of 0.5 s"),
         ("a huge message", "bytes that are no TraCI: a message of 2147483647 bytes was announced"),
-        LONG("steps to nan", "the controller stepped to time nan"),
         ("nan", "the controller commanded vehicle.setSpeed(nan)"),
     ],
 )
@@ -310,13 +266,6 @@ def test_a_command_that_never_connects_is_told_how():
     command = f"{sys.executable} -c 'import time; time.sleep(9)'"
     with pytest.raises(UserError, match=r"in 0\.3 s: the command is told the port as {port}"):
         run_cases(factory("traci:" + command, connect_s=0.3), cases_of(1))
-
-
-def test_the_reason_of_an_end_is_not_that_of_a_sumo_which_the_controller_started(tmp_path):
-    words = "KeyError: 64\nError: Could not access configuration 'm.sumocfg'.\nQuitting (on error)."
-    command = program(tmp_path, f"{RAW_CLIENT}client.drive(4)\nsys.exit({words!r})\n")
-    (trajectory,) = run_cases(factory("traci:" + command), cases_of(1))
-    assert trajectory.error.endswith("the controller ended with exit code 1: KeyError: 64")
 
 
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
@@ -380,18 +329,16 @@ class Monkey:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [25, pytest.param(1000, marks=pytest.mark.long)])
-def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason(count):
-    before, port, deadline_s = descriptors(), free_port(), 0.2
+def test_of_random_misbehaviours_every_case_has_its_verdict_or_its_reason():
+    count, before, port, deadline_s = 25, descriptors(), free_port(), 0.2
     monkey = Monkey(port, count)
-    cases, misdeeds, ran = cases_of(200, seed=9), 0, 0
+    cases, misdeeds = cases_of(200, seed=9), 0
     try:
         while misdeeds < count:
             vut = factory(f"traci:{port}", deadline_s=deadline_s, connect_s=5.0)
             trajectories = run_cases(vut, cases[: min(len(cases), count - misdeeds)])
             for trajectory in trajectories:
                 assert_has_verdict_or_reason(trajectory)
-            ran += len(trajectories)
             misdeeds += sum(t.end is End.VUT_ERROR for t in trajectories)
     finally:
         monkey.stop()
@@ -434,20 +381,6 @@ def test_who_asks_and_asks_and_makes_no_step_has_until_the_deadline():
     assert reason.endswith("within the deadline of 0.3 s")
 
 
-def test_who_asks_very_much_at_a_time_is_answered_or_dropped():
-    def client(port):
-        greedy = Client(port)
-        greedy.step()
-        ask = command(GET_LANE, bytes((0,)) + text(""))
-        with suppress(GoneError):
-            greedy.send(*[ask] * ((1 << 20) // len(ask) - 1))
-            greedy.socket.settimeout(20.0)
-            greedy.read(10_000_000)
-
-    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
-    assert reason is not None
-
-
 def test_of_two_clients_the_second_waits_and_changes_nothing():
     def client(port):
         first = Client(port)
@@ -467,18 +400,3 @@ def test_of_two_clients_the_second_waits_and_changes_nothing():
     both, one = (Played(c, steps=8) for c in (client, alone))
     assert both.reasons == one.reasons == [None]
     assert both.speeds == one.speeds
-
-
-def test_who_waits_for_a_second_client_of_its_own_is_told_that_one_is_served():
-    def client(port):
-        first = Client(port)
-        first.step()
-        second = Client(port)
-        with suppress(GoneError):
-            second.step()  # as a second connection does that is made before the first step
-
-    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
-    assert reason == (
-        "the controller made no step within the deadline of 0.3 s; another client waits, but one "
-        "at a time is served"
-    )

@@ -18,15 +18,7 @@ from merge_sumo.vuts.traci.session import QUESTIONS
 
 V, T = "vehicle", "vehicletype"
 SCRIPTS: dict[str, list[tuple]] = {
-    "a limit of acceleration": [(0, V, "setAccel", 1.0), (0, V, "setSpeed", 19.0)],
     "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
-    "limits above the scenario's": [
-        (0, V, "setAccel", 1.5),
-        (1, V, "setDecel", 3.5),
-        (1, V, "setSpeed", 20.0),
-        (5, V, "setSpeed", 12.0),
-    ],
-    "a maximum speed below": [(0, V, "setMaxSpeed", 17.0), (4, V, "setSpeed", 19.0)],
     "a maximum speed above, and lifted": [
         (0, V, "setMaxSpeed", 18.1),
         (0, V, "setSpeed", 25.0),
@@ -41,24 +33,11 @@ SCRIPTS: dict[str, list[tuple]] = {
         (12, V, "setMaxSpeed", 17.9),
     ],
     "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
-    "slowing down beyond a limit": [(0, V, "setDecel", 0.5), (0, V, "slowDown", 17.0, 1.5)],
     "slowing down at once": [(0, V, "slowDown", 17.95, 0.0), (1, V, "setSpeed", 18.1)],
     "speeding up beyond a limit": [(0, V, "setAccel", 0.5), (0, V, "slowDown", 20.0, 1.5)],
-    "an acceleration beyond a limit": [
-        (0, V, "setAccel", 0.5),
-        (0, V, "setAcceleration", 1.0, 1.5),
-    ],
     "an acceleration after another": [
         (0, V, "setAcceleration", 1.0, 0.5),
         (3, V, "setAcceleration", -2.0, 1.5),
-    ],
-    "no limits in mode 0": [
-        (0, V, "setAccel", 0.5),
-        (0, V, "setDecel", 0.5),
-        (0, V, "setMaxSpeed", 18.0),
-        (0, V, "setSpeedMode", 0),
-        (0, V, "setSpeed", 18.2),
-        (4, V, "setSpeed", 17.9),
     ],
     "one limit in mode 4": [
         (0, V, "setAccel", 0.5),
@@ -76,13 +55,6 @@ SCRIPTS: dict[str, list[tuple]] = {
         (0, V, "setSpeedFactor", 0.3),
         (1, V, "setSpeed", 18.3),
     ],
-    "limits of the type": [
-        (0, T, "setMaxSpeed", 18.4),
-        (0, T, "setAccel", 0.8),
-        (0, T, "setDecel", 0.9),
-        (1, V, "setSpeed", 25.0),
-        (9, V, "setSpeed", 10.0),
-    ],
     "limits of the type behind its own": [
         (0, T, "setAccel", 0.8),
         (0, V, "setDecel", 1.1),
@@ -90,11 +62,6 @@ SCRIPTS: dict[str, list[tuple]] = {
         (1, T, "setDecel", 0.1),
         (1, V, "setSpeed", 25.0),
         (7, V, "setSpeed", 10.0),
-    ],
-    "a factor of speed leaves it its type": [
-        (0, V, "setSpeedFactor", 0.5),
-        (1, T, "setAccel", 0.4),
-        (1, V, "setSpeed", 25.0),
     ],
 }
 READS = (
@@ -167,21 +134,6 @@ class TestWhatWasSet:
         drive.step()
         assert drive.speeds()[0] == pytest.approx(18.1)
 
-    def test_is_known_to_a_sumo_that_is_asked_later(self, drive):
-        drive.begin()
-        follow = []
-        for tau_s in (1.0, 3.0):
-            drive.ours.vehicle.setTau("vut", tau_s)
-            follow.append(drive.ours.vehicle.getFollowSpeed("vut", 18.0, 30.0, 10.0, 4.0))
-        assert follow[0] > follow[1] + 1.0
-
-    def test_of_the_gap_counts_in_the_distance_to_the_leader_as_in_sumo(self, drive):
-        drive.begin()
-        drive.place([60.0, 20.0], [20.0, 18.0])
-        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(35.0))
-        drive.ours.vehicle.setMinGap("vut", 1.5)
-        assert drive.ours.vehicle.getLeader("vut", 100.0) == ("pov", pytest.approx(33.5))
-
     def test_of_looks_and_parameters_can_be_read_back(self, drive):
         drive.begin()
         c = drive.ours
@@ -222,13 +174,6 @@ class TestWhatSumoDecides:
         # A stop ends a step sooner or later.
         assert max(apart) < (2.0 if name == "a stop" else 0.4)
         assert ours != pytest.approx(18.0, abs=1e-3)
-
-    def test_is_said_in_no_note(self, drive):
-        drive.begin()
-        drive.ours.vehicle.setSpeedMode("vut", 31)
-        drive.ours.vehicle.setTau("vut", 2.0)
-        drive.ours.vehicle.setSpeed("vut", -1.0)
-        assert drive.session.notes == []
 
     def test_stops_before_a_car_that_stands(self, drive):
         drive.begin()
@@ -272,20 +217,15 @@ def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
         ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
         ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
         ("vehicle", "moveTo", ("vut", "main_out_0", 5.0), "as the scenario says"),
-        ("vehicle", "remove", ("vut",), "as the scenario says"),
         ("vehicle", "setRoute", ("vut", ["ramp"]), "the route is the scenario's"),
-        ("vehicle", "changeTarget", ("vut", "main_in"), "the route is the scenario's"),
         ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
         ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
         ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
-        ("vehicle", "openGap", ("pov", 1.0, 1.0, 1.0, 1.0), "the vehicle 'pov' is not the"),
-        ("vehicle", "setStop", ("pov", "main_out"), "the vehicle 'pov' is not the controller's"),
         ("vehicletype", "setTau", ("pov", 1.0), "the type 'pov' is not the controller's"),
         ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
         ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
         ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
         ("simulation", "loadState", ("x.xml",), "the campaign runs the simulation"),
-        ("simulation", "writeMessage", ("x",), "the campaign runs the simulation"),
         ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
     ],
 )

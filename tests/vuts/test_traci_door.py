@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import os
 import pwd
-import signal
 import socket
 import subprocess
 import sys
@@ -36,7 +35,6 @@ from merge_sumo.vuts.traci.door import descends, owner_of
 
 RAW = SUPPORT / "raw_traci.py"
 OURS = raw_client()
-CAMPAIGN = sys.executable, "-m", "merge_sumo.cli", "campaign"
 
 
 @contextmanager
@@ -307,31 +305,3 @@ def test_a_sumo_that_is_ended_once_is_nobodys_fault(tmp_path, signal, times, err
         thread.join()
     found = [t.error for t in trajectories if t.error]
     assert found == ["the SUMO that answers the controller was ended by signal 15"] * errors
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["SIGTERM", pytest.param("SIGINT", marks=pytest.mark.long)])
-def test_a_campaign_that_is_stopped_twice_while_a_controller_thinks_ends_at_once(name, tmp_path):
-    """And not when the controller's deadline of ten minutes has passed; nothing is left."""
-    begun = tmp_path / "begun"
-    thinks = f"client.drive(4)\nopen({str(begun)!r}, 'w').close()\ntime.sleep(600)\n"
-    asked = ("--cases", "5", "--deadline", "600", "--out", str(tmp_path / "run"))
-    command = program(tmp_path, RAW_CLIENT + thinks)
-    with none_left():
-        campaign = subprocess.Popen(
-            [*CAMPAIGN, "--vut", f"traci:{command}", *asked],
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
-        try:
-            while not begun.exists():
-                assert campaign.poll() is None
-                time.sleep(0.05)
-            for _ in range(2):
-                campaign.send_signal(signal.Signals[name])
-                time.sleep(0.5)
-            _, said = campaign.communicate(timeout=120)
-        finally:
-            campaign.kill()
-    assert campaign.returncode != 0
-    assert b"Traceback" not in said

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
@@ -85,27 +84,6 @@ def test_a_lane_that_its_edge_does_not_have_is_refused_as_by_sumo(tmp_path, inde
         assert trajectory.x_vut_m[-2] < -60.0, "it merges at the gore, by the second command"
 
 
-@pytest.mark.slow
-def test_the_gap_that_a_controller_chooses_by_neighbours_is_the_one_it_gets(tmp_path):
-    source = (
-        ON_LANE
-        + """
-    gaps = [gap for side in (0b10, 0b00) for _, gap in traci.vehicle.getNeighbors("vut", side)]
-    assert gaps == [gap for _, gap in (*traci.vehicle.getLeftLeaders("vut"),
-                                       *traci.vehicle.getLeftFollowers("vut"))], gaps
-    assert traci.vehicle.couldChangeLane("vut", 1) in (True, False)
-    if all(gap > 12.0 for gap in gaps):
-        traci.vehicle.changeLane("vut", 1, 0.0)
-"""
-    )
-    *_, in_front, behind, _ = drive(tmp_path, source, cases=6)
-    for trajectory in (in_front, behind):
-        apart_m = trajectory.x_pov_m[-2] - trajectory.x_vut_m[-2]
-        last_m = trajectory.x_pov_m[-3] - trajectory.x_vut_m[-3]
-        assert apart_m > 17.0 >= last_m > 5.0
-        assert trajectory.x_vut_m[-1] < 0.0
-
-
 def test_the_controller_of_the_tutorial_merges_into_a_gap(tmp_path):
     page = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text("utf-8")
     _, source = re.findall(r"```python\n(import sys, traci.*?)```", page, flags=re.DOTALL)
@@ -144,20 +122,6 @@ while traci.simulation.getMinExpectedNumber() > 0:
 
 
 @pytest.mark.slow
-def test_sumos_car_following_stands_before_the_end_of_a_lane_that_it_may_not_leave(tmp_path):
-    source = """
-while traci.simulation.getMinExpectedNumber() > 0:
-    traci.simulationStep()
-    if "vut" in traci.vehicle.getIDList():
-        traci.vehicle.setSpeed("vut", -1)
-"""
-    (trajectory,) = drive(tmp_path, source, cases=1)
-    assert trajectory.end is End.TIMEOUT
-    assert trajectory.x_vut_m[-1] == pytest.approx(129.5, abs=0.3)
-    assert trajectory.v_vut_mps[-1] == pytest.approx(0.0, abs=0.05)
-
-
-@pytest.mark.slow
 def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
     source = (
         DRIVES
@@ -172,32 +136,6 @@ def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
     assert near < -65.0
     assert near_checked > -60.0, "the POV is 17 m behind and faster"
     assert far_checked == far
-
-
-@pytest.mark.slow
-def test_what_it_is_told_is_of_the_edge_with_both_lanes(tmp_path):
-    source = (
-        ON_LANE
-        + """
-    here = dict(
-        lane=traci.vehicle.getLaneID("vut"), index=traci.vehicle.getLaneIndex("vut"),
-        lanes=traci.edge.getLaneNumber("lane"), at=traci.vehicle.getLanePosition("vut"),
-        x=traci.vehicle.getPosition("vut")[0], y=traci.vehicle.getPosition("vut")[1],
-        pov=traci.vehicle.getLaneID("pov"), mode=traci.vehicle.getLaneChangeMode("vut"),
-    )
-    import json, pathlib
-    pathlib.Path(__file__).with_name("seen.json").write_text(json.dumps(here))
-    if here["at"] > 50.0:
-        traci.vehicle.changeLane("vut", 1, 0.0)
-"""
-    )
-    (trajectory,) = drive(tmp_path, source, cases=1)
-    seen = json.loads((tmp_path / "seen.json").read_text())
-    assert (seen["lane"], seen["index"], seen["lanes"], seen["mode"]) == ("lane_0", 0, 3, 0)
-    assert seen["pov"] in ("main_in_0", "lane_1", "main_out_0")
-    at_m = trajectory.x_vut_m[-2]
-    assert seen["at"] == pytest.approx(at_m + 70.0, abs=1e-9)
-    assert (seen["x"], seen["y"]) == pytest.approx((at_m, -3.2), abs=1e-9)
 
 
 class TestTheShadow:
@@ -239,20 +177,3 @@ class TestTheShadow:
         session.step()
         session.put(self.states(-34.0), merged=True)
         assert client.vehicle.getLaneIndex("vut") == 1
-
-    def test_the_end_of_the_lane_changes_no_speed_and_is_no_wish(self, session):
-        session.enter(self.states(120.0))
-        for x_m in (122.0, 124.0, 126.0, 128.0, 130.0, 132.0):
-            assert session.step() == 20.0
-            assert not session.sumo.wants_to_merge
-            session.put(self.states(x_m), merged=x_m >= 130.0)
-        assert session.notes == [STAYED]
-
-    def test_the_next_episode_begins_on_the_ramp(self, session):
-        session.enter(self.states(-40.0))
-        session.step()
-        session.put(self.states(-38.0), merged=True)
-        session.step()
-        session.clear()
-        session.enter(self.states(-60.0))
-        assert ToSession(session).vehicle.getLaneID("vut") == "lane_0"
