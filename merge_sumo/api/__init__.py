@@ -236,7 +236,9 @@ def _concluded(
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=runner.progress)
     try:
         with runner.open(plan) as opened, bars:
-            bars.begin(_title(settings))
+
+            def begin() -> None:
+                bars.begin(_title(settings))
 
             def case_ended(outcome: Outcome) -> None:
                 bars.case_ended(outcome)
@@ -249,11 +251,15 @@ def _concluded(
                     on_before=bars.ran_before,
                     workers=opened,
                     check=runner.checks,
+                    begin=begin,
                     warn=_notice,
                 )
             else:
                 done = run_campaign(
-                    settings, plan, folder, case_ended, workers=opened, check=runner.checks
+                    *(settings, plan, folder, case_ended),
+                    workers=opened,
+                    check=runner.checks,
+                    begin=begin,
                 )
             result = CampaignRun(done, gates)
             _write_findings(result, plan, opened, bars, runner)

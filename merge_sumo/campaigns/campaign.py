@@ -99,6 +99,7 @@ def run_campaign(
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
+    begin: Callable[[], None] = lambda: None,
 ) -> Run:
     """Run a campaign into a new folder and return it.
 
@@ -112,6 +113,7 @@ def run_campaign(
         on_case: called with every outcome.
         workers: where cases run, by default in this process.
         check: called after every batch; may raise to stop there, and `resume_campaign` goes on.
+        begin: called before the first case, when nothing is refused any more.
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
@@ -124,7 +126,7 @@ def run_campaign(
             record = record_of(of_version, planned)
             journal = journals.enter_context(Journal.create(at, record))
             opened.append(_Open(of_version, planned, record, journal))
-        return _run(*opened, workers=available, on_case=on_case, check=check)
+        return _run(*opened, workers=available, on_case=on_case, check=check, begin=begin)
 
 
 def resume_campaign(
@@ -136,6 +138,7 @@ def resume_campaign(
     on_before: OnCase | None = None,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
+    begin: Callable[[], None] = lambda: None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Run:
     """Go on with a campaign that was stopped, however it was; return it as `run_campaign` does.
@@ -152,6 +155,7 @@ def resume_campaign(
         on_before: called with the outcomes of cases that ran before.
         workers: where cases run.
         check: called after every batch.
+        begin: called before the first case.
         warn: called with a sentence on what was dropped.
     """
     check_own(folder / SCENARIOS, folder / AGAINST)
@@ -178,7 +182,7 @@ def resume_campaign(
         if (on_outcome := on_before or on_case) is not None:
             for outcome in opened[0].history:
                 on_outcome(outcome)
-        return _run(*opened, workers=available, on_case=on_case, check=check)
+        return _run(*opened, workers=available, on_case=on_case, check=check, begin=begin)
 
 
 def _with_earlier(
@@ -311,10 +315,12 @@ def _run(
     workers: Workers,
     on_case: OnCase | None,
     check: Callable[[], None],
+    begin: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
     ended = list(campaign.history)
     with closing(_search(campaign, against, workers, on_case)) as search:
+        begin()
         for together in search:
             campaign.append(*together)
             ended += [outcome for batch in together for outcome, _ in batch]

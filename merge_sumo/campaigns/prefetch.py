@@ -87,7 +87,8 @@ class Prefetch:
                     return
                 self._ran.update(enumerate(chunk[1], start=chunk[0]))
                 self._ended += len(chunk[1])
-            assert self._sent.pop(first + place) == case, "what it proposes is sure"  # noqa: S101
+            sent = self._sent.pop(first + place)
+            assert sent == case, "what it proposes is sure"  # noqa: S101
             yield place, self._ran.pop(first + place)
 
     def _run_now(self, cases: Sequence[Case]) -> Iterator[tuple[int, CaseResult]]:

@@ -56,8 +56,14 @@ FILES: Final = ("vut_files", "pov_files")
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
 Batch = list[tuple[Outcome, Trajectory]]
+FARTHEST: Final = 1e9
+"""No position, speed or acceleration of ours, in m, m/s and m/s2, is as large."""
 MOST_SYNCS: Final = 8
 """Files that are synced at the same time."""
+
+
+class LostError(UserError):
+    """A trajectory that is gone, or in a file that cannot be read any more."""
 
 
 class Run:
@@ -176,12 +182,15 @@ class Run:
         return self.outcomes[index]
 
     def trajectory(self, index: int) -> Trajectory:
-        """Return the trajectory of a case; `UserError` when it is missing or unreadable."""
+        """Return the trajectory of a case.
+
+        Raises `LostError` when it is missing or unreadable, `UserError` when it is no motion.
+        """
         outcome = self.outcome(index)
         motion = self._batch(outcome.batch).get(index)
         if motion is None:
             path = batch_file(self.folder, outcome.batch)
-            raise UserError(f"{path} has no trajectory of case {index}")
+            raise LostError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
         return Trajectory(
             outcome.case,
@@ -193,10 +202,10 @@ class Run:
         )
 
     def trajectories(self, indices: Iterable[int]) -> dict[int, Trajectory]:
-        """Return the trajectories of cases by index, without those that are lost."""
+        """Return the trajectories of cases by index without those that are lost; see above."""
         known = {}
         for index in indices:
-            with suppress(UserError):
+            with suppress(LostError):
                 known[index] = self.trajectory(index)
         return known
 
@@ -211,7 +220,7 @@ class Run:
         indices = [outcome.index for outcome in self.outcomes if outcome.batch == last]
         try:
             complete = sorted(self._batch(last)) == indices
-        except UserError:
+        except LostError:
             complete = False
         return len(self.outcomes) if complete else indices[0]
 
@@ -221,13 +230,18 @@ class Run:
             path = batch_file(self.folder, batch)
             try:
                 arrays = read_arrays(path)
+            except UNREADABLE_NPZ as error:
+                raise LostError(f"cannot read the trajectories in {path}: {error}") from error
+            try:
                 arrays.pop("lines_sha256", None)
                 text = arrays.pop("signals", None)
                 motion = _motion_by_case(self.scenario.vehicles, **arrays)
                 self._signals |= {} if text is None else _signals_by_case(text, motion)
                 self._batches[batch] = motion
-            except (*UNREADABLE_NPZ, UserError) as error:
-                raise UserError(f"cannot read the trajectories in {path}: {error}") from error
+            except (ValueError, TypeError, UserError) as error:
+                raise UserError(
+                    f"{path} is not as it was written: {error}; take it from a copy"
+                ) from error
         return self._batches[batch]
 
 
@@ -373,7 +387,10 @@ def _motion_by_case(
     """Return the motion of each case, (T + 1, A, 3); ValueError or TypeError for a misfit."""
     if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != 3 * vehicles:
         raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
-    if rows.dtype.kind != "i" or rows.ndim != 1 or (rows < 1).any() or rows.sum() != len(motion):
+    if not (np.abs(motion) < FARTHEST).all():
+        raise ValueError("the motion has numbers that are not finite, or none of a road")
+    within = rows.dtype.kind == "i" and ((rows >= 1) & (rows <= len(motion))).all()
+    if not within or rows.ndim != 1 or rows.sum() != len(motion):
         raise ValueError("the rows of the cases are not those of the motion")
     parts = np.split(motion.reshape(-1, vehicles, 3), np.cumsum(rows)[:-1])
     return dict(zip(index.tolist(), parts, strict=True))

@@ -177,7 +177,7 @@ class CampaignBars(Bars):
         """Say what begins, and where its report is: the first case may take long."""
         cases = counted(self._cases, "case")
         self.say(f"{printable(title)}: {cases}, watch {printable(str(self._folder / REPORT))}")
-        self.counted("cases", 0, self._cases, "cases")
+        self.counted("cases", len(self._outcomes), self._cases, "cases")
 
     def case_ended(self, outcome: Outcome) -> None:
         """Count a case."""

@@ -14,8 +14,9 @@ from contextlib import suppress
 from functools import lru_cache
 from importlib.metadata import EntryPoint, distributions
 from typing import Final, Generic, TypeVar
+from warnings import warn
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.system.suggestions import meant
 
 T = TypeVar("T")
@@ -75,19 +76,19 @@ class Registry(Mapping[str, T], Generic[T]):
     @property
     def packages(self) -> list[str]:
         """The installed packages that add to it, in the order of their names."""
-        return sorted({package for found in self._entries().values() for package in found})
+        return sorted({package for found in entries_of(self.group).values() for package in found})
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*self._ours, *self._registered, *self._entries())))
+        return iter(dict.fromkeys((*self._ours, *self._registered, *entries_of(self.group))))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        return name in self._ours or name in self._registered or name in self._entries()
+        return name in self._ours or name in self._registered or name in entries_of(self.group)
 
     def __getitem__(self, name: str) -> T:
-        bringers: dict[str, EntryPoint | T] = dict(self._entries().get(name, {}))
+        bringers: dict[str, EntryPoint | T] = dict(entries_of(self.group).get(name, {}))
         if name in self._ours:
             bringers[OURS] = self._ours[name]
         if len(bringers) + (name in self._registered) > 1:
@@ -109,12 +110,6 @@ class Registry(Mapping[str, T], Generic[T]):
         if key not in self._objects:
             self._objects[key] = self._loaded(entry, package)
         return self._objects[key]
-
-    def _entries(self) -> dict[str, dict[str, EntryPoint]]:
-        """Return the installed entries, by name and then by package."""
-        with suppress(OSError):  # the working folder may be gone
-            return installed_entries(self.group, tuple(sys.path), os.getcwd())  # noqa: PTH109
-        return {}
 
     def _loaded(self, entry: EntryPoint, package: str) -> T:
         try:
@@ -138,8 +133,15 @@ class Registry(Mapping[str, T], Generic[T]):
         return item
 
 
+def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
+    """Return the installed entry points of a group, by name and then by package."""
+    with suppress(OSError):  # the working folder may be gone
+        return _installed(group, tuple(sys.path), os.getcwd())  # noqa: PTH109
+    return {}
+
+
 @lru_cache(maxsize=64)
-def installed_entries(
+def _installed(
     group: str, folders: tuple[str, ...], working_folder: str
 ) -> dict[str, dict[str, EntryPoint]]:
     """Return the entry points of a group, by name and then by package; nothing is imported.
@@ -155,9 +157,15 @@ def installed_entries(
     entries: dict[str, dict[str, EntryPoint]] = {}
     packages: set[str] = set()
     for package in distributions(path=searched):
-        selected = package.entry_points.select(group=group)
+        try:
+            selected = package.entry_points.select(group=group)
+            name = str(package.metadata["Name"]) if selected else ""
+        except ValueError as error:  # not UTF-8, or no entry points
+            where = package.locate_file("")
+            warn(f"left out the entry points of a package in {where}: {error}", Notice, 2)
+            continue
         # The name takes most of the time; the first package of a name shadows others.
-        if not selected or (name := str(package.metadata["Name"])) in packages:
+        if not selected or name in packages:
             continue
         packages.add(name)
         for entry in selected:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
+from merge_sumo.system.registry import entries_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
@@ -47,7 +48,7 @@ GROUP: Final = "merge_sumo.vuts"
 
 def installed_vuts() -> dict[str, EntryPoint]:
     """Return the VUTs that installed packages register, by name."""
-    return {entry.name: entry for entry in entry_points(group=GROUP)}
+    return {name: entry for name, found in entries_of(GROUP).items() for entry in found.values()}
 
 
 def installed_vut(spec: str, options: VutOptions) -> Vut:

@@ -7,11 +7,14 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import resource
+import shutil
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from calling import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,6 +22,7 @@ from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_ou
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.system.arrays import read_arrays
 from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.measures import further_measures
 from merge_sumo.values.scenario import US23
@@ -432,6 +436,37 @@ class TestARun:
             Run(folder).trajectory(0)
         assert_sentence(error, "00000.npz")
         assert not (folder / "trapped").exists()
+
+
+SPOILT = {
+    "nan": lambda motion: motion * np.nan,
+    "infinite": lambda motion: motion + np.inf,
+    "of no road": lambda motion: motion + 1e300,
+    "three columns": lambda motion: motion[:, :3],
+    "a row less": lambda motion: motion[1:],
+    "words": lambda motion: motion.astype(str),
+}
+
+
+@pytest.mark.parametrize("spoil", SPOILT.values(), ids=SPOILT)
+def test_motion_that_is_none_is_one_sentence_of_every_command(run, tmp_path, command_line, spoil):
+    folder = tmp_path / "run"
+    shutil.copytree(run.folder, folder)
+    (folder / "report.html").unlink(missing_ok=True)
+    last = failures(run.outcomes)[0]
+    for path in (folder / "trajectories").iterdir():
+        arrays = read_arrays(path)
+        np.savez(path, **{**arrays, "motion": spoil(arrays["motion"])})
+    before = contents(folder)
+    for command in (
+        ("report", folder),
+        ("export", folder, last.index, "--out", tmp_path / "exported"),
+        ("campaign", "--resume", folder, "--cases", 80),
+    ):
+        code, out, err = command_line(*command)
+        assert (code, out) == (2, "")
+        assert re.search(r"merge-sumo: .*/trajectories/\d+\.npz is not as it was written", err)
+    assert contents(folder) == before
 
 
 def test_every_measure_is_in_the_record():
