@@ -128,20 +128,6 @@ def test_a_row_of_q_in_float32_does_not_depend_on_the_rows_beside_it(name):
         assert network.values_at_once(rows[some]).tobytes() == q[some].tobytes()
 
 
-def test_features_are_finite_and_bounded_wherever_a_vut_may_take_a_driver():
-    rng = np.random.default_rng(0)
-    n = 20_000
-    found = features(
-        rng.uniform(-900, 1800, n), rng.uniform(0, 95, n), rng.uniform(-182, 20, n),
-        rng.uniform(0, 80, n), rng.uniform(0, math.pi / 2, n), scenario=US23
-    )  # fmt: skip
-    assert found.shape == (n, 28)
-    assert np.isfinite(found).all()
-    zero = np.zeros(1)
-    standing = features(zero - 200.0, zero, zero - 100.0, zero, scenario=US23)
-    assert np.isfinite(standing).all()
-
-
 def papers_features(x_pov, v_pov, x_vut, v_vut):
     """Return what a network of the paper's scenario sees, with its numbers written out."""
     distance = np.maximum(-x_vut, 0.0)
@@ -267,14 +253,6 @@ class TestTheLibraryOfPeople:
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0
 
-    @pytest.mark.long
-    @pytest.mark.parametrize("name", NETWORKS)
-    def test_loses_little_over_300_cases_that_training_never_saw(self, name):
-        found = checking.check_policy(name, self.POVS.policies, scenario=US23)
-        assert found.mean_regret <= 0.01
-        assert found.p99_regret <= 0.15
-        assert found.avoidable_collisions == 0
-
 
 class TestTheExampleRuns:
     """Wang et al., Fig. 5, as they ship in scenarios/."""
@@ -309,22 +287,6 @@ class TestTheExampleRuns:
 
 @pytest.mark.long
 class TestRationality:
-    @pytest.mark.parametrize("name", ["pov1", "vut1", "pov2"])
-    def test_no_collision_in_10000_uniform_cases(self, name):
-        cases = checking.check_cases(name, 10_000, seed=5, scenario=US23)
-        network, opponent = load_network(name), checking.opponents(name, None)
-        pair = (network, opponent) if name.startswith("pov") else (opponent, network)
-        returns = checking.returns_of(checking.play(cases, *pair), REWARD)
-        assert returns.collided.sum() == 0
-
-    @pytest.mark.parametrize("name", NETWORKS)
-    def test_regret_over_300_cases_that_training_never_saw(self, name):
-        found = checking.check_policy(name, scenario=US23)
-        mean_bound, p99_bound = REGRET_BOUNDS[name]
-        assert found.mean_regret <= mean_bound
-        assert found.p99_regret <= p99_bound
-        assert found.avoidable_collisions == 0
-
     def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
         cases = checking.check_cases("pov2", 4000, seed=6, scenario=US23)
         pov2, vut1 = load_network("pov2"), load_network("vut1")

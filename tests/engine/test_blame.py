@@ -17,7 +17,7 @@ from merge_sumo.campaigns.store import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
-from merge_sumo.system.pulse import PAUSE_S, AwakeClock, Pulse
+from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.trajectory import End
 
@@ -121,18 +121,6 @@ class TestClocks:
         assert found_s == 0.25 + 0.25 + 0.5 + 0.25
         clock.restart()
         assert clock.elapsed_s() == 0.0
-
-    def test_a_pause_is_known_before_the_next_tick(self, now):
-        still = Pulse()
-        assert still.pauses() == 0
-        now[0] += PAUSE_S * 1.1
-        assert still.pauses() == 1
-
-    def test_a_pulse_ticks_and_ends(self):
-        with Pulse() as ticking:
-            thread = ticking._thread
-            assert thread.is_alive()
-        assert not thread.is_alive()
 
 
 class TestKills:

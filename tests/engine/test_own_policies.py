@@ -29,7 +29,7 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23, MergeScenario
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
 
 SMALL: dict[str, Any] = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
@@ -167,13 +167,6 @@ class TestOtherCommands:
 
         assert [counted(folder) for folder in (None, same, swapped, swapped)] == [30, 0, 30, 0]
 
-    @pytest.mark.slow
-    def test_a_probability_is_of_the_policies_of_its_campaign(self, call, same, swapped, tmp_path):
-        run_campaign(settings(swapped), tmp_path / "run")
-        fresh = ("probability", tmp_path / "run", "--cases", 8)
-        assert_refused(call(*fresh, "--policies", same), "run with other policies")
-        assert call(*fresh)[0] == 0
-
     @pytest.mark.parametrize(
         "command",
         [
@@ -268,18 +261,3 @@ class TestAFolder:
         shutil.rmtree(folder)
         with open_workers(1) as workers, pytest.raises(UserError, match="put the same files there"):
             open_simulators(plan, workers)
-
-    def test_of_the_name_of_a_scenario_is_its_shipped_one(self, tmp_path, same, monkeypatch):
-        shipped = Path(shutil.copytree(same, tmp_path / "shipped"))
-        shutil.copytree(same, shipped / "my-ring")
-        (shipped / "without").mkdir()
-        monkeypatch.setattr("merge_sumo.drivers.policies.resource", lambda _: shipped)
-        assert policies_of(MergeScenario(name="my-ring")) == shipped / "my-ring"
-        for name in ("us23", "without", "..", ".", "", "/", "../shipped/my-ring", "my-ring/"):
-            assert policies_of(MergeScenario(name=name)) == shipped
-        ring = CampaignSettings(vut="level1", levels=(1,), scenario=MergeScenario(name="my-ring"))
-        plan = resolve(ring)
-        assert plan.povs.policies == shipped / "my-ring"
-        assert plan.vut.options.policies == shipped / "my-ring"
-        assert resolve(campaign_settings(vut="level1", levels=(1,))).povs.policies == shipped
-        assert US23.name == "us23"

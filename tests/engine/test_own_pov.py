@@ -25,7 +25,6 @@ from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.reports.report import report_page
-from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import LEVELS, OWN, US23
 from merge_sumo.values.score import measure
@@ -146,17 +145,6 @@ class TestTheSeat:
         assert seen.active.tolist() == [False, True]
         assert answer[1] == -2.0
 
-    def test_in_traffic_shows_every_car_itself(self):
-        noting = Noting(6)
-        seat = PovAdapter(noting)
-        point = np.array([[0.5, 0.5, 0.5, 0.5]])
-        (case,) = from_unit(point, OWN, scenario=named_scenario("us23-traffic"))
-        (x, v), _, (ahead, _), (behind, _) = case.starts()
-        for corridor in (1, 3, 5):
-            seat.begin(corridor, case)
-        assert [seen.x_vut_m for _, seen in noting.begun] == pytest.approx([x, ahead, behind])
-        assert {(seen.v_vut_mps, seen.x_pov_m) for _, seen in noting.begun} == {(v, -182.0)}
-
     def test_passes_on_what_its_driver_loses_as_the_povs(self):
         class Losing(Noting):
             def act(self, _scene):
@@ -224,13 +212,6 @@ class TestSumosOwnPov:
         )
         assert motion.a_pov_mps2.min() < -1.0
         assert measure(motion).end is End.MERGED
-
-    def test_drives_all_cars_of_a_queue(self):
-        points = np.random.default_rng(1).random((6, 4))
-        cases = from_unit(points, OWN, scenario=named_scenario("us23-traffic"))
-        motions = run("sumo:IDM", cases)
-        assert all(motion.error is None for motion in motions)
-        assert any(motion.motion[:, 3, 2].min() < -0.1 for motion in motions), "the last one reacts"
 
 
 CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])

@@ -7,13 +7,11 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import make_scenarios
 import numpy as np
 import pytest
 from calling import invoke
 from campaigning import run_campaign
 
-from merge_sumo.analysis.diagnosis import Kind, diagnose
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.level0 import level0_time_to
@@ -30,8 +28,6 @@ from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.training.reward import RewardWeights
 from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23, as_merge
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End
 
 ROUNDABOUT = as_merge(named_scenario("roundabout"))
 RADIUS_M = 25.0
@@ -84,13 +80,6 @@ class TestItsPool:
         assert (gaps_m < ROUNDABOUT.dx_critical_m).mean() == pytest.approx(0.5, abs=0.02)
         assert (gaps_m < ROUNDABOUT.dx_crash_m).mean() > 0.15
 
-    def test_lets_who_waits_for_the_slowest_get_there_before_the_timeout(self):
-        waits_s = -ROUNDABOUT.x_pov0_m[0] / ROUNDABOUT.v_pov0_mps[0]
-        from_a_stand = level0_time_to(
-            np.array(11.2), np.array(0.0), ROUNDABOUT.level0_a_mps2, ROUNDABOUT.level0_v_mps
-        )
-        assert waits_s + float(from_a_stand) < ROUNDABOUT.timeout_s
-
 
 class TestItsDrivers:
     def test_are_its_own_and_rational(self):
@@ -107,28 +96,6 @@ class TestItsDrivers:
             assert entry["check"]["avoidable_collisions"] == 0
         for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
             assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
-
-
-class TestTheExampleRuns:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def runs(cls):
-        names = ("roundabout-yields", "roundabout-stalemate")
-        return [make_scenarios.play(make_scenarios.EXAMPLES[name]) for name in names]
-
-    def test_in_one_the_pov_slows_and_the_vut_merges_first(self, runs):
-        run = runs[0]
-        assert run.v_pov_mps[-1] < run.v_pov_mps[0] - 3.0
-        assert (measure(run).end, measure(run).merged_first) == (End.MERGED, "VUT")
-
-    def test_in_the_other_both_nearly_stop_go_at_the_same_moment_and_collide(self, runs):
-        run = runs[1]
-        assert measure(run).is_close
-        assert diagnose(run, measure(run)).kind is Kind.STALEMATE
-        slowest = run.v_pov_mps.argmin(), run.v_vut_mps.argmin()
-        assert abs(slowest[0] - slowest[1]) <= 2
-        assert (run.v_pov_mps.min(), run.v_vut_mps.min()) < (2.0, 2.0)
-        assert -12.0 < run.x_pov_m[slowest[0]] < run.x_vut_m[slowest[1]] < -6.0
 
 
 class TestACampaignOnIt:

@@ -24,7 +24,6 @@ from merge_sumo.vuts.registry import VutFactory
 TRAFFIC = replace(
     US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
 )
-RANGED = replace(US23, v_vut0_mps=(14.0, 22.0))
 
 
 def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) -> list[Case]:
@@ -47,15 +46,6 @@ class TestThePool:
         points = np.random.default_rng(1).random((20, dims))
         cases = from_unit(points, level, scenario=TRAFFIC)
         assert to_unit(cases, level, scenario=US23) == pytest.approx(points, abs=1e-12)
-
-    @pytest.mark.parametrize(("level", "dims"), [(0, 3), (1, 3), (2, 4)])
-    def test_has_the_speed_of_the_vut_where_that_is_a_range(self, level, dims):
-        names = [d.field for d in RANGED.dimensions(level)]
-        assert len(names) == dims
-        assert names[2] == "v_vut0_mps"
-        speeds = [case.v_vut0_mps for case in cases_of(level, 200, RANGED)]
-        assert 14.0 <= min(speeds) < 14.2
-        assert 21.8 < max(speeds) <= 22.0
 
     def test_starts_the_cars_at_their_headways_and_the_speed_of_the_pov(self):
         (case,) = from_unit(np.array([[0.5, 0.5, 0.0, 1.0]]), 0, scenario=TRAFFIC)
@@ -123,16 +113,6 @@ class TestCarsOfTheMainline:
             found = measure(other)
             assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
             assert replace(found, brake_after_mps2=measure(one).brake_after_mps2) == measure(one)
-
-    @pytest.mark.parametrize("level", [0, 1, 2])
-    def test_obey_eq4_and_keep_apart(self, level):
-        for trajectory in run("level0", cases_of(level, 60)):
-            x, v, a = np.moveaxis(trajectory.motion, 2, 0)
-            assert x.shape[1] == 4
-            assert np.abs(x[1:] - x[:-1] - v[:-1] * DT_S).max() < 1e-9
-            assert np.abs(v[1:] - v[:-1] - a[:-1] * DT_S).max() < 1e-9
-            for leader, follower in ((AHEAD, POV), (POV, BEHIND)):
-                assert (x[:, leader] - x[:, follower]).min() > TRAFFIC.pov_length_m
 
     def test_brake_behind_one_that_brakes_and_never_touch_it(self):
         following, rng = Following(50), np.random.default_rng(0)
@@ -227,9 +207,3 @@ class TestTheVerdict:
         measures = measure(ending({**gaps, row: 4.0}, {row: 27.0}))
         assert measures.is_close
         assert (measures.dx_m, measures.dv_mps, measures.nearest) == (4.0, 2.0, name)
-
-    def test_is_of_the_nearest_car(self):
-        measures = measure(ending({POV: 40.0, AHEAD: 90.0, BEHIND: -12.0}, {BEHIND: 29.0}))
-        assert (measures.end, measures.dx_m, measures.nearest) == (End.MERGED, -12.0, "behind")
-        assert measures.ttc_s == pytest.approx(3.0)
-        assert measures.merged_first == "VUT"

@@ -14,12 +14,8 @@ from foreign_nets import (
     FOREIGN,
     LANE_M,
     LANES,
-    edge,
-    lane,
     lane_corridor_of,
     lane_drop,
-    node,
-    plain,
 )
 
 from merge_sumo import api
@@ -96,21 +92,6 @@ class TestTheWindow:
             main, ramp = (own.lane_point(x_m, on_ramp=on_ramp) for on_ramp in (False, True))
             assert np.hypot(main.x_m - ramp.x_m, main.y_m - ramp.y_m) == pytest.approx(3.2, abs=0.1)
 
-    def test_shifts_all_and_changes_nothing_else(self, tmp_path):
-        net = NetFile(lane_drop(tmp_path))
-        edges = ["in", "acc", "out"], ["ramp", "acc", "out"]
-        point = find_corridor(net, *edges)
-        one, other = (find_corridor(net, *edges, lane_m=(end - 50, end)) for end in (50.0, 90.0))
-        assert point.lane_m is None
-        crossing_m = point.mainline.pieces[-2].length_m
-        for own, end_m in ((one, 50.0), (other, 90.0)):
-            shift_m = end_m + crossing_m
-            assert own.ramp.before_m == pytest.approx(point.ramp.before_m - shift_m)
-            for x_m in (-300.0, -100.0, 20.0):
-                at = point.lane_point(x_m, on_ramp=False)
-                shifted = own.lane_point(x_m + shift_m, on_ramp=False)
-                assert (shifted.lane, *shifted[1:]) == (at.lane, *map(pytest.approx, at[1:]))
-
     @pytest.mark.parametrize(
         ("lane_m", "said"),
         [
@@ -127,9 +108,8 @@ class TestTheWindow:
             find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=lane_m)
         assert "\n" not in str(error.value)
 
-    @pytest.mark.parametrize("name", ["priority", "OSM without an auxiliary lane", "roundabout"])
-    def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path, name):
-        build, mainline, ramp = FOREIGN[name]
+    def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
+        build, mainline, ramp = FOREIGN["priority"]
         net = NetFile(build(tmp_path))
         with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
             find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
@@ -209,31 +189,6 @@ def test_commanded_vehicles_follow_eq_4_on_both_paths_and_where_they_are_moved_a
     assert forced > 10
 
 
-@pytest.mark.parametrize("name", ["us23-lane", "two edges"])
-def test_a_driver_of_sumo_waits_for_a_gap_and_then_changes_to_the_mainline(road, simulation, name):
-    own = road(name)
-    libsumo = simulation(own, 'maxSpeed="28" carFollowModel="IDM"')
-    vehicle, seen = libsumo.vehicle, list[tuple[str, float]]()
-    # Side by side; the car of the mainline keeps 22 m/s.
-    for who, path, beside in zip(
-        *(("main", "ramp"), hosted_paths(own), ("lane.1_1", "lane.1_0")), strict=True
-    ):
-        assert beside in path.lanes(1)
-        vehicle.moveTo(who, beside, 5.0)
-        vehicle.setPreviousSpeed(who, 20.0)
-    vehicle.setSpeedMode("main", SPEED_MODE_COMMANDED)
-    vehicle.setSpeed("main", 22.0)
-    while not seen or not seen[-1][0].startswith("out"):
-        libsumo.simulation.step()
-        assert libsumo.simulation.getStartingTeleportNumber() == 0
-        seen.append((vehicle.getLaneID("ramp"), vehicle.getLanePosition("ramp")))
-        assert len(seen) < 900
-    lanes = [name for name, _ in seen]
-    assert list(dict.fromkeys(lanes))[:2] == ["lane.1_0", "lane.1_1"]
-    assert lanes[-1] == "out1.1_0"
-    assert seen[lanes.index("lane.1_1")][1] > 20.0, "beside a car it stays"
-
-
 class TestAScenario:
     @staticmethod
     def new(
@@ -299,34 +254,9 @@ class TestAScenario:
         (start,) = api.check_scenario(late).record["warnings"]
         assert start == "the VUT starts on the acceleration lane, 15 m behind its gore at -75.5 m"
 
-    def test_on_a_lane_that_goes_on_to_an_exit_says_so(self, tmp_path):
-        scenario, lines = self.new(tmp_path, weaving, "in acc out", "ramp acc out")
-        assert scenario.lane_m is not None
-        (weaves,) = (line for line in lines if line.startswith("weaving"))
-        assert weaves.startswith("weaving: the lane goes on to exit; ")
-
 
 def stretched(net: Path, length_m: float, without: str = "\0") -> Path:
     """Give the lanes of edge acc another length, and take a text out of the file."""
     text = re.sub(r'(id="acc_\d" [^>]*length=)"[\d.]+"', rf'\1"{length_m}"', net.read_text())
     net.write_text(text.replace(without, ""))
     return net
-
-
-NODES = (
-    node("a", -800, 0) + node("n", -200, 0) + node("d", 100, 0) + node("b", 700, 0)
-    + node("r", -500, -90) + node("x", 500, -90)
-)  # fmt: skip
-
-
-def weaving(folder: Path) -> Path:
-    """A lane from a ramp to an exit."""
-    return plain(
-        folder,
-        NODES,
-        edge("in", "a", "n", 2, 30, priority=9) + edge("acc", "n", "d", 3, 30, priority=9)
-        + edge("out", "d", "b", 2, 30, priority=9) + edge("ramp", "r", "n", 1, 22, priority=3)
-        + edge("exit", "d", "x", 1, 22, priority=3),
-        lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
-        + lane("acc", 0, "exit", 0) + lane("acc", 1, "out", 0) + lane("acc", 2, "out", 1),
-    )  # fmt: skip

@@ -6,19 +6,15 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import ALL, FOREIGN, LANES, OTHERS, SIX, lane_corridor_of
+from foreign_nets import FOREIGN, LANES, lane_corridor_of
 from handmade import write_run
 from lxml import etree
-from plans import POVS
 
-from merge_sumo.engine.povs import PovLibrary
-from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.reports.player import road_data
@@ -26,57 +22,15 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import (
-    CASE,
-    CONFIG,
     HOLD_STEPS,
-    HOSTED_NET,
-    LABELS,
-    RECORD,
-    SURROUNDINGS,
-    TYPES,
-    VIEW,
     write_scenario,
 )
-from merge_sumo.sumo.world import World
-from merge_sumo.values.case import MergeCase, from_unit
+from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import VutFactory
 
-FILES = {CONFIG, HOSTED_NET, SURROUNDINGS, TYPES, LABELS, RECORD, VIEW, CASE}
 LANE_WIDTH_M = 3.2
-
-
-@pytest.fixture(scope="module")
-def folder_of(corridor, tmp_path_factory):
-    """Return a function that gives a folder with an episode of `design1`, made once."""
-    made = {}
-
-    def get(name):
-        if name not in made:
-            trajectory = driven(corridor(name), 1)[0]
-            made[name] = write(
-                tmp_path_factory.mktemp("foreign") / "case", corridor(name), trajectory
-            )
-        return made[name]
-
-    return get
-
-
-@pytest.fixture
-def folder(folder_of, tmp_path) -> Path:
-    """Return a copy of a folder on a road with curves and lanes inside of junctions."""
-    return Path(shutil.copytree(folder_of("curved"), tmp_path / "case"))
-
-
-def driven(road, count: int) -> list[Trajectory]:
-    """Return what SUMO drove in cases of level 0 on a road."""
-    factory = VutFactory("design1")
-    cases = from_unit(np.random.default_rng(3).random((count, 2)), level=0, scenario=US23)
-    with World(4, road, scenario=US23) as world:
-        ran = dict(rollout(world, PovLibrary(4, POVS), factory(4, world), cases))
-    return [ran[index] for index in range(count)]
 
 
 def commanded(a_mps2: np.ndarray, road) -> Trajectory:
@@ -110,14 +64,7 @@ def assert_identical(folder: Path, steps: int) -> None:
 
 
 class TestAReplay:
-    @pytest.mark.parametrize("name", ALL[:-2])
-    def test_of_what_sumo_drove_is_identical(self, corridor, tmp_path, name):
-        for number, trajectory in enumerate(driven(corridor(name), 3)):
-            folder = write(tmp_path / str(number), corridor(name), trajectory)
-            assert {path.name for path in folder.iterdir()} == FILES
-            assert_identical(folder, len(trajectory.motion) - 1)
-
-    @pytest.mark.parametrize("name", ALL)
+    @pytest.mark.parametrize("name", FOREIGN)
     def test_of_any_motion_is_identical_also_behind_the_end_of_the_net(
         self, corridor, tmp_path, name
     ):
@@ -184,7 +131,7 @@ def made(tmp_path_factory):
 
 
 class TestAnExport:
-    @pytest.mark.parametrize("name", [*SIX, *OTHERS[2:5]])
+    @pytest.mark.parametrize("name", FOREIGN)
     def test_to_openscenario_lies_on_the_lanes_of_its_opendrive(
         self, made, corridor, tmp_path, name
     ):

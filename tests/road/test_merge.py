@@ -90,12 +90,3 @@ class TestABrokenNet:
             pass
         assert "\n" not in str(error.value)
         assert str(path) in str(error.value)
-
-
-@pytest.mark.parametrize("extra", ["<!-- surveyed -->", "<?editor id='7'?>"])
-def test_notes_between_the_lanes_do_no_harm(extra, tmp_path):
-    path = tmp_path / "noted.net.xml"
-    lane = '<lane id="ramp_0"'
-    path.write_text(edited(lane, extra + lane)(default_net_path().read_text()))
-    ours, noted = road_of(), road_of(path)
-    assert (noted.mainline, noted.ramp) == (ours.mainline, ours.ramp)

@@ -48,16 +48,6 @@ def test_each_chain_ends_up_around_one_of_two_minima(seed, chain):
     assert history.failed[-60:].mean() > 0.8
 
 
-def test_a_batch_of_one_still_moves():
-    points = anneal(0, batches=5, n=1).points
-    assert len(np.unique(points, axis=0)) == 5
-
-
-def test_begins_with_a_uniform_batch():
-    first = anneal(1, batches=1, n=500).points
-    assert np.abs(first.mean(axis=0) - 0.5).max() < 0.05
-
-
 def test_moves_are_reflected_at_the_faces():
     outside = np.array([[-0.1, 1.2], [0.3, 0.4], [2.3, -1.1]])
     assert reflect(outside) == pytest.approx(np.array([[0.1, 0.8], [0.3, 0.4], [0.3, 0.9]]))

@@ -14,7 +14,7 @@ from conftest import some
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import CALIBRATION, Calibration, _as_if, _calibrated, margin_of
 from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search
-from merge_sumo.samplers.coverage_grid import CoverageGrid, _Scattered
+from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
@@ -71,35 +71,12 @@ class TestTheGround:
         one = np.array([[0.5] * dims])
         assert grid.covered_balls() == pytest.approx(fmc(points) / fmc(one), rel=0.05)
 
-    @pytest.mark.parametrize("dims", range(2, 7))
-    def test_holds_the_balls_at_the_corners_of_the_cube(self, dims):
-        corners = np.array([[0.0] * dims, [1.0] * dims])
-        grid = CoverageGrid(dims)
-        grid.cover(grid.balls(corners), 1.0)
-        assert grid.covered_balls() == pytest.approx(2.0)
-
     @pytest.mark.parametrize("dims", [2, 5])
     def test_a_pick_that_fails_with_a_chance_of_60_percent_leaves_40_percent_uncovered(self, dims):
         grid = CoverageGrid(dims)
         here = grid.balls(np.full((1, dims), 0.4))
         grid.cover(here[0], 0.6)
         assert grid.new(here) == pytest.approx([0.4], rel=1e-6)
-
-    @pytest.mark.parametrize("dims", [2, 4])
-    def test_a_ball_two_radii_away_is_all_new(self, dims):
-        grid = CoverageGrid(dims)
-        here = np.full((1, dims), 0.3)
-        grid.cover(grid.balls(here), 1.0)
-        beside = here + (2.0 * radius_for(dims) + 0.02) * np.eye(dims)[0]
-        assert grid.new(grid.balls(beside)) == pytest.approx([1.0])
-
-    @pytest.mark.parametrize("dims", [4, 5, 6])
-    def test_has_balls_of_the_radius_where_they_are_no_grid(self, dims):
-        points = np.random.default_rng(1).random((200, dims))
-        places = CoverageGrid(dims)._places
-        assert isinstance(places, _Scattered)
-        farthest = places._tree.query(points, k=places.per_ball)[0][:, -1]
-        assert farthest == pytest.approx(radius_for(dims), rel=0.1)
 
     @pytest.mark.parametrize("dims", [2, 3, 5])
     def test_a_greedy_batch_is_that_of_who_looks_at_every_candidate_again(self, dims):
@@ -114,12 +91,6 @@ class TestTheGround:
             assert gain == chance[pick] * new[pick]
             grid.cover(balls[pick], max(PICKED, chance[pick]))
             free[pick] = 0.0
-
-    def test_is_new_each_time(self):
-        first, second = CoverageGrid(4), CoverageGrid(4)
-        ball = first.balls(np.full((1, 4), 0.5))
-        first.cover(ball, 1.0)
-        assert second.new(ball) == [1.0]
 
 
 @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
@@ -170,14 +141,6 @@ def test_expects_less_of_the_next_batch_the_more_it_has_covered():
     assert later.expected_gain(20) < 0.5 * early
 
 
-def test_learns_from_a_bounded_number_of_cases_in_a_long_campaign():
-    cases = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0).ask(1200)
-    sampler = make_sampler("coverage", Pool(levels=(0,), scenario=US23), 0)
-    sampler.tell([outcome(i, i // 40, case, blind=False) for i, case in enumerate(cases)])
-    points = to_unit(sampler.ask(10), 0, scenario=US23)
-    assert points.shape == (10, 2)
-
-
 class TestTheBranches:
     """A margin that comes up to `top` on the left of 0.5, and jumps to 3 on the right of it."""
 
@@ -203,14 +166,6 @@ class TestTheBranches:
         assert near > 0.7
         assert max(far) < 0.05
 
-    def test_a_smooth_process_alone_is_taken_in_by_the_jump(self):
-        points = np.random.default_rng(3).random((80, 2))
-        points = points[np.abs(points[:, 0] - 0.5) > 0.04]
-        values = np.where(points[:, 0] < 0.5, -3.0, 3.0)
-        smooth = Margin(points, values, -1.0, 1.0, rough=False)
-        here = np.array([[0.5, 0.5]])
-        assert smooth.at(here)[0] > 3.0 * Branches(points, values, smooth).at(here)[0]
-
 
 ONCE = np.ones(1, dtype=np.int64)
 """Runs of each case."""
@@ -232,22 +187,6 @@ class TestTheCalibration:
     def test_stays_near_what_it_believed_before_while_it_has_seen_little(self, n):
         weights, _ = _calibrated(self.evidence(n)[None], np.zeros(n, dtype=bool), ONCE)
         assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
-
-    def test_does_not_run_away_where_failures_are_perfectly_predicted(self):
-        evidence = self.evidence(400)
-        evidence[:, 0] *= 20.0
-        weights, posterior = _calibrated(evidence[None], evidence[:, 0] > 0.0, ONCE)
-        assert np.isfinite(posterior).all()
-        assert np.abs(weights).max() < 5.0
-
-    def test_calibrates_each_kind_of_evidence_as_if_it_were_the_only_one(self):
-        kinds = np.array([scale * self.evidence(30) for scale in (0.1, 1.0, 30.0)])
-        failed = np.random.default_rng(2).random(30) < 0.3
-        together = _calibrated(kinds, failed, ONCE)
-        for place in range(3):
-            alone = _calibrated(kinds[[place]], failed, ONCE)
-            assert together[0][place] == pytest.approx(alone[0][0], rel=1e-9)
-            assert together[1][place] == pytest.approx(alone[1][0], rel=1e-9)
 
 
 class TestWhatIsAimedAt:
@@ -272,16 +211,6 @@ class TestWhatIsAimedAt:
 
     def test_are_failures_alone_once_enough_are_known(self):
         assert _limit(self.history(PATIENCE, NEAREST)) is None
-
-    def test_are_failures_alone_in_the_first_batches(self):
-        assert _limit(self.history(PATIENCE - 1, 0)) is None
-
-    def test_a_gap_at_the_limit_has_a_margin_of_one(self):
-        history = self.history(PATIENCE, 0)
-        values, low, high = margin_of(history, 12.0)
-        at_limit = np.abs(history.dx_m) == 12.0
-        assert np.abs(values[at_limit]) == pytest.approx([high])
-        assert low == -high
 
 
 def test_looks_where_cases_come_near_but_counts_on_failures_alone():
@@ -316,7 +245,3 @@ class TestTheTrust:
 
     def test_is_small_where_they_did_not(self):
         assert Calibration(self.history(failing_late=False)).factors.min() < 0.5
-
-    def test_is_whole_while_there_is_little_to_judge_by(self):
-        first = self.history(failing_late=False).take(slice(120))
-        assert Calibration(first).factors.tolist() == [1.0, 1.0]

@@ -68,13 +68,6 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert history.varies
 
 
-def test_runs_that_are_alike_show_no_chance():
-    history = told((CASE, 0, -20.0, 40.0), (CASE, 1, -20.0, 40.0))
-    assert not history.varies
-    assert history.runs.tolist() == [2]
-    assert _noise(history) == NOISE
-
-
 def test_more_runs_leave_less_noise():
     history = told(*RUNS)
     single, four = (float(value) for value in np.asarray(_noise(history))[[1, 0]])
@@ -136,9 +129,3 @@ class TestTheBelief:
         strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
         assert belief.of(strip).mean() == pytest.approx(0.3, abs=0.08)
         assert belief.of(np.array([[0.1, 0.5], [0.9, 0.5]])).max() < 0.05
-
-    def test_tells_what_is_tolerated_from_what_is_not(self):
-        strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
-        low, high = (Belief(self.history(share)[0]).above(strip).mean() for share in (0.1, 0.6))
-        assert low > 0.8
-        assert high < 0.4

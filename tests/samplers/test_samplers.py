@@ -10,7 +10,6 @@ import pytest
 from conftest import some
 
 from merge_sumo.errors import UserError
-from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.testing.contracts import SamplerContract, play
 from merge_sumo.values.case import Pool, to_unit
@@ -50,9 +49,6 @@ class TestEverySampler(SamplerContract):
 
 
 class TestTheRegistry:
-    def test_has_the_default_sampler(self):
-        assert DEFAULT_SAMPLER in SAMPLERS
-
     def test_names_the_samplers_that_there_are(self):
         with pytest.raises(UserError) as error:
             make_sampler("grp", Pool(levels=(0,), scenario=US23), 0)
@@ -82,14 +78,6 @@ def test_gpr_finds_more_failures_than_uniform_with_the_same_budget(levels):
     )
     assert 0 < uniform < 24, "the band must be neither invisible nor easy"
     assert gpr > 2 * uniform
-
-
-def test_gpr_spreads_its_batch_out():
-    sampler = make_sampler("gpr", Pool(levels=(0,), scenario=US23), 4)
-    play(sampler, 4, 20)
-    points = to_unit(sampler.ask(20), 0, scenario=US23)
-    apart = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(20)
-    assert np.median(apart.min(axis=0)) > 0.02
 
 
 def test_gpr_gives_more_cases_to_the_level_with_the_failures():

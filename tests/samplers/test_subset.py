@@ -52,30 +52,9 @@ def test_estimates_the_probability_of_a_triangle(estimates):
     assert abs(estimates.mean() - PROBABILITY) < 3.0 * error_of_mean
 
 
-def test_estimates_the_same_as_openturns(estimates):
-    ot = pytest.importorskip("openturns")
-    ot.RandomGenerator.SetSeed(1)
-    cube = ot.RandomVector(ot.JointDistribution([ot.Uniform(0.0, 1.0)] * 2))
-    line = ot.CompositeRandomVector(ot.SymbolicFunction(["x", "v"], ["x + v"]), cube)
-    event = ot.ThresholdEvent(line, ot.Less(), CORNER)
-    theirs = ot.SubsetSampling(event)
-    theirs.setMaximumOuterSampling(10_000)
-    theirs.run()
-    reference = theirs.getResult().getProbabilityEstimate()
-    assert reference == pytest.approx(PROBABILITY, rel=0.1)
-    error_of_mean = estimates.std(ddof=1) / np.sqrt(len(estimates))
-    assert abs(estimates.mean() - reference) < 3.0 * error_of_mean + 0.1 * PROBABILITY
-
-
 def test_knows_of_no_failure_before_there_is_one():
     points = np.random.default_rng(0).uniform(0.5, 1.0, (40, 2))
     assert failure_probability(history_of(points, np.repeat([0, 1], 20))) == 0.0
-
-
-def test_is_a_plain_share_of_failures_while_it_samples_the_whole_cube():
-    points = np.vstack([np.full((3, 2), 0.01), np.full((37, 2), 0.8)])
-    history = history_of(points, np.repeat([0, 1], 20))
-    assert failure_probability(history) == pytest.approx(3 / 40)
 
 
 def stages() -> list[Stage]:

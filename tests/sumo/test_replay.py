@@ -276,17 +276,6 @@ class TestAReplayThatIsNotTheRecord:
         edit_number(folder / RECORD, "vut", "pos", sign * 1.0e-6)
         assert replay(folder).diverged_at_s == pytest.approx(ROW * DT_S)
 
-    def test_diverges_where_it_stops_early(self, folder, sumo_plays):
-        def stop_early(stage: Path) -> None:
-            config = etree.parse(stage / CONFIG)
-            config.find("time/end").set("value", "3.0")
-            config.write(stage / CONFIG)
-
-        sumo_plays(stop_early)
-        result = replay(folder)
-        assert result.diverged_at_s == pytest.approx(3.0)
-        assert "not there" in result.detail
-
     def test_that_sumo_does_not_end_is_refused(self, folder, monkeypatch):
         monkeypatch.setattr(replay_module, "run_program", partial(run_program, limit_s=0.0))
         assert "did not end within 0 s" in refusal(folder)

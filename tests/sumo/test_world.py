@@ -201,16 +201,6 @@ def test_an_answer_that_is_no_number_ends_only_its_own_case(answer, reason):
             assert trajectory.end is End.MERGED
 
 
-def test_a_vut_that_raises_when_it_is_reset_is_an_outcome():
-    cases = random_cases(20)
-    with World(4, scenario=US23) as world:
-        trajectories = run_all(world, PovLibrary(4, POVS), Broken(4, "raise"), cases)
-    for case, trajectory in zip(cases, trajectories, strict=True):
-        failed = case.v_pov0_mps > 30.0
-        assert (trajectory.end is End.VUT_ERROR) == failed
-        assert (trajectory.error == "reset raised RuntimeError: no start") == failed
-
-
 @pytest.mark.parametrize("half_step", ["advance", "command"])
 def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
     monkeypatch, half_step

@@ -6,8 +6,6 @@ import math
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.sumo.binding import sumo_program
@@ -130,41 +128,6 @@ def opendrive(folder: Path, of: Path) -> Path:
     return out
 
 
-def left_turn(folder: Path, kind: str = "priority") -> Path:
-    """A side road, from which one turns left over two internal lanes, or right into a light."""
-    ends = {"w": (-500, 0), "e": (500, 0), "s": (0, -400)}
-    arms = "".join(
-        edge(f"{n}2m", n, "m", 1, 20, priority=3 if n == "s" else 9, sidewalkWidth=2)
-        + edge(f"m2{n}", "m", n, 1, 20, priority=3 if n == "s" else 9, sidewalkWidth=2)
-        for n in ends
-    )
-    nodes = node("m", 0, 0, kind) + "".join(node(n, *place) for n, place in ends.items())
-    return plain(folder, nodes, arms, "", "--crossings.guess")
-
-
-def roundabout(folder: Path, radius_m: float = 20.0) -> Path:
-    """Four arms and a ring of short edges."""
-    turns = (0, 90, 180, 270)
-
-    def on(angle: float, r: float) -> tuple[float, float]:
-        return r * math.cos(math.radians(angle)), r * math.sin(math.radians(angle))
-
-    def arc(begin: int) -> str:
-        points = (on(begin + 90 * i / 8, radius_m) for i in range(9))
-        return " ".join(f"{x:.3f},{y:.3f}" for x, y in points)
-
-    nodes = "".join(node(f"r{a}", *on(a, radius_m)) + node(f"o{a}", *on(a, 240)) for a in turns)
-    edges = "".join(
-        edge(f"ring{a}", f"r{a}", f"r{(a + 90) % 360}", 1, 9, priority=9, shape=arc(a))
-        + edge(f"in{a}", f"o{a}", f"r{a}", 1, 14, priority=3)
-        + edge(f"out{a}", f"r{a}", f"o{a}", 1, 14, priority=3)
-        for a in turns
-    )
-    rings = " ".join(f"ring{a}" for a in turns)
-    round_it = f'<roundabout nodes="{" ".join(f"r{a}" for a in turns)}" edges="{rings}"/>'
-    return plain(folder, nodes, edges + round_it)
-
-
 def two_edges(folder: Path) -> Path:
     """A curved acceleration lane of two edges, with a sidewalk beside it and internal lanes."""
     bend = "-200,0 -120,6 -60,16 0,30"
@@ -193,37 +156,18 @@ FOREIGN = {
         f"4712 {AUXILIARY} 4711#1",
     ),
     "OpenDRIVE": (lambda f: opendrive(f, curved(f)), "-40 -41", "-42 -41"),
-    "zipper with an auxiliary lane": (
-        lambda f: lane_drop(f, "zipper"),
-        "in acc out",
-        "ramp acc out",
-    ),
-    "mainline that ends": (
-        lambda f: opendrive(f, lane_drop(f, "zipper")),
-        "-51 -50 -52",
-        "-53 -50 -52",
-    ),
-    "OSM without an auxiliary lane": (osm, "4711#0 4711#1", "4712 4711#1"),
-    "left turn": (left_turn, "e2m m2w", "s2m m2w"),
-    "traffic light": (lambda f: left_turn(f, "traffic_light"), "w2m m2e", "s2m m2e"),
-    "roundabout": (roundabout, "in180 ring180 ring270 ring0 out90", "in270 ring270 ring0"),
-    "ring": (roundabout, "ring270 ring0 ring90 ring180 ring270 ring0", "in270 ring270"),
 }
-"""Name, builder, edges of the mainline and of the ramp; the first six are the kinds that count."""
+"""Name, builder, edges of the mainline and of the ramp."""
 
 LANES = {
     "two edges": (two_edges, "in acc1 acc2 out", "ramp acc1 acc2 out"),
     "lane drop": FOREIGN["lane drop"],
     "OSM": FOREIGN["OSM"],
-    "zipper": FOREIGN["zipper with an auxiliary lane"],
+    "zipper": (lambda f: lane_drop(f, "zipper"), "in acc out", "ramp acc out"),
 }
 """Those with an acceleration lane."""
 LANE_M = (-30.0, 60.0)
 """Of a scenario; the lanes of these nets are longer."""
-SIX = list(FOREIGN)[:6]
-OTHERS = [pytest.param(name, marks=pytest.mark.long) for name in list(FOREIGN)[6:]]
-ALL = [*SIX, *OTHERS]
-"""Names for tests of each kind of road; those that vary another one take longer in all."""
 
 
 def corridor_of(name: str, folder: Path):

@@ -114,17 +114,13 @@ while True:
 HOLDS_THE_GIL: Final = "import ctypes; ctypes.PyDLL(None).sleep(60)"
 
 ENDS: Final = {
-    "os._exit 0": acts("import os; os._exit(0)", "ended its process with exit code 0"),
     "sys.exit": acts("import sys; sys.exit(3)", "SystemExit: 3"),
+    "os._exit 0": acts("import os; os._exit(0)", "ended its process with exit code 0"),
     "segfault": acts(SEGFAULT, "by signal 11 (SIGSEGV)"),
     "SIGKILL": acts("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "(SIGKILL)"),
-    "SIGTERM": acts("import os, signal; os.kill(os.getpid(), signal.SIGTERM)", "(SIGTERM)"),
     "SIGSTOP": acts("import os, signal; os.kill(os.getpid(), signal.SIGSTOP)", LATE),
     "SIGINT": acts("import os, signal; os.kill(os.getpid(), signal.SIGINT)", "KeyboardInterrupt"),
     "kills its process group": acts("import os, signal; os.killpg(0, signal.SIGKILL)", "(SIGKILL)"),
-    "exec of a program that ends": acts(
-        "import os; os.execv('/bin/true', ['true'])", "ended its process with exit code 0"
-    ),
     "exec of a program that stays": acts(
         "import os; os.execv('/bin/sleep', ['sleep', '600'])", "by signal 14 (SIGALRM)"
     ),
@@ -140,11 +136,7 @@ HANGS: Final = {
     "loops": acts(FOREVER, LATE),
     "loops and swallows": acts(STUBBORN, LATE),
     "sleeps and holds the interpreter": acts(HOLDS_THE_GIL, LATE),
-    "a sum without end": acts("10 ** 10 ** 8", LATE),
     "hangs while it resets": resets(FOREVER, f"reset: {LATE}"),
-    "ignores SIGALRM": acts(
-        "import signal, time; signal.signal(signal.SIGALRM, signal.SIG_IGN); time.sleep(60)", LATE
-    ),
     "cancels the timer": acts(
         "import signal, time; signal.setitimer(signal.ITIMER_REAL, 0); time.sleep(60)", LATE
     ),
@@ -153,18 +145,8 @@ HANGS: Final = {
         "signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals()); time.sleep(60)",
         LATE,
     ),
-    "a number that hangs": acts(
-        f"""
-        class Odd(float):
-            def __float__(self):
-                {FOREVER}
-        return Odd(1.0)
-        """,
-        LATE,
-    ),
 }
 MEMORY: Final = {
-    "a terabyte": acts("x = bytearray(10 ** 12)", "MemoryError"),
     "a list that grows": acts(
         """
         import numpy as np
@@ -174,7 +156,6 @@ MEMORY: Final = {
         """,
         "MemoryError",
     ),
-    "recursion": acts("f = lambda: f(); f()", "RecursionError"),
     "recursion in native code without a limit": acts(
         "hash(nest)", "(SIGSEGV)", setup="nest = ()\nfor _ in range(200_000): nest = (nest,)"
     ),
@@ -197,16 +178,9 @@ MEMORY: Final = {
         "Too many open files",
         shared=True,
     ),
-    "no processor time": acts(
-        "import resource; resource.setrlimit(resource.RLIMIT_CPU, (1, 1))" + STUBBORN,
-        "",
-        repeats=False,
-    ),
 }
 PROCESSES: Final = {
-    "forks": acts("import os; os.fork() or os._exit(0)"),
     "forks and comes back twice": acts("import os; os.fork()"),
-    "forks and ends": acts("import os; os.fork() and os._exit(3)", "exit code 3"),
     "forks and leaves a child": acts("import os, time; os.fork() or time.sleep(600)"),
     "a subprocess that is left behind": acts(
         "import subprocess; subprocess.Popen(['sleep', '600'])"
@@ -214,13 +188,8 @@ PROCESSES: Final = {
     "a subprocess in a session of its own": acts(
         "import subprocess; subprocess.Popen(['sleep', '600'], start_new_session=True)"
     ),
-    "a subprocess that hangs": acts("import subprocess; subprocess.run(['sleep', '60'])", LATE),
-    "a thread that dies": acts("import threading; threading.Thread(target=lambda: 1 / 0).start()"),
     "a thread that hangs": acts(
         "import threading, time; threading.Thread(target=time.sleep, args=(600,)).start()"
-    ),
-    "interrupts the main thread": acts(
-        "import _thread; _thread.interrupt_main(); [0 for _ in range(9)]", "KeyboardInterrupt"
     ),
 }
 RAISES: Final = {
@@ -228,19 +197,6 @@ RAISES: Final = {
     "a KeyboardInterrupt": acts("raise KeyboardInterrupt", "KeyboardInterrupt"),
     "what stops the program": acts(
         "from merge_sumo.system.interrupt import Stopped; raise Stopped(2)", "Stopped: SIGINT"
-    ),
-    "what is ours": acts(
-        "from merge_sumo.drivers.base import VutLostError; raise VutLostError('mine', 3)",
-        "VutLostError: mine",
-    ),
-    "an unpicklable exception": acts(
-        """
-        class Odd(Exception):
-            def __init__(self, a, b):
-                super().__init__(lambda: a)
-        raise Odd(1, 2)
-        """,
-        "Odd: <function",
     ),
     "a text that raises": acts(
         """
@@ -252,34 +208,10 @@ RAISES: Final = {
         "Odd: (ZeroDivisionError when it was to be shown)",
     ),
     "a text of 10 MB": acts("raise ValueError('x' * 10_000_000)", "ValueError: " + "x" * 300),
-    "a text that is a kind of text": acts(
-        """
-        class Text(str):
-            def __format__(self, how): raise SystemExit
-            def __getitem__(self, at): return self
-            def __str__(self): return self
-        class Odd(Exception):
-            def __str__(self):
-                return Text("odd")
-        raise Odd
-        """,
-        "Odd: odd",
-    ),
-    "a class that raises": acts(
-        """
-        class Odd(Exception):
-            @property
-            def __class__(self):
-                return 1 / 0
-        raise Odd("odd")
-        """,
-        "",
-    ),
     "control characters": acts(
         "raise ValueError('\\x1b[31mred\\x1b[0m\\0\\r\\n\\x07')",
         r"ValueError: \x1b[31mred\x1b[0m\x00\r\n\x07",
     ),
-    "an address": acts("raise ValueError(object())", "<object object at 0x...>"),
     "its process": acts("import os; raise ValueError(os.getpid())", "ValueError: ", repeats=False),
 }
 ANSWERS: Final = {
@@ -288,17 +220,10 @@ ANSWERS: Final = {
         "float('nan')": "answered nan",
         "float('inf')": "answered inf",
         "None": "answered None (NoneType)",
-        "'1.0'": "answered '1.0' (str)",
-        "True": "answered True (bool)",
-        "1 + 2j": "answered (1+2j) (complex)",
         "10 ** 400": "OverflowError",
-        "__import__('decimal').Decimal(1)": "(Decimal)",
         "[1.0]": "answered [1.0] (list)",
-        "np.ones(1)": "(ndarray)",
-        "np.array(1.0, dtype=object)": "(ndarray)",
         "type('Odd', (), {'__float__': lambda s: 1.0})()": "(Odd)",
         "type('Odd', (), {'__repr__': lambda s: 1 / 0})()": "(ZeroDivisionError when",
-        "np.float32('inf')": "answered inf",
         "(1.0, float('nan'))": "wishes nan (float)",
         "(1.0, 'yes')": "wishes 'yes' (str)",
         "type('Odd', (tuple,), {'__len__': lambda s: 1 / 0})()": "ZeroDivisionError",
@@ -316,8 +241,6 @@ HARMLESS: Final = {
 }
 PRINTS: Final = {
     "prints 10 MB": acts("print('x' * 10_000_000)"),
-    "prints surrogates": acts("print('\\ud800')"),
-    "writes to descriptor 1": acts("import os; os.write(1, b'hello')"),
     "writes to every descriptor": acts(
         """
         import os
@@ -339,17 +262,15 @@ PRINTS: Final = {
                 pass
         """
     ),
-    "reads standard input": acts("import sys; assert sys.stdin.read() == ''"),
-    "takes standard output away": acts("import sys; sys.stdout = sys.stderr = None"),
     "closes all other descriptors": acts("import os; os.closerange(3, 4096)", "exit code 1"),
     "closes all descriptors": acts("import os; os.closerange(0, 4096)", "exit code 1"),
 }
 CHANGES: Final = {
-    "changes directory": acts("import os; os.chdir('/')"),
-    "changes directory to one that goes": acts(
-        "import os, tempfile; d = tempfile.mkdtemp(); os.chdir(d); os.rmdir(d)"
+    "blames another": acts(
+        "from merge_sumo.vuts import base; import os; base.asked.note(1); os._exit(3)",
+        "exit code 3",
     ),
-    "clears the environment": acts("import os; os.environ.clear()"),
+    "changes directory": acts("import os; os.chdir('/')"),
     "leaves temporary files": acts("import tempfile; tempfile.mkstemp(); tempfile.mkdtemp()"),
     "seeds": acts("import random, numpy as np; random.seed(0); np.random.seed(0)"),
     "numpy raises": acts("import numpy as np; np.seterr(all='raise')"),
@@ -359,70 +280,37 @@ CHANGES: Final = {
         shared=True,
         repeats=False,
     ),
-    "traces": acts("import sys; sys.settrace(lambda *_: None)"),
     "traces and raises": acts(
         "import sys; sys.settrace(lambda *_: 1 / 0)", "", shared=True, repeats=False
     ),
-    "collects no garbage": acts("import gc; gc.disable(); x = []; x.append(x)"),
     "hangs at exit": acts("import atexit, time; atexit.register(time.sleep, 600)"),
     "close that hangs": acts("", methods=f"def close(self):\n    {FOREVER}"),
     "close that dies": acts("", methods="def close(self):\n    __import__('os')._exit(3)"),
-    "changes what it sees": acts("seen.t_s = 5.0", "AttributeError"),
-    "limits its files": acts("import resource; resource.setrlimit(resource.RLIMIT_NOFILE, (0, 0))"),
-    "is made once only": acts(
-        "raise ValueError('first')",
-        "ValueError: first",
-        setup="count = 0",
-        methods="""
-        def __init__(self):
-            global count
-            count += 1
-            if count > 12: raise ValueError("no more")
-        """,
-        shared=True,
-    ),
     "forgets all modules": acts("import sys; sys.modules.clear()", shared=True),
     "breaks numpy": acts(
         "import numpy as np; np.array = np.isfinite = np.flatnonzero = lambda *_: 1 / 0",
         "",
         shared=True,
     ),
-    "breaks os.write": acts("import os; os.write = lambda *_: 1 / 0", "", shared=True),
-    "breaks the clock": acts("import time; time.perf_counter = time.monotonic = lambda: 0.0"),
-    "breaks isinstance": acts("import builtins; builtins.isinstance = None", "", shared=True),
     "breaks the watch": acts(
         "from merge_sumo.vuts import base; base.Deadline.call = lambda *_: 1 / 0", "", shared=True
-    ),
-    "blames another": acts(
-        "from merge_sumo.vuts import base; import os; base.asked.note(1); os._exit(3)",
-        "exit code 3",
-    ),
-    "starts SUMO": acts(
-        "libsumo.start(['sumo', '-c', '/nothing.sumocfg'])", "", setup="import libsumo"
     ),
     "removes its own file": acts("import os; os.remove(__file__)", shared=True, repeats=False),
 }
 OTHERS: Final = {
     "batched: dies": batched("import os; os._exit(3)", "exit code 3"),
-    "batched: loops": batched(FOREVER, LATE),
     "batched: raises": batched("1 / 0", "ZeroDivisionError"),
-    "batched: another shape": batched("return answer[:-1]", "shape"),
-    "batched: texts": batched("return answer.astype(str)", "shape"),
     "batched: nan for one": batched("answer[bad] = np.nan", "answered nan"),
     "batched: half a wish for one": batched(
         "answer = np.stack([answer, 0.5 * bad])", "wishes 0.5 instead of 1 or 0"
     ),
-    "batched: is broken from then on": batched("self.guilty = None; 1 / 0", "ZeroDivisionError"),
-    "function: dies": function("import os; os._exit(3)", "exit code 3"),
     "function: loops and swallows": function(STUBBORN, LATE),
     "function: is a coroutine": Misbehaviour(
         source="async def Vut(seen):\n    return 1.0\n", reason="<coroutine object", shared=True
     ),
     "loading: forks": loads("import os; os.fork()"),
     "loading: dies": loads("import os; os._exit(0)", "ended its process with exit code 0"),
-    "loading: raises": loads("1 / 0", "ZeroDivisionError"),
     "loading: an interrupt": loads("raise KeyboardInterrupt", "KeyboardInterrupt"),
-    "loading: no syntax": loads("def (", "SyntaxError"),
     "making: dies": replace(
         acts("", "exit code 3", methods="def __init__(self): __import__('os')._exit(3)"),
         refused=True,

@@ -6,12 +6,10 @@ import json
 import math
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from campaigning import campaign_settings, run_campaign
-from conftest import some
 from plans import POVS, plan_for
 
 from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
@@ -26,11 +24,11 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.system.records import decode, to_plain
-from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
+from merge_sumo.twin.experts import Expert, Forest, Steps
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import MergeCase, Pool, to_unit
+from merge_sumo.values.case import MergeCase, Pool
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import US23
@@ -184,36 +182,6 @@ class TestTwin:
         in_parts.tell(outcomes[:40], motions)
         assert (at_once.predict([query])[0] == in_parts.predict([query])[0]).all()
 
-    def test_says_the_same_where_it_sees_cases_again(self, seen, monkeypatch):
-        outcomes, motions = seen
-        query = Query(0, np.random.default_rng(4).random((7, 2)))
-        keeps, forgets = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
-        for twin, kept in ((keeps, 1000), (forgets, 0)):
-            monkeypatch.setattr("merge_sumo.twin.twin.KEPT", kept)
-            twin.tell(outcomes[:30], motions)
-            twin.predict([query])
-            twin.tell(outcomes, motions)
-        assert (keeps.predict([query])[0] == forgets.predict([query])[0]).all()
-
-    def test_answers_queries_together_as_alone(self, seen):
-        outcomes, motions = seen
-        twin = Twin(Pool(levels=(0, 2), scenario=US23), POVS, 0)
-        twin.tell(outcomes, motions)
-        rng = np.random.default_rng(5)
-        queries = [
-            Query(0, rng.random((9, 2)), screening=1),
-            Query(2, rng.random((7, 3))),
-            Query(0, np.array([to_unit([o.case], 0, scenario=US23)[0] for o in outcomes[:6]])),
-        ]
-        queries.append(replace(queries[-1], held_out=range(6)))
-        together = twin.predict(queries)
-        assert [found.shape for found in together] == [(1, 1, 9), (2, 4, 7), (2, 4, 6), (2, 6)]
-        for query, found in zip(queries, together, strict=True):
-            assert twin.predict([query])[0] == pytest.approx(found, nan_ok=True)
-        assert together[3] == pytest.approx(
-            together[2][:, np.arange(6) % GROUPS, np.arange(6)], nan_ok=True
-        )
-
     def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
         outcomes, motions = seen
         odd = {index: motion.copy() for index, motion in motions.items()}
@@ -224,14 +192,6 @@ class TestTwin:
         taught.tell(outcomes[:40], odd)
         same = [twin.predict([Query(0, points[8:9], held_out=[8])])[0] for twin in (plain, taught)]
         assert same[0].tolist() == same[1].tolist()
-
-    @pytest.mark.parametrize("size", some([60, 20, 7], 7))
-    def test_learns_from_batches_of_any_size(self, seen, size):
-        outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
-        many = [replace(o, index=k, batch=k // size) for k, o in enumerate(outcomes * 3)]
-        twin.tell(many, {o.index: motions[o.index % len(outcomes)] for o in many})
-        assert twin.predict([Query(0, np.full((1, 2), 0.5))])[0].shape == (2, 4, 1)
 
     def test_needs_some_cases_and_learns_nothing_from_errors(self, seen):
         outcomes, motions = seen
@@ -291,19 +251,6 @@ class TestTheRecord:
         told = [outcome(i, 50.0, Prediction.of(members, *chances, 0.5)) for i in range(cases)]
         assert PredictionSkill(told, 0, 6.0).is_doubted == bool(doubted)
 
-    def test_prefers_the_expert_who_is_nearer_where_he_has_not_learned(self):
-        outcomes = [outcome(i, 10.0) for i in range(10)]
-        record = PredictionSkill(outcomes, 0, 6.0, {i: np.array([10.1, -40.0]) for i in range(10)})
-        assert record.experts[0] > 0.99
-        assert record.expert(np.random.default_rng(0)) == 0
-
-    def test_doubts_where_members_disagree_on_a_near_gap(self):
-        gaps = np.zeros((2, 4, 3))
-        gaps[0, :, 1], gaps[:, :, 2] = 20.0, 100.0
-        doubt = PredictionSkill([], 0, 6.0).disagreement(gaps)
-        assert doubt.argmax() == 1
-        assert doubt[0] == doubt[2] == 0.0
-
 
 class TestPrediction:
     def test_is_read_as_it_was_written(self):
@@ -347,11 +294,6 @@ def test_a_sampler_without_games_is_the_surrogate_alone():
     sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
     sampler.ask(3)
     assert [sampler.prediction(place) for place in range(3)] == [None] * 3
-
-
-def test_a_folder_of_before_has_nothing_predicted(tmp_path: Path):
-    record = outcome(0, 1.0).to_record()
-    assert "foretold" not in record
 
 
 class TestTheReport:

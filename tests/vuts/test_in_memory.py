@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import merge_sumo as ms
-from merge_sumo.system.spawning import without_main
 from merge_sumo.vuts.in_memory import is_here, keep, object_of, spec_of, travels
 
 SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
@@ -106,30 +105,13 @@ class TestACampaign:
         assert vut.asked > 50
         assert run.trajectory(0).a_vut_mps2[0] == 1.0
 
-    def test_gives_each_corridor_a_copy_of_an_object_that_acts_alone(self, tmp_path):
-        class Counts:
-            asked = 0
-
-            def act(self, _seen):
-                self.asked += 1
-                return 0.1 * self.asked
-
-        vut = Counts()
-        with pytest.warns(UserWarning, match="drives"):
-            run = ms.campaign(vut, **SMALL, out=tmp_path / "run")
-        assert vut.asked == 0
-        assert all(run.trajectory(n).a_vut_mps2[0] == pytest.approx(0.1) for n in range(4))
-
     def test_of_what_cannot_travel_runs_without_workers(self, tmp_path):
         with pytest.warns(UserWarning, match="and without workers"):
             ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "way", ["standard input", pytest.param("a script", marks=pytest.mark.long)]
-)
-def test_workers_need_no_main_guard_and_no_file(way, tmp_path):
+def test_workers_need_no_main_guard_and_no_file(tmp_path):
     """Without a guard, a worker that imported the script would run the campaign again."""
     script = (
         "import merge_sumo as ms\n"
@@ -137,11 +119,9 @@ def test_workers_need_no_main_guard_and_no_file(way, tmp_path):
         "    workers=2, out='run')\n"
         "print(repr(run))\n"
     )
-    (tmp_path / "script.py").write_text(script)
-    from_input = way == "standard input"
     done = subprocess.run(
-        [sys.executable, "-" if from_input else "script.py"],
-        input=script if from_input else None,
+        [sys.executable, "-"],
+        input=script,
         cwd=tmp_path,
         capture_output=True,
         text=True,
@@ -149,15 +129,6 @@ def test_workers_need_no_main_guard_and_no_file(way, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "<campaign run: 0 failures in 4 cases>\n"
-
-
-def test_the_main_module_is_whole_again_after_processes_have_started():
-    main = sys.modules["__main__"].__dict__
-    before = {name: main.get(name) for name in ("__file__", "__spec__")}
-    with without_main():
-        assert main["__spec__"] is None
-        assert "__file__" not in main
-    assert {name: main.get(name) for name in before} == before
 
 
 class TestTheOtherFunctions:
@@ -168,14 +139,6 @@ class TestTheOtherFunctions:
     def test_one_case_is_refused(self, values, part):
         with pytest.raises(ms.UserError, match=part):
             ms.run("design2", **values)
-
-    def test_cases_are_exported(self, run, tmp_path):
-        (config,) = ms.export(run.folder, [3], out=tmp_path / "sumo")
-        assert config.is_file()
-        (table,) = ms.export(run.folder, file_format="csv", out=tmp_path / "table")
-        assert len(table.read_text().splitlines()) > 60 * 50
-        with pytest.raises(ms.UserError, match="no format 'pdf'"):
-            ms.export(run.folder, [3], file_format="pdf")
 
     def test_the_truth_of_an_object_is_not_kept(self, tmp_path, monkeypatch):
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))

@@ -66,24 +66,6 @@ def test_a_lane_change_merges_in_the_next_step_wherever_it_is_commanded(tmp_path
         assert len(trajectory.after) > 40, "it drives on itself behind the merge"
 
 
-@pytest.mark.parametrize("index", [3, -1])
-def test_a_lane_that_its_edge_does_not_have_is_refused_as_by_sumo(tmp_path, index):
-    source = (
-        ON_LANE
-        + f"""
-    try:
-        traci.vehicle.changeLane("vut", {index}, 1.0)
-        raise SystemExit("it was accepted")
-    except traci.TraCIException as error:
-        assert str(error) == "No lane with index '{index}' on road 'lane'.", error
-        traci.vehicle.changeLane("vut", 1, 1.0)
-"""
-    )
-    for trajectory in drive(tmp_path, source):
-        assert (trajectory.error, trajectory.end) == (None, End.MERGED)
-        assert trajectory.x_vut_m[-2] < -60.0, "it merges at the gore, by the second command"
-
-
 def test_the_controller_of_the_tutorial_merges_into_a_gap(tmp_path):
     page = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text("utf-8")
     _, source = re.findall(r"```python\n(import sys, traci.*?)```", page, flags=re.DOTALL)
