@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from itertools import pairwise
 
 import make_scenarios
 import numpy as np
@@ -33,7 +31,6 @@ from merge_sumo.drivers.policies import (
 from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.sumo.world import World
-from merge_sumo.training import check as checking
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.env import pool_starts
 from merge_sumo.training.game import Game, greedy
@@ -45,7 +42,6 @@ from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.registry import VutFactory
 
-REWARD = Reward(RewardWeights(), scenario=US23)
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),
     "vut1": (0.01, 0.05),
@@ -283,30 +279,6 @@ class TestTheExampleRuns:
         assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
         assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"
         assert run.a_vut_mps2.min() <= -1.0
-
-
-@pytest.mark.long
-class TestRationality:
-    def test_a_prosocial_pov_gives_up_its_own_return_for_the_vuts(self):
-        cases = checking.check_cases("pov2", 4000, seed=6, scenario=US23)
-        pov2, vut1 = load_network("pov2"), load_network("vut1")
-        vut_ego, pov_ego = [], []
-        for svo_rad in (0.0, 0.375, 0.75, 1.125, 1.5):
-            turned = [dataclasses.replace(case, svo_rad=svo_rad) for case in cases]
-            returns = checking.returns_of(checking.play(turned, pov2, vut1), REWARD)
-            vut_ego.append(returns.vut_ego)
-            pov_ego.append(returns.pov_ego)
-        for rising in (vut_ego, [-x for x in pov_ego]):
-            steps = [after - before for before, after in pairwise(rising)]
-            for step in steps:
-                assert step.mean() > -standard_error(step)
-            whole = rising[-1] - rising[0]
-            ends = math.hypot(standard_error(rising[-1]), standard_error(rising[0]))
-            assert whole.mean() > 5.0 * ends
-
-
-def standard_error(values):
-    return values.std(ddof=1) / math.sqrt(len(values))
 
 
 @pytest.mark.long

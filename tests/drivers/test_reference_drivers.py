@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plans import POVS, plan_for
+from plans import POVS
 
 from merge_sumo.drivers.base import Scene
-from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.reference import (
     REFERENCES,
     CarefulPov,
@@ -30,7 +29,6 @@ from merge_sumo.drivers.safety_models import (
     ttc_s,
 )
 from merge_sumo.engine.povs import PovLibrary
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, US23, MergeScenario
@@ -268,21 +266,3 @@ def merged(row):
 
 
 UNITS = (("x", "m"), ("v", "mps"), ("a", "mps2"))
-
-
-@pytest.mark.parametrize("name", ["level0", *REFERENCES])
-def test_only_the_blind_driver_collides_where_both_are_due_at_the_same_time(name):
-    due_s = level0_time_to(one(182), one(18), US23.level0_a_mps2, US23.level0_v_mps)[0]
-    speeds = np.arange(25.0, 35.5, 2.0)
-    cases = [
-        MergeCase(level=0, x_pov0_m=-v * due_s, v_pov0_mps=v, scenario=US23)
-        for v in speeds.tolist()
-    ]
-    with Simulator(plan_for(name, corridors=6)) as ground:
-        gaps = [abs(ran.x_pov_m[-1] - ran.x_vut_m[-1]) for _, ran in ground.run(cases)]
-        assert len(gaps) == len(cases)
-    collides = [gap < 6.0 for gap in gaps]
-    if name == "careful":  # brakes 2 s before a collision at the earliest
-        assert any(collides)
-    else:
-        assert collides == [name == "level0"] * len(cases)

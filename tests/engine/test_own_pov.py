@@ -162,24 +162,6 @@ class TestAPov:
         cases = cases_of(20)
         assert same(run(pov(KEEPS), own(cases)), run(None, cases))
 
-    def test_sees_the_same_in_either_seat(self):
-        source = """
-            log = open(__file__.replace("my_pov.py", "seen.txt"), "a", buffering=1)
-            def Pov(seen):
-                log.write(f"{seen!r}\\n")
-                return 0.5
-        """
-        spec = pov(dedent(source))
-        case = MergeCase(level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
-        (motion,) = run(spec, [case], vut="level0")
-        first, *_, last = Path("seen.txt").read_text().splitlines()
-        state = "x_pov_m=-182.0, v_pov_mps=18.0, x_vut_m=-273.0, v_vut_mps=33.0"
-        assert first == f"Seen(t_s=0.0, {state})"
-        # It goes on past M until the vehicle under test is there.
-        assert f"x_vut_m={motion.x_pov_m[-2]}" in last
-        assert motion.x_pov_m[-2] > 0.0
-        assert motion.a_pov_mps2[:-1] == pytest.approx(0.5)
-
     def test_may_be_the_very_file_that_is_the_vut(self):
         spec = pov(YIELDS)
         hosted = run(spec, own(cases_of(6)), vut=spec, hosted=True)

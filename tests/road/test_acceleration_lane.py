@@ -1,8 +1,7 @@
-"""Acceleration lanes: found beside the mainline, hosted as lanes of one edge, driven by eq. (4)."""
+"""Acceleration lanes: found beside the mainline, as a scenario says, and in a new scenario."""
 
 from __future__ import annotations
 
-import bisect
 import re
 from dataclasses import replace
 from itertools import pairwise
@@ -25,9 +24,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
-from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MergeScenario
+from merge_sumo.values.scenario import MergeScenario
 
 EXACT = 1e-9
 
@@ -43,26 +40,6 @@ def road(tmp_path_factory):
         return found[name]
 
     return get
-
-
-@pytest.fixture
-def simulation(tmp_path):
-    """Return a function that starts SUMO on two copies of a road; the second one is driven in."""
-    libsumo = load_libsumo()
-
-    def start(road: Corridor, vtype: str) -> object:
-        (tmp_path / "net.xml").write_bytes(hosted_net(road, 2))
-        (tmp_path / "types.xml").write_text(f'<additional><vType id="car" {vtype}/></additional>')
-        files = ("-n", str(tmp_path / "net.xml"), "-a", str(tmp_path / "types.xml"))
-        libsumo.start(["sumo", *files, *SUMO_OPTIONS])
-        for name, path in zip(("main", "ramp"), hosted_paths(road), strict=True):
-            libsumo.route.add(name, path.route(1))
-            libsumo.vehicle.add(name, name, typeID="car", departPos="0", departSpeed="0")
-        libsumo.simulation.step()
-        return libsumo
-
-    yield start
-    libsumo.close()
 
 
 class TestTheShippedRoad:
@@ -113,80 +90,6 @@ class TestTheWindow:
         net = NetFile(build(tmp_path))
         with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
             find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
-
-
-class Commanded:
-    """A vehicle that SUMO moves as it is told, and that is moved from lane to lane."""
-
-    def __init__(self, vehicle, name, own, other, seed):
-        self.vehicle, self.name, self.rng = vehicle, name, np.random.default_rng(seed)
-        self.own, self.other = own, other
-        self.begin()
-        vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
-        vehicle.setLaneChangeMode(name, 0)
-
-    def begin(self, begin_m=-60.0, end_m=60.0):
-        self.path, self.v_mps = self.own, self.rng.uniform(0.0, 40.0)
-        self.put(float(self.rng.uniform(begin_m, end_m)))
-
-    def put(self, x_m):
-        self.x_m = x_m
-        place = bisect.bisect_right(self.path.starts_m, x_m) - 1
-        position_m = x_m - self.path.starts_m[place]
-        self.vehicle.moveTo(self.name, self.path.lanes(1)[place], position_m)
-
-    def tell(self):
-        self.vehicle.setPreviousSpeed(self.name, self.v_mps)
-        self.vehicle.setSpeed(self.name, self.v_mps)
-
-    def change(self, path):
-        self.path = path
-        self.put(self.x_m)
-
-    def follow(self):
-        """Advance by eq. (4), after SUMO."""
-        self.x_m += self.v_mps * DT_S
-        a_mps2 = self.rng.uniform(A_MIN_MPS2, A_MAX_MPS2)
-        self.v_mps = max(self.v_mps + a_mps2 * DT_S, 0.0)
-
-    def off_m(self):
-        starts_m = dict(zip(self.path.lanes(1), self.path.starts_m, strict=True))
-        lane, position_m = (
-            self.vehicle.getLaneID(self.name),
-            self.vehicle.getLanePosition(self.name),
-        )
-        return abs(starts_m[lane] + position_m - self.x_m)
-
-
-@pytest.mark.parametrize("name", ["us23-lane", *LANES])
-def test_commanded_vehicles_follow_eq_4_on_both_paths_and_where_they_are_moved_aside(
-    road, simulation, name
-):
-    own = road(name)
-    (begin_m, end_m), (main, ramp) = own.lane_m, hosted_paths(own)
-    libsumo = simulation(own, 'maxSpeed="200" minGap="0"')
-    cars = [
-        Commanded(libsumo.vehicle, "main", main, ramp, 1),
-        Commanded(libsumo.vehicle, "ramp", ramp, main, 2),
-    ]
-    changes = forced = 0
-    for step in range(3000):
-        for car in cars:
-            if step % 150 == 0 or car.x_m > 300.0:
-                car.begin(begin_m - 60.0, end_m)
-            car.tell()
-        libsumo.simulation.step()
-        for car in cars:
-            car.follow()
-            if car.path is ramp and car.x_m >= end_m:
-                car.change(main)
-                forced += 1
-            elif begin_m <= car.x_m < end_m and car.rng.random() < 0.05:
-                car.change(ramp if car.path is main else main)
-                changes += 1
-            assert car.off_m() < EXACT
-    assert changes > 50
-    assert forced > 10
 
 
 class TestAScenario:

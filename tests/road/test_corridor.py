@@ -14,7 +14,7 @@ from merge_sumo.road.corridor import Piece
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.hosting import hosted_net, hosted_paths
+from merge_sumo.sumo.hosting import hosted_paths
 from merge_sumo.sumo.world import World
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
 
@@ -159,27 +159,6 @@ def test_the_junction_at_m_says_who_goes_first(corridor, name, lane_drop_found, 
     assert road.lane_drop is lane_drop_found
     approaches = (road.mainline_approach, road.ramp_approach)
     assert [(a.state, a.yields) for a in approaches] == [mainline, ramp]
-
-
-@pytest.mark.parametrize("name", ["priority", "zipper"])
-def test_sumo_sees_the_same_right_of_way_in_the_hosted_net(corridor, tmp_path, name):
-    road = corridor(name)
-    hosted = tmp_path / "hosted.net.xml"
-    hosted.write_bytes(hosted_net(road, 2))
-    libsumo = load_libsumo()
-    seen = []
-    for file, lanes in (
-        (road.path, ("in_0", "r1_0")),
-        (hosted, [path.lanes(1)[n] for path, n in zip(hosted_paths(road), (0, 2), strict=True)]),
-    ):
-        libsumo.start(["sumo", "-n", str(file), "--no-step-log", "--xml-validation", "never"])
-        try:
-            links = [libsumo.lane.getLinks(name)[0] for name in lanes]
-            # Whether it has priority, its state, and the length of the lane inside the junction.
-            seen.append([(link[1], link[5], link[7]) for link in links])
-        finally:
-            libsumo.close()
-    assert seen[0] == seen[1]
 
 
 def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):

@@ -132,16 +132,6 @@ def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps
             world.step(np.zeros((2, 1)))
 
 
-def test_lane_coordinates_go_on_behind_the_merge_point():
-    with World(1, scenario=US23) as world:
-        world.place(0, [(-1.0, 30.0), (-2.0, 25.0)])
-        world.step(np.zeros((2, 1)))
-        assert world.x_m[:, 0] == pytest.approx([2.0, 0.5], abs=EXACT)
-        world.place(0, [(-100.0, 30.0), (-50.0, 25.0)])
-        assert world.x_m[:, 0] == pytest.approx([-100.0, -50.0], abs=EXACT)
-        assert world.v_mps[:, 0] == pytest.approx([30.0, 25.0], abs=EXACT)
-
-
 def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
     class Fastest(Driver):
         def act(self, scene):
