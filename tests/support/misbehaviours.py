@@ -267,7 +267,7 @@ PRINTS: Final = {
 }
 CHANGES: Final = {
     "blames another": acts(
-        "from merge_sumo.vuts import base; import os; base.asked.note(1); os._exit(3)",
+        "from merge_sumo.vuts import base; import os; base.current_call.note(1); os._exit(3)",
         "exit code 3",
     ),
     "changes directory": acts("import os; os.chdir('/')"),
