@@ -169,7 +169,7 @@ def campaign(
         vut: vehicle under test: a spec, a class, a function, or an object.
         out: new folder to write; `runs/<vut>-<date>` by default.
         given: which cases are chosen (`level`, `against`, `sampler`, `cases`, `batch`, `in_flight`,
-            `seed`, `stop_after_converged`), how a case is run
+            `seed`, `stop_when_converged`), how a case is run
             and judged (`scenario`, `follow_up_s`, `fail_when`, `require`, `policies`, `pov`,
             `deadline_s`, `vut_memory_gib`), where it runs
             (`workers`), and who is told (`progress`, `on_case`, `check`, `gates`, `junit`);

@@ -29,6 +29,7 @@ from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.settings import named_again
+from merge_sumo.campaigns.stopping import LITTLE, WINDOW
 from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
@@ -183,9 +184,8 @@ class CampaignRun(Result):
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended before its number of cases, as nothing new was expected."""
-        may_end = self.settings.get("stop_after_converged") is not None
-        return may_end and len(self._run.outcomes) < self.settings["cases"]
+        """Whether the search ended before its number of cases, as little new was found."""
+        return self._run.may_converge and len(self._run.outcomes) < self.settings["cases"]
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
@@ -264,11 +264,10 @@ class CampaignRun(Result):
         return [*(gate.sentence for gate in self.gates), *untested]
 
     def _converged_line(self) -> str:
-        cases, share = (self.settings[name] for name in ("cases", "stop_after_converged"))
-        caveat = " (this says nothing of regions that no case has come near)"
         return (
-            f"stopped after {len(self._run.outcomes)} of {cases} cases: three times in a row the "
-            f"next batch was expected to add less than {share:.2%} to the coverage{caveat}"
+            f"stopped after {len(self._run.outcomes)} of {self.settings['cases']} cases: the last "
+            f"{WINDOW} added less than {LITTLE:.0%} to the coverage of each level with failures "
+            "(this says nothing of regions that no case has come near)"
         )
 
     def __repr__(self) -> str:

@@ -23,7 +23,7 @@ ONE: Final[dict[str, Any]] = {
     "batch": 1,
     "in_flight": None,
     "sampler": "uniform",
-    "stop_after_converged": None,
+    "stop_when_converged": False,
     "repeat": 1,
 }
 """Settings of a campaign that is one case."""

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, asdict, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
-from merge_sumo.campaigns.stopping import StoppingRule
+from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
@@ -44,7 +45,7 @@ class CampaignSettings:
     repeat: int | Literal["auto"] = 1
     tolerated: float = 0.0
     seed: int = 0
-    stop_after_converged: float | None = None
+    stop_when_converged: bool = False
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
     policies: str | None = None
@@ -93,7 +94,6 @@ class CampaignSettings:
                 f"--repeat is {self.repeat} and --cases is {self.cases}: runs of a case are among "
                 "the cases of the campaign, and cannot be more"
             )
-        self.stopping_rule()
 
     def _check_texts(self) -> None:
         for option, text in (
@@ -159,15 +159,9 @@ class CampaignSettings:
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
         """Return what says of the outcomes so far whether the search is over, if anything does."""
-        if self.stop_after_converged is None:
-            return None
-        rule = StoppingRule(
-            self.stop_after_converged,
-            self.batch or self.in_flight,
-            self.new_sampler,
-            tolerated=self.tolerated,
+        return (
+            partial(has_converged, tolerated=self.tolerated) if self.stop_when_converged else None
         )
-        return rule
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
         """Return the sampler, which was told nothing; `predictor` as of `make_sampler`."""

@@ -145,11 +145,15 @@ class Run:
         return printable(str(self.settings.get("pov"))[:NAME_CHARACTERS])
 
     @property
+    def may_converge(self) -> bool:
+        """Whether the campaign may end before its number of cases."""
+        return self.settings.get("stop_when_converged") is True
+
+    @property
     def interruption(self) -> str:
         """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
         wanted = self.settings.get("cases")
-        may_end = self.settings.get("stop_after_converged") is not None
-        fewer = isinstance(wanted, int) and len(self.outcomes) < wanted and not may_end
+        fewer = isinstance(wanted, int) and len(self.outcomes) < wanted and not self.may_converge
         if not (self.torn or fewer):
             return ""
         torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""

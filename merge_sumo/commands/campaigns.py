@@ -33,7 +33,7 @@ COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
     options=(
         *(
             *SETTINGS,
-            "stop_after_converged",
+            "stop_when_converged",
             "repeat",
             "tolerate",
             *SETUP,

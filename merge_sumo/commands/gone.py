@@ -43,6 +43,7 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--limit": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--problems": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "--samplers": "`merge-sumo benchmark` compares samplers on a VUT",
+    "--stop-after-converged": "--stop-when-converged looks at what the last cases have added",
     "--truth-cases": "`merge-sumo benchmark` compares samplers on a VUT",
     "--trust-vut": "a run folder names no code to run: name a controller of your own again, --vut "
     "SPEC (and --pov)",

@@ -42,7 +42,7 @@ GROUPS: Final[Mapping[str, tuple[str, ...]]] = {
             "traffic",
         ),
         *("param", "cost", "trials", "rounds"),
-        *("stress", "stop_after_converged", "repeat"),
+        *("stress", "stop_when_converged", "repeat"),
     ),
     "Verdict": (*("fail_when", "tolerate", "gate", "confidence"),),
     "Where it runs, and what it writes": (
@@ -197,11 +197,10 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         metavar="N",
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
-    "stop_after_converged": optional(
-        float,
-        "Stop early when, three batches in a row, the next batch is expected to add less than this "
-        "share to the coverage. Needs a sampler that can tell: coverage.",
-        metavar="SHARE",
+    "stop_when_converged": flag(
+        "Stop early when the last 100 cases have added less than 2 % to the coverage of each level "
+        "with failures.",
+        "--stop-when-converged",
     ),
     "repeat": option(
         str,

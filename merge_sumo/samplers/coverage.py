@@ -19,7 +19,6 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
-from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.gpr import exploiting
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
@@ -136,22 +135,6 @@ class CoverageSampler(Sampler):
     def allocate(self, n: int) -> dict[int, int]:
         """Return the number of cases for each level; they add up to `n`."""
         return self._shares(self._proposals(n), n)
-
-    def expected_gain(self, n: int) -> float:
-        """Return the expected new coverage of the next `n` cases as a share of that so far.
-
-        Infinite without a failure: the search cannot have converged.
-        """
-        proposals = self._proposals(n)
-        shares = self._shares(proposals, n)
-        gain = sum(float(proposals[level].gain[:share].sum()) for level, share in shares.items())
-        covered = 0.0
-        for level in self.pool.levels:
-            history = self.history(level)
-            grid = CoverageGrid(history.dims)
-            grid.cover(grid.balls(history.points[history.failed]), 1.0)
-            covered += grid.covered_balls()
-        return gain / covered if covered > 0.0 else np.inf
 
     def _proposals(self, n: int) -> dict[int, Proposal]:
         """Return the batch of each level on its own."""

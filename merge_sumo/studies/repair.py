@@ -362,7 +362,7 @@ def fresh_settings(
         vut=spec,
         seed=today.seed + asked.seed + number,
         cases=cases,
-        stop_after_converged=None,
+        stop_when_converged=False,
         **few,
     )
 

@@ -204,10 +204,10 @@ class TestACampaign:
 
     @pytest.mark.slow
     def test_that_converges_ends_where_it_would_have_ended(self, tmp_path):
-        eager = settings(cases=300, in_flight=10, stop_after_converged=0.9)
+        eager = settings(cases=400, in_flight=10, stop_when_converged=True)
         run = run_campaign(eager, tmp_path / "run")
         count = len(run.outcomes)
-        assert count < 300
+        assert count < 400
         lines = outcomes(run.folder).splitlines(keepends=True)
         (run.folder / OUTCOMES).write_bytes(b"".join(lines[: count // 2]))
         resume_campaign(run.folder)

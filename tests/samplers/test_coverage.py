@@ -13,7 +13,7 @@ from conftest import some
 
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import CALIBRATION, Calibration, _as_if, _calibrated, margin_of
-from merge_sumo.samplers.coverage import NEAREST, PATIENCE, CoverageSampler, _limit, _Search
+from merge_sumo.samplers.coverage import NEAREST, PATIENCE, _limit, _Search
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.history import LevelHistory
@@ -130,15 +130,6 @@ def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
     last = [o.case.level for o in outcomes if o.batch == 4]
     assert last.count(1) == 20, "5 of the half that is shared out evenly, and the other half"
     assert last.count(0) == last.count(2) == 5
-
-
-def test_expects_less_of_the_next_batch_the_more_it_has_covered():
-    sampler = CoverageSampler(Pool(levels=(0,), scenario=US23), 2)
-    assert sampler.expected_gain(20) == math.inf
-    play(sampler, 4)
-    early = sampler.expected_gain(20)
-    play(later := CoverageSampler(Pool(levels=(0,), scenario=US23), 2), 9)
-    assert later.expected_gain(20) < 0.5 * early
 
 
 class TestTheBranches:
