@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.kinematic_world import EquationWorld
@@ -38,7 +38,6 @@ from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.studies.comparison import settings_today
 from merge_sumo.sumo.world import MAX_SPEED_MPS
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
@@ -160,7 +159,7 @@ class Crosscheck:
 
 def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
     """Let HighwayEnv repeat the cases of a campaign, and fresh uniform ones up to `cases`."""
-    settings = settings_today(run)
+    settings = settings_of(run.folder, run.settings)
     plan = resolve(settings)
     if plan.needs_sumo is not None:
         raise UserError(f"{plan.needs_sumo}: name a campaign of a VUT of this package")

@@ -101,7 +101,7 @@ from merge_sumo.studies import (
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
-from merge_sumo.studies.comparison import Comparison, settings_today
+from merge_sumo.studies.comparison import Comparison
 from merge_sumo.studies.counterfactuals import note_avoidance
 from merge_sumo.studies.probability import ProbabilityResult
 from merge_sumo.studies.run_study import RunStudy, notice_changes
@@ -422,7 +422,7 @@ def _recorded_case(
         policies = policies_folder(setup.get("policies"), run.scenario)
         own = fields.get("pov") is not None
         number = one_level(str(level), policies, run.scenario.levels, own=own)
-    settings = settings_today(run, {**fields, **ONE, "levels": (number,)})
+    settings = settings_of(run.folder, run.settings, {**fields, **ONE, "levels": (number,)})
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(number)))
     kept = {name: getattr(before, name) for name in names}
     case = case_of(settings.scenario, number, {**kept, **values})
@@ -513,7 +513,7 @@ def _today(
     """Return how and where cases of a campaign run today: settings, their plan, and the runner."""
     others = {name: one for name, one in given.items() if name != "vut"}
     fields, runner = given_again(given.get("vut"), others, {"vut": run.vut}, stacklevel)
-    settings = settings_today(run, fields)
+    settings = settings_of(run.folder, run.settings, fields)
     return settings, resolve(settings), runner
 
 

@@ -249,10 +249,9 @@ def compare(
     """Compare recorded versions of a VUT: what broke, and what was fixed.
 
     Everything is read from the records. Cases that two campaigns share are paired; where each has
-    cases of its own, regions of failures are compared: one broke where the later version fails and
-    the earlier one has passed cases.
+    cases of its own, regions of failures are compared, as a hint.
 
-    Exit code 1 when a case or a region broke, or the last version was tested in no case.
+    Exit code 1 when a case broke, or the last version was tested in no case.
 
     Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
     """

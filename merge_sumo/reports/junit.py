@@ -25,7 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
-from merge_sumo.system.printable import counted, printable
+from merge_sumo.system.printable import printable
 from merge_sumo.values.chance import by_case
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
@@ -110,7 +110,7 @@ def _against(root: etree._Element, run: Run) -> None:
 
 
 def _step(root: etree._Element, name: str, step: Step) -> None:
-    """Add a suite of the cases that two versions ran, and of regions of failures that broke."""
+    """Add a suite of the cases that two versions ran."""
     suite = etree.SubElement(root, "testsuite", name=name)
     for one in step.cases:
         if one.change is not Change.BOTH:
@@ -118,12 +118,6 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
             if one.change is Change.BROKE:
                 _wrong(test, "failure", REGRESSION, one.became)
-    for level, regions in step.regions.items():
-        for region in regions:
-            where = f"region at POV level {level_name(level)}: {region.where}"
-            test = _test(suite, where, f"{CLASS}.against", 0.0)
-            if region.change is Change.BROKE:
-                _wrong(test, "failure", REGRESSION, f"{counted(region.failures, 'failure')}")
     _count(suite)
 
 

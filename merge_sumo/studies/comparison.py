@@ -3,7 +3,8 @@
 A version is what was recorded of it. Cases that two neighbours both ran are paired, and a case that
 passes with the earlier one and does not pass with the later one broke. Where each has cases of its
 own, regions are compared: failures that are linked at the radius of FMC, and the cases that the
-other version has within that radius of one of them.
+other version has within that radius of one of them. They decide nothing: two searches of one
+version have cases on both sides of the edge of a region.
 
 `compare` reads recorded campaigns and runs nothing. `compare_against` reads a campaign that ran
 both versions (`campaigns/against.py`). `rerun` runs the recorded cases of one campaign again with a
@@ -13,7 +14,7 @@ changed VUT. All return a `Comparison`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from functools import cached_property
@@ -29,7 +30,7 @@ from merge_sumo.analysis.summary import LevelSummary, summarise
 from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.against import earlier_run
 from merge_sumo.campaigns.repeats import cause
-from merge_sumo.campaigns.settings import CampaignSettings, same_pov, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, same_pov
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import versions as versions_of_packages
@@ -37,6 +38,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.hashing import changed
 from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.records import Record, to_plain
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.chance import RunsOfCase, by_case, one_per_case
 from merge_sumo.values.fmc import fmc, radius_for, regions
@@ -58,14 +60,17 @@ class Change(StrEnum):
 
     A case passes where the VUT arrives and the criterion is met. One whose runs are not alike may
     pass with one version alone by chance: it is `WITHIN_CHANCE` where Fisher's exact test does not
-    tell the shares of failing runs apart.
+    tell the shares of failing runs apart. `LATER_ALONE`, `EARLIER_ALONE` and `NOT_SEEN` are only of
+    regions.
     """
 
     BROKE = "broke"
+    LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
     NEITHER = "passes with neither"
     STILL_CONTACT = "contact without failure"
     FIXED = "fixed"
+    EARLIER_ALONE = "found in the earlier alone"
     NOT_SEEN = "not looked at"
     BOTH = "passes with both"
 
@@ -185,8 +190,7 @@ def _by_case(
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Region:
+class Region(Record, frozen=True):
     """A region of failures of one of two neighbours, and what the other one did in it.
 
     Attributes:
@@ -282,10 +286,6 @@ class Step:
             case.change is change for case in self.cases if level in (None, case.a.case.level)
         )
 
-    def count_regions(self, change: Change) -> int:
-        """Return the number of regions of which that became."""
-        return sum(one.change is change for found in self.regions.values() for one in found)
-
     def table_lines(self) -> list[str]:
         """Return the table of transitions as lines."""
         return [
@@ -304,8 +304,7 @@ class Step:
             ],
             "cases": [one.to_record() for one in self.cases if one.change is not Change.BOTH],
             "regions": {
-                level_name(level): [asdict(region) for region in found]
-                for level, found in self.regions.items()
+                level_name(level): to_plain(found) for level, found in self.regions.items()
             },
         }
 
@@ -336,13 +335,8 @@ class Comparison(Result):
 
     @property
     def worse(self) -> bool:
-        """Whether a case broke, or a region of failures appeared where the version before passed.
-
-        So also where the last version was tested in no case.
-        """
-        regions = sum(step.count_regions(Change.BROKE) for step in self.steps)
-        untested = not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
-        return self.broke > 0 or regions > 0 or untested
+        """Whether a case broke, or the last version was tested in no case."""
+        return self.broke > 0 or not any(o.is_tested for o in self.versions[-1].outcomes)
 
     @property
     def headline(self) -> str:
@@ -357,11 +351,8 @@ class Comparison(Result):
             ]
             words = ", ".join(numbers) if step.cases else "no case is shared"
             if step.regions:
-                shown = [
-                    f"{number} {change}"
-                    for change in Change
-                    if (number := step.count_regions(change))
-                ]
+                became = Counter(one.change for found in step.regions.values() for one in found)
+                shown = [f"{became[change]} {change}" for change in Change if change in became]
                 words += f"; regions of failures: {', '.join(shown) or 'none'}"
             many = len(self.steps) > 1
             parts.append(f"from {step.before} to {step.after}: {words}" if many else words)
@@ -397,8 +388,8 @@ class Comparison(Result):
             if cases and folder is not None:
                 text.append(f"  look at one: merge-sumo replay {quoted(folder)} {cases[0].b.index}")
         for level, regions_there in step.regions.items():
-            shown = [one for one in regions_there if one.change is Change.BROKE]
-            at = f"regions that broke at level {level_name(level)}"
+            shown = [one for one in regions_there if one.change is Change.LATER_ALONE]
+            at = f"regions found in the later alone at level {level_name(level)}"
             text += [f"{at}{cut(len(shown), LISTED)}:"] if shown else []
             text += [
                 f"  {one.where}: {counted(one.failures, 'failure')}, the other version passed "
@@ -458,8 +449,8 @@ def compare(runs: Sequence[Run]) -> Comparison:
         versions=tuple(found),
         steps=tuple(_step(found, number) for number in range(1, len(found))),
         source=(
-            "each campaign has the cases of its own search: where they share none, regions say "
-            "what broke, and `merge-sumo rerun` pairs the cases of one with another VUT"
+            "each campaign has the cases of its own search: where they share none, regions are a "
+            "hint, and `merge-sumo rerun` pairs the cases of one with another VUT"
         ),
         notes=tuple(_notes(runs)),
     )
@@ -485,19 +476,17 @@ def compare_against(run: Run) -> Comparison | None:
 
 
 def _comparison_of_two(
-    before: Version, after: Version, source: str, notes: Iterable[str] = (), **more: Any
+    before: Version, after: Version, source: str, *more: tuple[Any, ...]
 ) -> Comparison:
-    """Return the comparison of two versions that ran the same cases."""
-    step = _step((before, after), 1)
-    return Comparison((before, after), (step,), source, tuple(notes), **more)
+    """Return the comparison of two versions that ran the same cases; `more` as in `Comparison`."""
+    return Comparison((before, after), (_step((before, after), 1),), source, *more)
 
 
 def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
     """Compare a campaign with what another VUT does in its cases."""
     version = Version.of(after)
-    source = f"the cases come from the search of {after.vut}"
     earlier = Version(vut, None, before, after.tolerated, version.levels)
-    return _comparison_of_two(earlier, version, source)
+    return _comparison_of_two(earlier, version, f"the cases come from the search of {after.vut}")
 
 
 def _check_comparable(a: Run, b: Run) -> None:
@@ -606,10 +595,10 @@ class _Tested:
 
 def _regions(number: int, earlier: _Tested, later: _Tested) -> list[Region]:
     """Return the regions of two versions, of which the earlier one has a number; as `Change`."""
-    fixed = earlier.regions(number, later, Change.FIXED)
-    broke = later.regions(number + 1, earlier, Change.BROKE)
+    own = earlier.regions(number, later, Change.EARLIER_ALONE)
+    new = later.regions(number + 1, earlier, Change.LATER_ALONE)
     # Where both fail the region is given once, as one of the earlier version.
-    both = [*fixed, *(region for region in broke if not region.failed)]
+    both = [*own, *(region for region in new if not region.failed)]
     order = list(Change)
     return sorted(both, key=lambda one: (order.index(one.change), -one.fmc, one.worst))
 
@@ -628,16 +617,8 @@ def _box_in_words(cases: Sequence[Case]) -> str:
 # Recorded cases with a changed VUT.
 
 
-def settings_today(run: Run, given: Mapping[str, object] | None = None) -> CampaignSettings:
-    """Return the settings of a campaign with what is given in the place of what it recorded.
-
-    A VUT that is not given is that of the campaign, as its files are today (`settings_of`).
-    """
-    return settings_of(run.folder, run.settings, given)
-
-
 def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
-    """Run cases of a campaign again, by default all, with `settings_today` and their plan.
+    """Run cases of a campaign again, by default all, with the settings of the study and their plan.
 
     Raises `UserError` for an index without a case, and where net or POV are not the campaign's:
     then not only the VUT would have changed.
@@ -666,18 +647,18 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
         f"now alone fails may lie elsewhere: `{search}` searches there"
     )
     unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
-    notes = []
+    notes: tuple[str, ...] = ()
     if unrepeated:
-        notes.append(
+        notes = (
             f"{len(unrepeated)} of {counted(len(after), 'case')} went differently, and no file of "
-            f"the VUT has changed (the first is case {unrepeated[0]}). {cause()}."
+            f"the VUT has changed (the first is case {unrepeated[0]}). {cause()}.",
         )
     return _comparison_of_two(
         Version(run.vut, str(run.folder), before, run.tolerated, levels),
         Version(settings.vut, None, after, run.tolerated, levels),
         source,
         notes,
-        unrepeated=unrepeated,
+        unrepeated,
     )
 
 

@@ -21,11 +21,11 @@ from merge_sumo.campaigns.repeats import (
     spread_places,
     unrepeatable,
 )
-from merge_sumo.campaigns.settings import CampaignSettings, controllers
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.studies.comparison import rerun, settings_today
+from merge_sumo.studies.comparison import rerun
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
@@ -173,9 +173,8 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     checked = CliRunner().invoke(cli.app, ["check-vut", spec])
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
-    again = rerun(
-        RunStudy(run, today := settings_today(run, controllers(run.settings)), resolve(today))
-    )
+    today = settings_of(run.folder, run.settings, controllers(run.settings))
+    again = rerun(RunStudy(run, today, resolve(today)))
     assert again.unrepeated
     assert "no file of the VUT has changed" in str(again)
 
