@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import some
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -70,10 +69,9 @@ def test_uniform_covers_the_pool_evenly():
     assert points.max() > 0.995
 
 
-@pytest.mark.parametrize("levels", some([(0,), (2,)], (2,)), ids=str)
-def test_gpr_finds_more_failures_than_uniform_with_the_same_budget(levels):
+def test_gpr_finds_more_failures_than_uniform_with_the_same_budget():
     uniform, gpr = (
-        statistics.median(failures_found(name, levels, seed, batches=6) for seed in (1, 2, 3))
+        statistics.median(failures_found(name, (2,), seed, batches=6) for seed in (1, 2, 3))
         for name in ("uniform", "gpr")
     )
     assert 0 < uniform < 24, "the band must be neither invisible nor easy"

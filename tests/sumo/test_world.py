@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from conftest import some
 from plans import POVS
 
 from merge_sumo.drivers.base import Driver
@@ -69,9 +68,8 @@ def assert_eq4(trajectory):
             assert abs(v[t + 1] - expected_v) < EXACT
 
 
-@pytest.mark.parametrize("corridors", some([1, 32], 32))
-def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills(corridors):
-    cases = random_cases(300)
+def test_sumo_moves_random_episodes_by_eq_4_at_every_step_with_refills():
+    corridors, cases = 32, random_cases(300)
     with World(corridors, scenario=US23) as world:
         trajectories = run_all(world, RandomDriver(corridors), RandomDriver(corridors), cases)
     lengths = {len(t.motion) for t in trajectories}

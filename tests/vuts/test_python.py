@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 from campaigning import campaign_settings, run_campaign
-from conftest import some
 from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
@@ -161,8 +160,7 @@ def test_what_it_does_wrong_is_the_outcome_of_its_own_case(vut, answer):
         ("import time; time.sleep(9)", "reset: took longer than the deadline of 0.3 s"),
     ],
 )
-@pytest.mark.parametrize("batched", some([False, True], True))
-def test_a_reset_that_fails_is_the_outcome_of_its_own_case(vut, body, reason, batched):
+def test_a_reset_that_fails_is_the_outcome_of_its_own_case(vut, body, reason):
     source = f"""
 class Vut:
     def __init__(self, *corridors):
@@ -170,7 +168,7 @@ class Vut:
     def reset(self, *arguments):
         if arguments[-1].v_pov_mps > 30.0:
             {body}
-    def {"act_batch" if batched else "act"}(self, seen):
+    def act_batch(self, seen):
         return 0.0 * seen.v_vut_mps + 1.0
 """
     cases = cases_of(8)
