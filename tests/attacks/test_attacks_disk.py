@@ -5,16 +5,14 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from attacks import World, tell
+from attacks import World
 from campaigning import campaign_settings, run_campaign
 from conftest import require
 from plans import plan_for
@@ -22,7 +20,6 @@ from plans import plan_for
 from merge_sumo.campaigns.store import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
-from merge_sumo.system.folders import TEMPORARY
 
 CAMPAIGN = ("campaign", "--vut", "design1", "--level", "0", "--sampler", "uniform", "-q")
 SMALL = (*CAMPAIGN, "--cases", "60", "--seed", "1")
@@ -121,16 +118,6 @@ def test_a_disk_that_is_full_ends_every_writer_in_a_sentence(name, left, run, sm
     for campaign, cases in (("new", 0), ("stopped", 20)):
         if f"{campaign}/{OUTCOMES}" in after:
             assert len(Run(small_disk / campaign).outcomes) == cases
-
-
-@pytest.mark.long
-def test_a_full_folder_for_temporary_files_is_not_used(run, small_disk, tmp_path):
-    (small_disk / "filler").write_bytes(bytes(shutil.disk_usage(small_disk).free))
-    world = world_with(run, tmp_path / "world")
-    world.environment["TMPDIR"] = str(small_disk)
-    code, _, err = world.run(*SMALL, "--out", "new")
-    assert code == 0, err
-    assert sorted(path.name for path in small_disk.iterdir()) == ["filler"]
 
 
 SETPRIV = shutil.which("setpriv")
@@ -276,98 +263,3 @@ class TestAFolderThatVanishes:
             code, _, err = world.run(*arguments, script=script)
             assert code == 2, err
             assert "Traceback" not in err, err
-
-
-@pytest.mark.long
-class TestTwoWriters:
-    def both(self, world: World, *arguments: object) -> list[tuple[int, str]]:
-        started = [world.start(*arguments) for _ in range(2)]
-        return [(p.communicate(timeout=300)[1], p.returncode)[::-1] for p in started]
-
-    def test_of_one_name_are_a_first_and_a_second(self, run, tmp_path):
-        makes = {
-            "new": (*SMALL, "--out", "new"),
-            "paper": ("export", "run", "0", "--out", "paper"),
-            "tables": ("export", "run", "--format", "csv", "--out", "tables"),
-            "p.json": ("probability", "run", "--cases", "20", "--out", "p.json"),
-            "curves.svg": (*COMPARE, "--figure", "curves.svg"),
-        }
-        seen: Counter[str] = Counter()
-        for name, arguments in makes.items():
-            for number in range(4):
-                world = world_with(run, tmp_path / f"{name}-{number}")
-                ended = self.both(world, *arguments)
-                assert "Traceback" not in "".join(err for _, err in ended), ended
-                codes = sorted(code for code, _ in ended)
-                assert codes in ([0, 2], [0, 0]) if name == "curves.svg" else codes == [0, 2], ended
-                assert "xists" in "".join(err for _, err in ended) or codes == [0, 0]
-                assert (world.root / name).exists()
-                assert not [n for n in tree(world.root) if TEMPORARY in n]
-                seen["pairs"] += 1
-        tell(seen)
-
-    def test_of_one_report_or_one_truth_leave_a_whole_one(self, run, tmp_path):
-        world = world_with(run, tmp_path / "world")
-        assert world.run("report", "run")[0] == 0
-        page = (world.root / "run" / "report.html").read_bytes()
-        for _ in range(6):
-            assert [code for code, _ in self.both(world, "report", "run")] == [0, 0]
-            assert (world.root / "run" / "report.html").read_bytes() == page
-        for _ in range(3):
-            for truth in world.cache.glob("truth-*"):
-                truth.unlink()
-            assert [code for code, _ in self.both(world, *TRUTH)] == [0, 0]
-            assert len(list(world.cache.glob("truth-*"))) == 1
-        assert not [n for n in tree(world.root) if TEMPORARY in n]
-
-
-CLOCK = """
-import itertools, time
-_real, _steps = time.time, itertools.count()
-def back():
-    return {start} - 1000.0 * next(_steps)
-time.time = back
-time.time_ns = lambda: int(back() * 1e9)
-"""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("start", [1e6, 1e9, 1.9e9, 5e9], ids=["1970", "2001", "2030", "2128"])
-def test_a_clock_that_runs_backwards_decides_nothing(start, run, tmp_path):
-    (tmp_path / "clock").mkdir()
-    (tmp_path / "clock" / "sitecustomize.py").write_text(CLOCK.format(start=start))
-    path = os.pathsep.join([str(tmp_path / "clock"), os.environ.get("PYTHONPATH", "")])
-    usual, odd = (world_with(run, tmp_path / name) for name in ("usual", "odd"))
-    odd.environment["PYTHONPATH"] = path
-    assert "back" in odd.run(script="import time; print(time.time)")[1]
-    found = []
-    for world in (usual, odd):
-        said = []
-        for arguments in (
-            SMALL,
-            (*SMALL, "--workers", "2", "--out", "two", "--json"),
-            (*TRUTH, "--json"),
-            (*TRUTH, "--json"),
-            (*COMPARE, "--figure", "curves.svg"),
-            ("report", "run"),
-            ("export", "run", "--format", "csv", "--out", "tables"),
-            ("export", "run", "3", "--out", "folders"),
-            ("probability", "run", "--cases", "20", "--out", "p.json", "--json"),
-            ("campaign", "--resume", "run", "-q", "--json"),
-        ):
-            code, out, err = world.run(*arguments)
-            assert code == 0, err
-            said.append(out if "--json" in arguments and arguments[0] == "truth" else "")
-        (world.root / "runs" / "latest").unlink()
-        (dated,) = (world.root / "runs").iterdir()
-        dated.rename(world.root / "dated")
-        # A report has the name of its folder.
-        made = {
-            name: content
-            for name, content in tree(world.root).items()
-            if name.startswith(("dated", "two", "tables", "folders", "p.json", "curves"))
-            and not name.endswith("report.html")
-        }
-        found.append((said, made))
-    assert found[0] == found[1]
-    assert json.loads(found[0][0][2])["cases"] == 300

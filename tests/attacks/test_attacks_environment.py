@@ -15,7 +15,7 @@ from attacks import World
 from conftest import require, some
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.limits import EXHAUSTED, check_threads, exhausted
+from merge_sumo.system.limits import EXHAUSTED, check_threads
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX is needed")
 
@@ -133,12 +133,6 @@ class TestLimits:
     def test_of_files_and_memory(self, world, limit, command):
         assert_refused_or_run(world, command, limit)
 
-    @pytest.mark.long
-    @pytest.mark.parametrize("limit", ["-f 1", "-n 8", "-n 12", "-n 16", "-v 1000000"])
-    @pytest.mark.parametrize("command", COMMANDS)
-    def test_of_files_and_memory_for_every_command(self, world, limit, command):
-        assert_refused_or_run(world, command, limit)
-
     @pytest.mark.parametrize(
         "processes", some((1, 2, 3, 4, 5, 6, 8, 9, 10, 12, 14, 16, 18, 20, 24, 32), 4)
     )
@@ -158,15 +152,6 @@ class TestLimits:
         monkeypatch.setattr(Thread, "start", refuse)
         with pytest.raises(UserError, match="no more processes or threads"):
             check_threads(3)
-
-    def test_other_errors_are_not_the_systems(self):
-        assert exhausted(OSError(errno.ENOSPC, "full", "/there/a")) == (
-            f"/there/a: {EXHAUSTED[errno.ENOSPC]}"
-        )
-        assert exhausted(MemoryError())
-        assert exhausted(RuntimeError("can't start new thread"))
-        assert exhausted(RuntimeError("our own")) is None
-        assert exhausted(FileNotFoundError(errno.ENOENT, "nothing")) is None
 
 
 def assert_refused_or_run(world: World, command: str, limit: str) -> None:

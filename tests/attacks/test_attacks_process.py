@@ -12,13 +12,9 @@ from collections import Counter
 import pytest
 from attacks import World, tell
 from campaigning import campaign_settings, run_campaign
-from test_workers import cluster, workers_at
 
 import merge_sumo as ms
 from merge_sumo.campaigns.store import OUTCOMES
-from merge_sumo.system.workers import dask_workers
-
-__all__ = ["cluster", "workers_at"]
 
 MANY = """
 import gc, json, os, sys, tempfile, threading
@@ -112,42 +108,3 @@ class TestThreads:
         assert wrong == []
         for path in tmp_path.iterdir():
             assert (path / OUTCOMES).read_bytes() == alone[path.name.split("-")[0]]
-
-
-SAMPLERS = ("uniform", "gpr", "coverage")
-BLAS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-WAYS: dict[str, tuple[tuple[str, ...], tuple[str, ...], dict[str, str]]] = {
-    "2 workers": ((), ("--workers", "2"), {}),
-    "3 workers": ((), ("--workers", "3"), {}),
-    "python -O": (("-O",), (), {}),
-    "python -OO": (("-OO",), (), {}),
-    **{f"{n} BLAS threads": ((), (), dict.fromkeys(BLAS, n)) for n in ("1", "2", "4")},
-    **{f"hash seed {n}": ((), (), {"PYTHONHASHSEED": n}) for n in ("0", "1", "4294967295")},
-    "another locale": ((), (), {"LC_ALL": "C", "PYTHONUTF8": "0", "TZ": "Asia/Kolkata"}),
-}
-"""By name: options of the interpreter, of the campaign, and environment."""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("sampler", SAMPLERS)
-def test_nothing_but_the_settings_decides_outcomes(sampler, cluster, tmp_path):
-    options = ("--vut", "design2", "--sampler", sampler, "--cases", 60, "-q")
-    found = {}
-    for name, (python, more, environment) in {"usual": ((), (), {}), **WAYS}.items():
-        world = World(tmp_path / name.replace(" ", "-"), python, environment)
-        code, _, err = world.run("campaign", *options, *more, "--seed", 5, "--out", "run")
-        assert code == 0, (name, err)
-        found[name] = (world.root / "run" / OUTCOMES).read_bytes()
-    address, _ = cluster
-    settings = campaign_settings(
-        vut="design2", levels=(0, 1, 2), sampler=sampler, cases=60, batch=20, seed=5
-    )
-    with dask_workers(address) as workers:
-        run_campaign(settings, tmp_path / "dask", workers=workers)
-    found["Dask"] = (tmp_path / "dask" / OUTCOMES).read_bytes()
-    tell(
-        Counter({"ways": len(found), "different bytes": len(set(found.values())) - 1}),
-        sampler + ": ",
-    )
-    assert found["usual"].count(b"\n") == 60
-    assert [name for name in found if found[name] != found["usual"]] == []

@@ -12,8 +12,6 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -26,12 +24,6 @@ from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.scenario_suggestion import (
-    about,
-    kind_of_merge,
-    lane_warnings,
-    suggested,
-)
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.campaigns.store import (
     OUTCOMES,
@@ -45,13 +37,11 @@ from merge_sumo.campaigns.store import (
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.merge import default_net_path, road_of
-from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo import replay, replay_folder
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import US23, as_merge
+from merge_sumo.values.scenario import US23
 
 here = settings(
     max_examples=60,
@@ -273,21 +263,6 @@ class TestAScenario:
             answer(lambda: hosted_net(road, 2))
             answer(lambda: road.speed_limit_mps)
 
-    @here
-    @given(data=st.data())
-    def test_with_a_spoilt_net_that_has_an_acceleration_lane(self, tmp_path, data):
-        scenario = as_merge(named_scenario("us23-lane"))
-        net = resource("sumo_net") / str(scenario.net)
-        path = tmp_path / "spoilt.net.xml"
-        path.write_bytes(data.draw(some(net.read_bytes())))
-        lane_m = data.draw(st.sampled_from([None, scenario.lane_m, (-0.0, 1e-9), (-1e3, 1e3)]))
-        edges = scenario.mainline, scenario.ramp
-        road = answer(lambda: road_of(path, *edges, lane_m=lane_m))
-        if road is not None:
-            answer(lambda: hosted_net(road, 2))
-            answer(lambda: road_svg(road, suggested(road, "spoilt")))
-            answer(lambda: [*about(road), *kind_of_merge(road), *lane_warnings(scenario, road)])
-
     def test_that_is_an_entity_bomb_is_refused_quickly(self, tmp_path):
         bomb = '<!DOCTYPE l [<!ENTITY a0 "ha">'
         bomb += "".join(f'<!ENTITY a{n} "{f"&a{n - 1};" * 10}">' for n in range(1, 12))
@@ -336,33 +311,3 @@ def test_settings_of_any_value_are_settings_or_a_sentence(values):
         assert 1 <= found.batch <= found.cases
         assert found.seed >= 0
         assert set(found.levels) <= {0, 1, 2}
-
-
-ATHERIS = """
-import sys, atheris
-with atheris.instrument_imports(include=["merge_sumo", "json"]):
-    from merge_sumo.errors import UserError
-    from merge_sumo.campaigns.store import read_outcomes, to_line
-
-def one(data):
-    try:
-        outcomes, _ = read_outcomes(data, "outcomes.jsonl")
-    except UserError:
-        return
-    assert read_outcomes("".join(map(to_line, outcomes)).encode(), "again")[0] == outcomes
-
-atheris.Setup(sys.argv, one)
-atheris.Fuzz()
-"""
-
-
-@pytest.mark.long
-def test_a_coverage_guided_fuzzer_finds_no_other_exception(lines, tmp_path):
-    pytest.importorskip("atheris", reason="pip install atheris")
-    (tmp_path / "fuzz.py").write_text(ATHERIS)
-    (tmp_path / "corpus").mkdir()
-    (tmp_path / "corpus" / "lines").write_bytes(lines)
-    command = [sys.executable, "fuzz.py", "corpus", "-max_total_time=120", "-max_len=4096"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "DONE" in done.stderr

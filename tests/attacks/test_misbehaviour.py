@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -116,33 +115,3 @@ def campaign(folder: Path, file: Path, workers: int) -> tuple[subprocess.Complet
     assert list(scratch.iterdir()) == []
     outcomes = folder / "outcomes.jsonl"
     return ended, outcomes.read_bytes() if outcomes.is_file() else b""
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", CATALOGUE)
-def test_a_campaign_ends_by_itself_with_an_outcome_for_every_case(name, tmp_path):
-    how, file = CATALOGUE[name], tmp_path / "my_vut.py"
-    outcomes = []
-    for run, workers in enumerate((1, 1, 2)):
-        file.write_text(how.source, encoding="utf-8")
-        with none_left():
-            ended, lines = campaign(tmp_path / f"run{run}", file, workers)
-        outcomes.append(lines)
-        if how.refused or (how.shared and ended.returncode == 2):
-            # Who changes or removes its own file may not be found again by the next worker.
-            assert ended.returncode == 2
-            assert ended.stderr.splitlines()[-1].startswith("merge-sumo: ")
-            continue
-        records = [json.loads(line) for line in lines.splitlines()]
-        tested = any(record["end"] == "MERGED" for record in records)
-        assert ended.returncode == (0 if tested else 1)
-        assert [record["index"] for record in records] == list(range(12))
-        for record in records:
-            bad = record["v_pov0_mps"] > GUILTY_MPS and how.reason is not None
-            if not how.shared:
-                assert (record["error"] is not None) == bad
-                assert how.reason is None or not bad or how.reason in record["error"]
-    if how.repeats:
-        assert outcomes[0] == outcomes[1]
-    if how.repeats and not how.shared:
-        assert outcomes[0] == outcomes[2]

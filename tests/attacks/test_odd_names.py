@@ -21,7 +21,6 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
-from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.report import write_report
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.system.printable import printable, quoted
@@ -78,12 +77,6 @@ class TestAVutFile:
         code, out, err = call("check-vut", f"{name}.py:drive")
         assert code == 0, out + err
 
-    def test_with_a_long_name_has_a_folder_with_a_shorter_one(self, call, tmp_path):
-        (tmp_path / ("x" * 250 + ".py")).write_text(VUT)
-        options = ("--level", 0, "--cases", 1, "--sampler", "uniform", "-q")
-        code, _, err = call("campaign", "--vut", f"{'x' * 250}.py:drive", *options)
-        assert code == 0, err
-
     @pytest.mark.parametrize("vut", [f"{NOT_UTF8}.py:drive", f"traci:{NOT_UTF8} {{port}}"])
     def test_with_a_name_that_is_no_text_is_refused_before_it_is_loaded(self, call, tmp_path, vut):
         (tmp_path / f"{NOT_UTF8}.py").write_text("raise SystemExit('it was loaded')")
@@ -93,10 +86,6 @@ class TestAVutFile:
             "it is not UTF-8",
         )
         assert [path.suffix for path in tmp_path.iterdir()] == [".py"]
-
-    def test_in_a_command_that_is_no_text_is_refused_from_python_too(self):
-        with pytest.raises(UserError, match="not UTF-8"):
-            campaign_settings(vut="half\ud800.py:drive")
 
 
 class TestATerminal:
@@ -115,14 +104,6 @@ class TestATerminal:
         assert out.count("\n") == 1
         assert (folder / "scenarios" / "case-00000" / "replay.sumocfg").is_file()
 
-    @pytest.mark.parametrize("name", SOME_TERMINALS)
-    def test_of_any_encoding_shows_a_sentence_on_any_name(self, tmp_path, name):
-        code, out, err = in_a_process(TERMINALS[name], "report", tmp_path / NASTY)
-        assert (code, out) == (2, "")
-        assert err.startswith("merge-sumo: ")
-        assert err.count("\n") == 1
-        assert "\x1b" not in err
-
     def test_gets_json_that_says_any_name(self, call, run, tmp_path):
         folder = Path(shutil.copytree(run.folder, tmp_path / NASTY))
         code, out, err = call("campaign", "--resume", folder, "--cases", 60, "--json", "-q")
@@ -132,12 +113,6 @@ class TestATerminal:
         code, out, err = call("campaign", "--resume", folder, "--cases", 60, "-q")
         assert code == 0, err
         assert f"merge-sumo replay {quoted(folder)[:-1]}" in out, "a command that a shell reads"
-
-    def test_shows_a_title_as_it_is(self, capsys):
-        with Bars() as bars:
-            bars.counted("a [/red] \x1b[31m\udcff", 1, 1, "cases", "[/bold]")
-        said = capsys.readouterr().err
-        assert "[/red] \\x1b[31m\\udcff" in said
 
 
 def test_what_is_printed_moves_no_cursor_and_keeps_letters_of_all_languages():
@@ -171,17 +146,6 @@ class TestSumo:
         with Simulator(plan_for("design1", corridors=1)):
             pass
         assert list((tmp_path / name).iterdir()) == []
-
-    @pytest.mark.parametrize(
-        "name", some(["a,b", "a%41b", "${HOME}", "a:b", NOT_UTF8], "a%41b", NOT_UTF8)
-    )
-    def test_says_so_where_it_cannot_use_the_folder_for_temporary_files(
-        self, tmp_path, monkeypatch, name
-    ):
-        (tmp_path / name).mkdir()
-        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
-        with pytest.raises(UserError, match="set TMPDIR to one without"):
-            Simulator(plan_for("design1", corridors=1))
 
     def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))

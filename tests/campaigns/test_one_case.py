@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,7 @@ from merge_sumo.campaigns.one_case import case_of, run_one
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.sumo.live import LABEL, Window
-from merge_sumo.sumo.replay_folder import TEXT, case_line, verdict_line
+from merge_sumo.sumo.live import Window
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
 
@@ -35,45 +33,12 @@ class TestTheCommand:
         assert "stalemate" in out
         assert "impact speed" in out
 
-    def test_has_a_row_for_each_second_and_one_for_the_end(self, command_line):
-        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE)
-        table = out[out.index("  t s") :].splitlines()
-        assert [row.split()[0] for row in table[1:]] == [f"{t}.0" for t in range(10)] + ["9.3"]
-        assert {row.rindex("|") for row in table[1:-2]} == {table[0].index("M", 60)}
-
-    def test_ends_with_0_when_the_vut_merges(self, command_line):
-        code, out, _ = command_line("run", "--vut", "design2", *SAFE)
-        assert (code, "MERGED" in out) == (0, True)
-
-    def test_says_what_is_outside_of_the_pool(self, command_line):
-        case = ("--vut", "design2", "--level", "0", "--v", "34", "--x")
-        said = "note: x_POV0 -900.0 m is outside of the pool, -340 to -180 m: "
-        assert said in command_line("run", *case, "-900")[2]
-        assert command_line("run", *case, "-340")[2] == ""
-
     def test_keeps_the_case_as_a_folder_that_replays(self, command_line, tmp_path):
         command_line("run", "--vut", "design2", *SAFE, "--out", tmp_path / "kept")
         assert command_line("replay", tmp_path / "kept")[:2] == (
             0,
             f"identical: {_rows(tmp_path / 'kept')} rows of x, y, position and speed\n",
         )
-
-    def test_of_a_campaign_is_replayed_by_its_index_as_often_as_one_likes(
-        self, command_line, run, tmp_path
-    ):
-        folder = shutil.copytree(run.folder, tmp_path / "run")
-        index = next(o.index for o in run.outcomes if not o.failed)  # which is not exported yet
-        for _ in range(2):
-            code, out, _ = command_line("replay", folder, index)
-            assert (code, out.startswith("identical: ")) == (0, True)
-        assert (folder / "scenarios" / f"case-{index:05d}" / "replay.sumocfg").is_file()
-        code, _, said = command_line("replay", folder)
-        assert (code, f"{folder} is a campaign: say which case" in said) == (2, True)
-        assert command_line("replay", folder, 60)[0] == 2
-
-    def test_that_is_no_campaigns_has_no_index(self, command_line):
-        code, _, said = command_line("replay", "scenarios/stalemate", 3)
-        assert (code, "is no campaign, so it has no case 3" in said) == (2, True)
 
     def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
         code, out, _ = command_line("run", "--case", run.folder, "7", "--json")
@@ -154,24 +119,6 @@ class TestInSumoGui:
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
         assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
-
-    def test_the_window_says_the_case_and_the_verdict_and_labels_keep_apart(self, window):
-        lines: list[str] = []
-        labels: list[str] = []
-
-        def look(this: Window) -> None:
-            this._look()
-            lines.extend(this._poi.getParameter(name, TEXT) for name in this._poi.getIDList())
-            names = this.vehicle.getIDList()
-            labels.extend(this.vehicle.getParameter(name, LABEL) for name in names)
-
-        window.setattr(Window, "wait", look)
-        live = run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
-        assert lines == [case_line(COLLIDES), verdict_line(live.outcome)]
-        first, second = sorted(labels)  # a space is before any letter
-        assert first.startswith(" ")
-        assert second.endswith(" ")
-        assert {label.split()[0] for label in labels} == {"POV", "VUT"}
 
     def test_opens_no_port(self, window):
         ports: list[list[str]] = []

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from campaigning import campaign_settings, resume_campaign, run_campaign
+from campaigning import campaign_settings, run_campaign
 from conftest import some
 from typer.testing import CliRunner
 
@@ -18,7 +18,6 @@ from merge_sumo.campaigns.repeats import (
     Repeat,
     chosen_again,
     read_repeats,
-    spread_places,
     unrepeatable,
 )
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
@@ -88,48 +87,6 @@ def test_a_class_without_reset_drives_as_one_with_it(vut, tmp_path):
         assert len(repeats) == 8
         assert all(one.same for one in repeats)
     assert lines[0] == lines[1]
-
-
-def test_an_object_without_reset_is_closed_before_the_next_one_is_made(vut, tmp_path):
-    log = tmp_path / "log"
-    source = f"""
-class Vut:
-    def __init__(self):
-        self.note("made")
-    def close(self):
-        self.note("closed")
-    def note(self, what):
-        with open({str(log)!r}, "a") as file:
-            print(what, file=file)
-    def act(self, seen):
-        return 1.0
-"""
-    CliRunner().invoke(
-        cli.app, ["run", "--vut", vut(source), "--x", "-300", "--v", "30"], catch_exceptions=False
-    )
-    assert log.read_text().split() == ["made", "closed"]
-    log.unlink()
-    campaign(vut(source), tmp_path / "run", cases=8)
-    noted = log.read_text().split()
-    assert noted.count("made") == noted.count("closed") > 8
-
-
-def test_a_constructor_that_takes_too_long_says_what_would_help(vut, tmp_path):
-    source = """
-import time
-class Vut:
-    made = 0
-    def __init__(self):
-        Vut.made += 1
-        time.sleep(30.0 if Vut.made > 32 else 0.0)
-    def act(self, seen):
-        return 1.0
-"""
-    run = campaign(vut(source), tmp_path / "run", cases=33, deadline_s=0.3)
-    errors = {o.measures.error for o in run.outcomes if o.measures.end is End.VUT_ERROR}
-    assert errors == {
-        "made anew for this episode, as it has no `reset`: took longer than the deadline of 0.3 s"
-    }
 
 
 @pytest.mark.filterwarnings("ignore:.*drives:UserWarning")
@@ -208,18 +165,6 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
     assert "the POV draws random numbers" in str(unrepeatable(repeats))
 
 
-def test_an_error_of_the_second_time_says_nothing(vut, tmp_path):
-    source = """
-EPISODES = []
-def Vut(seen):
-    EPISODES.append(None) if seen.t_s == 0.0 else None
-    return 1.0 if len(EPISODES) <= 60 else None
-"""
-    run = campaign(vut(source), tmp_path / "run")
-    assert not any(outcome.measures.end.is_error for outcome in run.outcomes)
-    assert read_repeats(run) == []
-
-
 def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
     settings = campaign_settings(vut="traci")
     assert chosen_again(run.outcomes, settings) == []
@@ -231,31 +176,6 @@ def test_drivers_of_the_package_run_once(run, tmp_path):
     assert read_repeats(run) == []
     assert not (run.folder / REPEATS).exists()
     assert chosen_again(run.outcomes, campaign_settings(vut="design1")) == []
-
-
-def test_a_campaign_that_went_on_says_the_same_as_one_that_never_stopped(vut, tmp_path):
-    spec = vut(WITH_RESET)
-    whole = campaign(spec, tmp_path / "whole", cases=40, batch=10)
-    folder = tmp_path / "run"
-    campaign(spec, folder, cases=20, batch=10)
-    resume_campaign(folder, given={"cases": 40})
-    assert (folder / REPEATS).read_bytes() == (whole.folder / REPEATS).read_bytes()
-
-
-@pytest.mark.parametrize(
-    ("cases", "count", "places"),
-    [(1, 1, [0]), (2, 1, [0]), (8, 1, [0]), (10, 4, [9, 2, 1, 0]), (3, 3, [2, 1, 0]), (0, 0, [])],
-)
-def test_the_first_cases_run_again_and_others_of_the_whole_campaign(cases, count, places):
-    assert spread_places(cases, count) == places
-
-
-@pytest.mark.parametrize("cases", [7, 40, 160, 1000])
-def test_no_case_runs_three_times(cases):
-    places = spread_places(cases, min(20, -(-cases // 8)))
-    assert len(set(places)) == len(places)
-    assert places == sorted(places, reverse=True)
-    assert set(places) <= set(range(cases))
 
 
 HONEST = Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=True).to_record()

@@ -7,7 +7,6 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -100,16 +99,6 @@ def test_every_case_runs_as_often_as_stated_however_batches_are_cut(sizes):
     assert set(draws.values()) == {3}
     assert len({outcome.case for outcome in outcomes}) == 27
     assert sampler.batch_size() % 3 == 0
-
-
-def test_what_was_skipped_counts_as_what_was_told():
-    """Cases of a sampler that learns nothing are sent before their outcomes are known."""
-    told, skipped = (EachCaseRepeated(make_sampler("uniform", POOL, 1), 3) for _ in range(2))
-    for batch in range(3):
-        cases = told.ask(5)
-        assert skipped.ask(5) == cases
-        told.tell([play_case(5 * batch + place, batch, case) for place, case in enumerate(cases)])
-        skipped.skip(cases)
 
 
 def test_a_deterministic_vut_costs_few_repeats():
@@ -250,12 +239,3 @@ def test_the_package_s_own_vuts_repeat_nothing_without_noise():
     noisy = replace(US23, sense=Sensing(noise_x_m=1.0))
     settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=noisy)
     assert isinstance(settings.with_repeats(sampler), RepeatedWhereItMatters)
-
-
-def test_what_is_said_of_merges_counts_cases(tmp_path):
-    how: dict[str, Any] = {"scenario": "us23-lane", "level": 0, "cases": 12, "repeat": 3}
-    run = api.campaign("gap", out=tmp_path / "run", **how)
-    assert len(run.cases) == 12
-    assert run.summary.cases == 4
-    assert run.merging.cases == 4
-    assert "of 4 where it ends" in run.merging.sentence

@@ -20,7 +20,6 @@ from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 from processes import wait_for
 
-from merge_sumo.campaigns.campaign import SCENARIOS
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import (
     CHECKSUM,
@@ -31,7 +30,6 @@ from merge_sumo.campaigns.store import (
     Run,
     read_settings,
 )
-from merge_sumo.engine.plan import differences
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import folders, interrupt
@@ -132,41 +130,6 @@ class TestResuming:
             resume_campaign(folder)
         assert contents(folder) == before
 
-    def test_with_more_cases_is_as_one_that_had_them_from_the_start(self, tmp_path, whole):
-        folder = run_campaign(settings("coverage", cases=2 * BATCH), tmp_path / "grown").folder
-        run = resume_campaign(folder, given={"cases": 28})
-        run_campaign(settings("coverage"), tmp_path / "at once")
-        assert outcomes(folder) == outcomes(tmp_path / "at once")
-        assert run.settings["cases"] == 28
-        assert "forced" not in run.settings
-        once = read_settings(tmp_path / "at once")
-        assert differences(once, run.settings) == {}
-
-    def test_tells_what_ran_before_apart(self, folder):
-        before: list = []
-        after: list = []
-        resume_campaign(folder, on_case=after.append, on_before=before.append)
-        assert [len(before), len(after)] == [2 * BATCH, 28 - 2 * BATCH]
-
-    def test_of_a_finished_campaign_changes_nothing(self, whole):
-        before = contents(whole)
-        assert len(resume_campaign(whole).outcomes) == 28
-        assert contents(whole) == before
-
-    def test_exports_failures_that_are_not_there_yet(self, run, tmp_path):
-        folder = Path(shutil.copytree(run.folder, tmp_path / "run"))
-        first, *_ = sorted((folder / SCENARIOS).iterdir())
-        shutil.rmtree(first)
-        resume_campaign(folder)
-        names = {path.relative_to(folder) for path in folder.rglob("*")}
-        assert names >= {path.relative_to(run.folder) for path in run.folder.rglob("*")}
-
-    def test_of_no_campaign_is_refused(self, tmp_path):
-        for name in ("nowhere", "."):
-            with pytest.raises(UserError, match="not a campaign"):
-                resume_campaign(tmp_path / name)
-        assert list(tmp_path.iterdir()) == []
-
 
 class TestWhatDiffers:
     @pytest.mark.parametrize(
@@ -208,15 +171,6 @@ class TestWhatDiffers:
         assert len(run.outcomes) == 36
         assert outcomes(longer).startswith(outcomes(whole))
         assert [outcome.batch for outcome in run.outcomes][-9:] == [3] + [4] * 8
-
-    def test_is_nothing_where_what_is_given_is_what_was_recorded(self, whole, folder):
-        resume_campaign(folder, given={"seed": 2, "levels": (0,)})
-        assert outcomes(folder) == outcomes(whole)
-
-    def test_by_hand(self):
-        was = {"a": 1, "b": {"x": 1, "y": 2}, "levels": [0, 1], "gone": 0}
-        now = {"a": 1, "b": {"x": 1, "y": 3}, "levels": (0, 1), "new": 5}
-        assert differences(was, now) == {"b.y": (2, 3), "gone": (0, None), "new": (None, 5)}
 
 
 def edit(folder: Path, where: tuple[str, ...], value) -> None:

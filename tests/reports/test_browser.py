@@ -24,14 +24,10 @@ from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.store import Run, failures, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
-from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.comparison import compare
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.scenario import POV, US23
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
@@ -57,7 +53,6 @@ def made(tmp_path_factory) -> Run:
     return run
 
 
-FIELDS = {notation.name: field for field, notation in US23.notation.items()}
 INSIDE = """() => views.filter((view) => view.moving).flatMap(({ svg, cars }) => {
     const all = svg.getBoundingClientRect();
     return Object.values(cars).map(({ group }) => {
@@ -110,55 +105,6 @@ def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options
         assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
         width = page.evaluate("document.documentElement.scrollWidth")
         assert width <= page.viewport_size["width"]
-
-
-@LOOKS
-def test_pages_without_a_script_open_without_a_complaint_and_fit_the_window(
-    browser, made, tmp_path, options
-):
-    other = write_run(tmp_path / "other", 20, vut=EVIL, error=EVIL)
-    file = tmp_path / "compared.html"
-    compared = comparison_page(compare([made, other]), [made, other])
-    file.write_bytes(compared.encode(errors="backslashreplace"))
-    running = tmp_path / "running.html"
-    running.write_text(report.report_page(other, learns=False, running=True), encoding="utf-8")
-    for page_file in (file, running):
-        with shown(browser, page_file, **options) as page:
-            assert EVIL in page.inner_text("h1")
-            for details in page.locator("details").all()[:3]:
-                details.locator("summary").click()
-                assert details.locator("svg").first.is_visible()
-            width = page.evaluate("document.documentElement.scrollWidth")
-            assert width <= page.viewport_size["width"]
-
-
-def test_marks_filters_and_table_know_the_four_words(browser, made):
-    classed = {
-        word: sorted(o.index for o in made.outcomes if o.measures.severity == word)
-        for word in ("contact", "conflict", "harsh", "safe")
-    }
-    assert sum(map(bool, classed.values())) >= 3
-    with shown(browser, made.folder / report.REPORT) as page:
-        for word, indices in classed.items():
-            marks = page.locator(f".map .mark.{word}")
-            drawn = marks.evaluate_all("all => all.map((m) => m.dataset.case)")
-            assert sorted(map(int, drawn)) == indices
-            chip = page.locator(f".legend [data-filter=severity][data-value={word}]")
-            assert chip.inner_text().strip() == word
-            if indices:
-                chip.click()
-                assert page.evaluate("location.hash").endswith(f"severity={word}")
-                assert bright(page) == all_rows(page) == indices
-                assert set(column(page, "severity")) == {word}
-                chip.click()
-        fails = page.locator(".map .mark.fail").evaluate_all(
-            "all => all.map((m) => m.dataset.case)"
-        )
-        assert sorted(map(int, fails)) == sorted(o.index for o in failures(made.outcomes))
-        page.locator("#table th button", has_text="severity").click()
-        words = [word for word in column(page, "severity") if word]
-        order = list(classed)
-        assert words == sorted(words, key=order.index), "the most severe first"
 
 
 def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
@@ -261,22 +207,6 @@ def test_a_click_on_a_mark_shows_its_case_and_the_mark_without_scrolling(browser
         assert not in_sight(page, "#case-title")
 
 
-@WINDOWS
-def test_a_link_opens_its_case(browser, made, size):
-    viewport = {"width": size[0], "height": size[1]}
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        for index in (111, 7):
-            page.evaluate(f"location.hash = '#case-{index}'")
-            page.locator(f"#case-link[href='#case-{index}']").wait_for()
-            assert chosen(page) == index
-            assert in_sight(page, "#case-title")
-        page.reload()
-        assert chosen(page) == 7
-        assert in_sight(page, "#case-title")
-        page.evaluate("location.hash = '#case-99999'")
-        assert chosen(page) == 7
-
-
 def rows(page) -> list[int]:
     """Return the cases of the table of all cases, from top to bottom."""
     return [int(text) for text in page.locator("#table td button").all_inner_texts()]
@@ -286,33 +216,6 @@ def column(page, name: str) -> list[str]:
     names = [text.strip() for text in page.locator("#table th").all_inner_texts()]
     cells = page.locator(f"#table td:nth-child({names.index(name) + 1})")
     return cells.all_inner_texts()
-
-
-@WINDOWS
-def test_all_cases_sort_and_open(browser, made, size):
-    viewport = {"width": size[0], "height": size[1]}
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        worst = sorted((round(o.score, 1), o.index) for o in failures(made.outcomes))
-        assert rows(page)[: len(worst)] == [index for _, index in worst]
-        assert len(rows(page)) == 100
-        page.locator("#more").click()
-        assert sorted(rows(page)) == [o.index for o in made.outcomes]
-        by_gap = page.locator("#table th button", has_text="Δx at M")
-        for way, order in (("ascending", 1), ("descending", -1)):
-            by_gap.click()
-            assert page.locator(f"#table th[aria-sort={way}]").inner_text().startswith("Δx at M")
-            told = [o for o in made.outcomes if o.measures.dx_m is not None]
-            told.sort(key=lambda o: (order * round(o.measures.dx_m, 4), o.index))
-            assert rows(page) == [o.index for o in told[:100]]
-        row = page.locator("#table tbody tr").nth(5)
-        row.click()
-        assert chosen(page) == rows(page)[5]
-        assert in_sight(page, "#case-title")
-        assert in_sight(page, "#table tr.on td:first-child")
-        row.locator("button").focus()
-        page.keyboard.press("ArrowDown")
-        assert chosen(page) == rows(page)[6]
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
 
 
 def bright(page) -> list[int]:
@@ -442,63 +345,6 @@ def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formul
         assert [int(row["case"]) for row in table] == rows(page)
 
 
-def placed(page, view: str, who: str) -> tuple[float, float]:
-    """Return where a car is drawn, in metres."""
-    moved = page.locator(f"#{view} g:has(> rect.{who})").get_attribute("transform")
-    found = re.match(r"translate\((\S+) (\S+)\)", moved)
-    assert found is not None
-    x, y = found.groups()
-    return float(x), float(y)
-
-
-@pytest.mark.slow
-@BOTH
-def test_two_top_views_move_together_and_show_the_same_stretch_of_road(browser, tmp_path, size):
-    run = write_run(tmp_path / "run", 20, error=None, timeouts=(0,))
-    report.write_report(run)
-    first, second = failures(run.outcomes)[0].index, 0
-    rows = {index: len(run.trajectory(index).motion) for index in (first, second)}
-    last = rows[second] - 1
-    assert rows[first] < last
-    with shown(
-        browser, run.folder / report.REPORT, viewport={"width": size[0], "height": size[1]}
-    ) as page:
-        page.evaluate(f"openCase(place.get({first}))")
-        page.locator("#keep").click()
-        page.evaluate(f"openCase(place.get({second}))")
-        for part in ("#case-title", "#road", "#road-beside", "#play", "#time"):
-            assert in_sight(page, part), part
-        own, other = (page.locator(part).bounding_box() for part in ("#road", "#road-beside"))
-        side_by_side = own["y"] == other["y"] and own["x"] + own["width"] < other["x"]
-        one_below_the_other = own["x"] == other["x"] and own["y"] + own["height"] < other["y"]
-        assert (side_by_side, one_below_the_other) == (size[0] > 1000, size[0] < 1000)
-        assert (own["width"], own["height"]) == (other["width"], other["height"])
-        slider = page.locator("#time")
-        assert slider.get_attribute("max") == str(last)
-        for step in (0, 30, last):
-            slider.fill(str(step))
-            road, other_road = page.locator("#road"), page.locator("#road-beside")
-            assert road.get_attribute("viewBox") == other_road.get_attribute("viewBox")
-            assert page.evaluate(INSIDE) == [True] * 4
-            for view, index in (("view", second), ("view-beside", first)):
-                motion = run.trajectory(index).motion[min(step, rows[index] - 1)]
-                assert placed(page, view, "pov")[0] == pytest.approx(motion[POV, 0], abs=0.1)
-        slider.fill(str(last - 1))
-        assert page.inner_text("#view figcaption") == f"Case {second}"
-        ended = f"Case {first}, ended at {(rows[first] - 1) / 10:.1f} s"
-        assert page.inner_text("#view-beside figcaption") == ended
-        slider.fill("0")
-        page.locator("#play").click()
-        for _ in range(600):
-            if int(page.input_value("#time")) > 3:
-                break
-            page.wait_for_timeout(50)
-        page.locator("#play").click()
-        assert 3 < int(page.input_value("#time")) < last
-        assert placed(page, "view", "vut") == placed(page, "view-beside", "vut")
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-
-
 def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(browser, tmp_path):
     run = write_run(
         tmp_path / "run", 20, errors={4: "boom", 9: EVIL, 11: "boom"}, timeouts=(0, 3, 6)
@@ -525,15 +371,6 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
 
 
-def test_a_campaign_without_cases_opens_too(browser, made, tmp_path):
-    folder = tmp_path / "run"
-    shutil.copytree(made.folder, folder)
-    (folder / "outcomes.jsonl").write_bytes(b"")
-    report.write_report(Run(folder))
-    with shown(browser, folder / report.REPORT) as page:
-        assert page.inner_text("tr.all .num:nth-child(2)") == "0"
-
-
 @pytest.mark.parametrize("name", some([None, "curved", "left turn"], None, "left turn"))
 def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
     if name is not None:
@@ -544,30 +381,6 @@ def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch
         for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):
             page.evaluate(f"at({step})")
             assert page.evaluate(INSIDE) == [True, True]
-
-
-@pytest.fixture(scope="module")
-def in_traffic(tmp_path_factory) -> Run:
-    folder = tmp_path_factory.mktemp("traffic") / "run"
-    run = write_run(folder, per_level=40, error=None, scenario=named_scenario("us23-traffic"))
-    report.write_report(run)
-    return run
-
-
-def test_all_cars_are_drawn_and_say_which_one_the_vut_meets(browser, in_traffic):
-    index = next(o.index for o in in_traffic.outcomes if o.measures.nearest == "behind")
-    with shown(browser, in_traffic.folder / report.REPORT, **NARROW) as page:
-        assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["viewport"]["width"]
-        page.evaluate(f"show(place.get({index}))")
-        inside = page.evaluate(INSIDE)
-        assert inside == [True] * 4
-        labels = page.locator("#road text").all_text_contents()
-        assert [label.split()[0] for label in labels] == ["POV", "VUT", "ahead", "behind"]
-        for chart in ("speed", "position"):
-            assert page.locator(f"#chart-{chart} .line").count() == 4
-        assert page.locator("#chart-gap .line.behind").count() == 1
-        assert "headway behind" in page.inner_text("#case-title")
-        assert "car behind" in page.inner_text("#case-words")
 
 
 def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):

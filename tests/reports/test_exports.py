@@ -117,15 +117,6 @@ class TestAFreeVut:
             read = xosc.ParseOpenScenario(str(free))
         assert {car.name for car in read.entities.scenario_objects} == {"pov", "vut"}
 
-    def test_starts_where_it_started_and_then_nobody_tells_it_where_to_go(self, scenario, free):
-        recorded, tree = etree.parse(scenario), etree.parse(free)
-        start = ".//Private[@entityRef='vut']/PrivateAction"
-        for path in (f"{start}/TeleportAction", f"{start}/LongitudinalAction"):
-            (here,), (there,) = recorded.findall(path), tree.findall(path)
-            assert etree.tostring(here) == etree.tostring(there)
-        assert {e.get("entityRef") for e in tree.iterfind(".//Story//EntityRef")} == {"pov"}
-        assert vertices(tree, "vut") == []
-
     def test_has_the_controller_that_a_parameter_names(self, free):
         tree = etree.parse(free)
         (assigned,) = tree.findall(".//Private[@entityRef='vut']//AssignControllerAction")
@@ -133,16 +124,6 @@ class TestAFreeVut:
         assert assigned.find("Controller").get("name") == "$EgoController"
         (declared,) = tree.findall("ParameterDeclarations/ParameterDeclaration")
         assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
-
-    def test_meets_a_pov_that_does_what_it_did_and_then_keeps_its_speed(self, made, scenario, free):
-        trajectory = made.trajectory(failures(made.outcomes)[0].index)
-        tree = etree.parse(free)
-        assert vertices(tree, "pov") == vertices(etree.parse(scenario), "pov")
-        after = tree.find(".//Event[@name='pov afterwards']")
-        assert float(after.find(".//SimulationTimeCondition").get("value")) == trajectory.t_end_s
-        assert float(after.find(".//AbsoluteTargetSpeed").get("value")) == trajectory.v_pov_mps[-1]
-        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
-        assert float(stop.get("value")) == US23.timeout_s
 
     def test_meets_all_cars_of_the_traffic(self, tmp_path):
         run = write_run(
@@ -271,19 +252,6 @@ class TestATable:
 
 
 class TestTheCommand:
-    def test_writes_all_cases_as_a_table_when_none_is_named(self, made, tmp_path):
-        said = invoke("export", made.folder, "--format", "csv", "--out", tmp_path)
-        assert said.exit_code == 0, said.output
-        assert said.stdout == f"{tmp_path / 'trajectories.csv'}\n"
-        with (tmp_path / "trajectories.csv").open() as file:
-            assert len({line.split(",")[0] for line in file}) == len(made.outcomes) + 1
-
-    def test_writes_a_folder_for_each_openscenario(self, made, tmp_path):
-        said = invoke("export", made.folder, 1, 2, "--format", "openscenario", "--out", tmp_path)
-        assert said.exit_code == 0, said.output
-        names = ("case-00001", "case-00002")
-        assert said.stdout.split() == [str(tmp_path / n / f"{n}.xosc") for n in names]
-
     @pytest.mark.parametrize("file_format", ["sumo", "openscenario"])
     def test_asks_for_cases_where_it_needs_them(self, made, file_format):
         said = invoke("export", made.folder, "--format", file_format)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
-from matplotlib.text import Annotation
 from PIL import Image
 
 from merge_sumo.errors import UserError
@@ -57,13 +56,6 @@ class TestTheCurves:
         assert {text.get_text() for text in axes.texts} == names
         assert len(axes.collections) == 2, "a band for each sampler"
 
-    def test_name_lines_that_end_together_apart(self):
-        figure = curves(together=True)
-        heights = sorted(
-            text.xyann[1] for text in figure.axes[0].texts if isinstance(text, Annotation)
-        )
-        assert min(np.diff(heights)) > 0.0
-
 
 class TestTheMaps:
     def test_show_cases_in_the_units_of_the_pool_and_the_balls_that_fmc_counts(self):
@@ -82,17 +74,6 @@ class TestTheMaps:
         for dims, level in ((2, 1), (3, 2)):
             safe = Panel(np.full((3, dims), 0.5), np.zeros(3, dtype=bool), 0.0)
             figures.save(figures.maps("t", {"gpr": safe}, level), tmp_path / f"{level}.png")
-
-
-def test_surfaces_show_a_panel_per_batch_on_one_scale(tmp_path):
-    predicted = np.linspace(-900.0, 50.0, 25).reshape(5, 5)
-    shown = {batch: PredictedScores(predicted, panel(20, 2)) for batch in (1, 4)}
-    figure = figures.predicted_scores("t", shown, 1, np.array([[0.2, 0.2]]))
-    assert [axes.get_title("left") for axes in figure.axes[:2]] == [
-        "after batch 1: 20 cases",
-        "after batch 4: 20 cases",
-    ]
-    figures.save(figure, tmp_path / "surface.png")
 
 
 @pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])

@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 from handmade import write_run
-from lxml import etree
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 from test_report import data_of, text_of
 
@@ -156,55 +155,3 @@ class TestMerging:
         stood = [f.value for f in run.facts if f.name == "cases that stood on the lane"]
         assert sum(map(int, stood)) == 2
         assert sum("of the lane in the median" in line for line in run.lines()) == 1
-
-
-@pytest.mark.slow
-class TestThePictures:
-    def test_have_the_vut_on_the_lane_until_it_merges(self, browser, made):  # noqa: F811
-        index = next(o.index for o in made.outcomes if o.measures.end is End.MERGED)
-        rows = len(made.trajectory(index).motion)
-        with shown(browser, write_report(made)) as page:
-            page.evaluate(f"() => show(place.get({index}))")
-            before, after = page.evaluate(
-                f"() => [{rows - 2}, {rows - 1}].map((t) => views[0].places(t)[VUT])"
-            )
-            band, dot = (
-                page.locator(f"#chart-position {mark}").bounding_box()
-                for mark in ("rect.window", "circle.merged")
-            )
-            assert page.locator("#road path.window").count() == 1
-            assert page.locator("#road line.merge").count() == 1
-        assert abs(before["y"]) == pytest.approx(3.2, abs=0.01)
-        assert after["y"] == pytest.approx(0.0, abs=0.01)
-        middle = dot["y"] + dot["height"] / 2
-        assert band["y"] < middle < band["y"] + band["height"]
-
-    def test_have_no_lane_without_one(self, browser, tmp_path):  # noqa: F811
-        run = write_run(tmp_path / "run", per_level=10)
-        with shown(browser, write_report(run)) as page:
-            assert page.locator(".window, .merged").count() == 0
-            line = page.locator("#road line.merge")
-            ends = [line.get_attribute(name) for name in ("x1", "x2", "y1", "y2")]
-        assert ends == ["0", "0", "-5.4", "2.4"]
-
-
-@pytest.mark.slow
-def test_new_measures_decide_gates_and_junit(call, tmp_path):
-    rule = "time_gap_behind_s < 0.5"
-    asked = ("--scenario", "us23-lane", "--seed", 0, "--cases", 20, "--level", 0, "-q")
-    for name in ("level0", "design2"):
-        out = ("--out", tmp_path / name, "--junit", tmp_path / f"{name}.xml")
-        code, said, _ = call(
-            "campaign", "--vut", name, *asked, *out, "--fail-when", rule, "--gate", "failures"
-        )
-        run = Run(tmp_path / name)
-        gaps = [o.measures.time_gap_behind_s for o in run.outcomes]
-        failing = [o.index for o in run.outcomes if o.failed]
-        assert failing == [i for i, gap in enumerate(gaps) if gap is not None and gap < 0.5]
-        assert code == bool(failing)
-        assert "0 of 20 where it ends" in said
-        suites = etree.parse(tmp_path / f"{name}.xml").getroot()
-        (level,) = suites.findall("testsuite[@name='POV level 0']")
-        wrong = [failure.get("message") for failure in level.iter("failure")]
-        assert len(wrong) == len(failing)
-        assert all(re.search(r"merges after 3[56]% of the lane", message) for message in wrong)

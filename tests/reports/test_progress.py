@@ -18,7 +18,6 @@ from merge_sumo.reports import report
 from merge_sumo.reports.progress import (
     Bars,
     CampaignBars,
-    Counter,
     is_watched,
     rate_text,
 )
@@ -28,8 +27,6 @@ from merge_sumo.reports.report import (
     MOST_SHARE,
     REPORT,
     RunningReport,
-    report_page,
-    write_report,
 )
 
 
@@ -125,23 +122,6 @@ class TestARate:
             bars.case_ended(outcome)
         assert out.getvalue().endswith("  27 cases/min  0:06:00 left\n"), "of the first 18"
 
-    def test_leaves_out_what_ran_before(self, run, tmp_path, clock):
-        bars, out = bars_for(tmp_path)
-        for outcome in run.outcomes[:100]:
-            bars.ran_before(outcome)
-        clock[0] += 10.0
-        for outcome in run.outcomes[100:120]:
-            bars.case_ended(outcome)
-            clock[0] += 0.01
-        assert "cases: 101/180" in out.getvalue()
-        assert "  6.0 cases/min  0:13:10 left" in out.getvalue()
-
-    def test_of_a_bar_counts_from_its_opening(self, clock, capsys):
-        with Counter("runs", 4, "runs") as counter:
-            clock[0] += 2.0
-            counter.ended(1)
-        assert capsys.readouterr().err == "runs: 1/4  30 runs/min  0:00:06 left\n"
-
     def test_on_a_terminal_says_what_time_it_leaves(self, clock):
         drawn = io.StringIO()
         with Bars(Console(file=drawn, force_terminal=True, width=100)) as bars:
@@ -190,12 +170,6 @@ class TestTheReportOfACampaignThatRuns:
         page = html.parse(run.folder / REPORT).getroot()
         assert page.xpath("//meta[@http-equiv='refresh']") == []
         assert f"merge-sumo campaign --resume '{run.folder}'" in page.text_content()
-
-    def test_is_replaced_by_the_last_one(self, own):
-        run, bars = own
-        bars.case_ended(run.outcomes[1])
-        write_report(run)
-        assert (run.folder / REPORT).read_text() == report_page(run)
 
     @pytest.mark.parametrize("what", ["a link", "somebody's page"])
     def test_is_left_away_where_something_else_is_in_its_place(self, own, clock, what, tmp_path):

@@ -16,21 +16,17 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.analysis.summary import summarise
-from merge_sumo.analysis.surface import Surface, learn_surface
+from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
-from merge_sumo.reports import report_data
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.player import SPEED_UNIT_MPS
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth
-from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import DT_S, US23, Scenario
-from merge_sumo.values.trajectory import REASON_CHARACTERS
 from merge_sumo.vuts.output import LINES, LOG
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
@@ -87,10 +83,6 @@ class TestThePage:
 
     def test_is_the_same_when_written_again(self, made, page):
         assert report_page(Run(made.folder)) == page
-
-    def test_is_the_same_where_workers_ask_the_surrogates(self, made, page):
-        with Workers(InProcess, 2) as workers:
-            assert report_page(made, workers=workers) == page
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
         run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
@@ -191,11 +183,6 @@ class TestWhatWasNotTested:
         assert len(others) > 10
         assert others & {0, 1, 2, 3, 4, 6, 9} == set()
 
-    def test_has_no_message_of_megabytes(self, tmp_path):
-        page = report_page(write_run(tmp_path / "run", 10, errors={0: "x" * 10**7}))
-        assert len(page) < 1e6
-        assert data_of(page)["errors"]["0"] == "x" * REASON_CHARACTERS
-
     def test_ends_with_what_the_controller_printed_last(self, tmp_path):
         run = write_run(tmp_path / "run", 10, error=None)
         assert "Printed by the controller" not in text_of(report_page(run))
@@ -245,15 +232,6 @@ class TestALongCampaign:
         shown = set(data["cases"]["index"])
         assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
 
-    def test_is_drawn_in_groups_of_batches(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(report_data, "MOST_STEPS", 4)
-        run = write_run(tmp_path / "run", per_level=60)
-        search = data_of(report_page(run))["search"]
-        assert search["batch"] == [0, 3, 6]
-        for level in search["levels"]:
-            found = summarise(run.outcomes, (level["level"],)).levels[level["level"]]
-            assert level["fmc"][-1] == pytest.approx(found.fmc, abs=1e-5)
-
 
 class TestTheTruth:
     @pytest.fixture
@@ -298,10 +276,6 @@ class TestTheSurrogate:
             assert chance[failed].min() > np.median(chance[~failed])
             assert chance[failed].mean() > 0.5
             assert chance[~failed].mean() < 0.1
-
-    def test_finds_no_more_than_the_pool_plausible(self):
-        everywhere = Surface(np.array([[0.5, 0.5]]), lambda sets: [np.ones(len(s)) for s in sets])
-        assert everywhere.plausible_fmc() == 1.0
 
     def test_is_not_made_of_too_few_failures(self, made):
         few = [o for o in made.outcomes if not o.failed] + failures(made.outcomes)[:4]

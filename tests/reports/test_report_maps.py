@@ -14,8 +14,6 @@ from handmade import write_run
 
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.reports.report_maps import PAIR_NODES, explained, maps_of, pairs_of
-from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.report_sections import SECTIONS, shared_words
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import MergeCase
@@ -134,44 +132,6 @@ class TestAMap:
             counted = sum(grid["counts"]["safe"]), sum(grid["counts"]["failing"])
             failing = sum(o.failed for o in run.outcomes)
             assert counted == (20 - failing, failing)
-
-
-class TestWords:
-    @pytest.fixture(scope="class")
-    @classmethod
-    def words(cls, tmp_path_factory):
-        folder = tmp_path_factory.mktemp("traffic") / "run"
-        model = ReportModel(write_run(folder, 40, error=None, scenario=TRAFFIC))
-        facts, words = (SECTIONS[name].words(model) for name in ("facts", "words"))
-        return {**shared_words(model), **facts, **words}
-
-    def test_name_the_pairs_and_what_they_explain(self, words):
-        zero, _, two = words["levels"]
-        assert len(zero["pairs"]) == 6
-        assert len(two["pairs"]) == 10
-        name, _, share = zero["pairs"][0].partition(": ")
-        assert " × " in name
-        assert share.endswith("%")
-        assert len(zero["axes"]) != 3
-
-    def test_say_how_large_a_ball_is_where_it_is_not_the_papers(self, words):
-        assert [(d, round(r, 2)) for d, r in words["radii"]] == [(4, 0.12), (5, 0.2)]
-
-    def test_speak_of_headways_and_of_when_the_other_cars_are_due(self, words):
-        features = " ".join(words["sentences"])
-        assert "due at M" in features
-        assert [c.name for c in words["coordinates"]] == [
-            *("x_POV0", "v_POV0", "headway ahead", "headway behind", "psi")
-        ]
-
-    def test_have_a_slider_for_a_third_coordinate(self, tmp_path):
-        run = write_run(tmp_path / "run", 10, levels=(0, 2), error=None, scenario=RANGED)
-        zero, two = shared_words(ReportModel(run))["levels"]
-        third = zero["axes"][2]
-        shown = (third.name, third.dimension.low, third.dimension.high)
-        assert (len(zero["axes"]), shown) == (3, ("v_VUT0", 14.0, 22.0))
-        assert len(two["axes"]) != 3
-        assert len(two["pairs"]) == 6
 
 
 def test_a_case_is_described_by_its_coordinates():

@@ -14,7 +14,6 @@ import pytest
 from campaigning import run_campaign
 from plans import plan_for
 
-from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.campaigns.store import Run, failures
@@ -24,7 +23,6 @@ from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator, run_cases
 from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.errors import UserError
-from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.counterfactuals import (
     AVOIDANCE,
@@ -249,32 +247,6 @@ class TestTheFile:
         path.write_text("\n".join(lines) + "\n")
         with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
             read_avoidance(Run(folder))
-
-    def test_has_no_failure_twice(self, folder, found):
-        write_avoidance(folder, [found[0], found[0]])
-        with pytest.raises(UserError, match="line 2"):
-            read_avoidance(Run(folder))
-
-
-class TestItIsShown:
-    def test_in_the_report_with_a_filter(self, folder, found):
-        assert "avoided-by" not in report_page(Run(folder)).split("<script")[0]
-        write_avoidance(folder, found)
-        page = report_page(Run(folder))
-        known = {f.name: f.value for f in CampaignRun(folder).facts}
-        assert known["failures that driver careful avoids"] == sum(
-            "careful" in one.avoided_by for one in found
-        )
-        assert '<option value="careful">avoided by careful</option>' in page
-        assert "no claim of compliance follows" in page
-
-    def test_by_campaign(self, command_line, tmp_path):
-        plan = ("campaign", "--vut", "design1", "--level", 0, "--cases", 40)
-        code, out, err = command_line(*plan, "--seed", 1, "--out", tmp_path / "a", "-q")
-        assert code == 0, err
-        kept = read_avoidance(Run(tmp_path / "a")).values()
-        careful = sum("careful" in one.avoided_by for one in kept)
-        assert f"  failures that driver careful avoids: {careful}" in out
 
 
 ESCAPES = """

@@ -151,22 +151,9 @@ class TestASide:
         assert self.find(axis, -1, lambda v: v < 3.3)[0] == 3.2
         assert self.find(axis, 1, lambda v: True)[0] == pytest.approx(value + 0.1, abs=0.0501)
 
-    def test_tries_both_ends_and_nothing_beyond(self):
-        axis = Axis("x", 1.0, 0.3, 2.3, step=0.7, digits=3)
-        for sign, end in ((-1, 0.3), (1, 2.3)):
-            found, asked = self.find(axis, sign, lambda v: False)
-            assert found is None
-            assert asked[-1] == end
-            assert all((v - 1.0) * sign > 0.0 and 0.3 <= v <= 2.3 for v in asked)
-        assert self.find(replaced_value(axis, 0.1), -1, lambda v: True) == (None, [])
-
     def test_misses_a_pass_between_two_values_of_its_grid(self):
         axis = Axis("x", 0.0, -10.0, 10.0, step=1.0, digits=1)
         assert self.find(axis, 1, lambda v: 2.2 < v < 2.8 or v > 5.05)[0] == 5.1
-
-
-def replaced_value(axis: Axis, value: float) -> Axis:
-    return Axis(axis.name, value, axis.low, axis.high, axis.step, axis.digits)
 
 
 class TestParameters:
@@ -245,20 +232,6 @@ def test_a_controller_that_is_another_now_or_decides_by_chance_is_refused(tmp_pa
 
 
 class TestTheFile:
-    @pytest.mark.slow
-    def test_is_the_same_wherever_its_cases_ran(self, made, folder):
-        first, second = (o.index for o in failures(made.cases)[:2])
-        (folder / EXPLANATIONS).unlink()
-        ms.explain(folder, second, workers=2)
-        ms.explain(folder, first)
-        together = (folder / EXPLANATIONS).read_bytes()
-        assert set(read_explanations(Run(folder))) == {first, second}
-        (folder / EXPLANATIONS).unlink()
-        ms.explain(folder, first)
-        assert (folder / EXPLANATIONS).read_bytes() == (made.folder / EXPLANATIONS).read_bytes()
-        ms.explain(folder, second)
-        assert (folder / EXPLANATIONS).read_bytes() == together
-
     @pytest.mark.parametrize(
         "changes",
         [

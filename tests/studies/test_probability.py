@@ -10,7 +10,7 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from scipy.stats import kstest, norm, truncnorm
 
-from merge_sumo.analysis.exposure import Histogram, Normal, read_distribution
+from merge_sumo.analysis.exposure import Normal, read_distribution
 from merge_sumo.analysis.traffic import FOLDER, Traffic, named_traffic, shipped_traffics
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import settings_of
@@ -28,7 +28,7 @@ from merge_sumo.studies.probability import (
     probability_of,
 )
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.values.case import V_POV0, dimensions
+from merge_sumo.values.case import dimensions
 from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)
@@ -185,13 +185,6 @@ class TestADistribution:
         assert not ((psi > 0.5) & (psi < 1.0)).any()
         assert psi.max() <= 1.5
 
-    def test_is_recorded_as_it_was_stated(self, tmp_path):
-        first = self.stated(tmp_path, {"v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 2}})
-        record = json.loads(json.dumps(first.record()))
-        again = self.stated(tmp_path, record)
-        assert again.record() == first.record()
-        assert record["v_pov0_mps"]["low"] == V_POV0.low
-
     @pytest.mark.parametrize(
         ("text", "says"),
         [
@@ -224,10 +217,6 @@ class TestADistribution:
         assert says in str(error.value)
         assert "\n" not in str(error.value)
 
-    def test_that_is_not_there_is_refused(self, tmp_path):
-        with pytest.raises(UserError, match="cannot read"):
-            read_distribution(tmp_path / "nowhere.json", LEVELS, scenario=US23)
-
 
 def traffic(**changes) -> Traffic:
     """A traffic of 8.7 cars per km with 27 +- 2.85 m/s."""
@@ -254,14 +243,6 @@ class TestATraffic:
         expected = 0.0087 * 160.0 * (norm.cdf(8.0 / 2.85) - norm.cdf(3.0 / 2.85))
         found = traffic().cars_in_pool(US23) * np.mean(v_mps > 30.0)
         assert found == pytest.approx(expected, rel=0.03)
-
-    def test_of_a_histogram_is_cut_at_the_pool(self):
-        """Of 20-30, 30-40 and 40-50 m/s half of the first two bins is in 25 to 35 m/s."""
-        speeds = Histogram(edges=(20.0, 30.0, 40.0, 50.0), weights=(4.0, 2.0, 2.0))
-        share, found = traffic(speeds=speeds).speeds_in_pool(US23)
-        assert share == pytest.approx(3.0 / 8.0)
-        v_mps = found.quantile(np.array([0.0, 1 / 3, 2 / 3, 1.0]))
-        assert v_mps == pytest.approx([25.0, 27.5, 30.0, 35.0])
 
     def test_that_is_shipped_has_the_published_figures_and_their_source(self):
         published = {"exid-2": (5.7, 23.3), "exid-3": (4.9, 21.5), "exid-5": (8.7, 25.1)}

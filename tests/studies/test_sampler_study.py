@@ -176,7 +176,6 @@ SMALL = truth_with((0.2, 0.2), (0.8, 0.8), failures=1)
 NONE = truth_with(failures=0)
 HALF = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
 MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
-FAR = searched([[(0.8, 0.2)]])
 
 
 def study_of(*searches: Search, truth: Truth = TWO, **more) -> SamplerStudy:
@@ -218,48 +217,6 @@ class TestASamplerByHand:
         for other, share in ((NONE, 0.5), (truth_with((0.2, 0.2)), 0.25)):
             found = SamplerStudy({"mine": [HALF]}, {0: SMALL, 1: other}, cases=3)
             assert found.samplers["mine"].covered_share.median == share
-
-
-class TestTheLinesOfAStudy:
-    def test_divide_by_no_truth_that_is_too_small(self):
-        found = study_of(HALF, truth=SMALL)
-        text = "\n".join(found.lines())
-        assert "at level 0 it is too small to be divided by: as many cases again could" in text
-        assert "too small for regions: 100% of the failures have no other one within 0.05" in text
-        assert "covered share: of 2 failing uniform cases" in text
-        assert "FMC / truth" not in text
-        record = found.to_record()
-        assert record["truth_too_small"]
-        assert record["truth_regions"] is None
-        assert record["samplers"]["mine"]["fmc_over_truth"]["median"] is None
-
-    def test_divide_by_a_large_one(self):
-        text = "\n".join(study_of(HALF).lines())
-        assert "too small" not in text
-        assert "FMC / truth" in text
-        assert "sampler s" in text
-        assert "sampler s" not in "\n".join(study_of(HALF).found(timed=False))
-
-
-class TestTheLimit:
-    def test_is_the_coverage_of_all_that_truth_and_searches_found(self):
-        found = np.array([[0.2, 0.2], [0.8, 0.8], [0.2, 0.24], [0.8, 0.2]])
-        assert study_of(HALF, FAR).limit_fmc == pytest.approx(fmc(found))
-
-    def test_is_that_of_a_dense_truth_where_it_is_more(self):
-        points = np.random.default_rng(0).random((50, 2))
-        dense = Truth(points, np.full(50, -600.0))
-        assert study_of(FAR, dense={0: dense}).limit_fmc == fmc(points)
-        poor = {0: truth_with((0.2, 0.2), failures=1)}
-        assert study_of(FAR, dense=poor).limit_fmc == study_of(FAR).limit_fmc
-
-    def test_is_never_passed_although_the_truth_is(self):
-        found = summary(searched([[(0.2, 0.2), (0.8, 0.2)]]), truth=truth_with((0.2, 0.2)))
-        assert found.fmc_over_truth.median == pytest.approx(2.0)
-        assert astuple(found.fmc_over_limit) == pytest.approx((1.0, 1.0, 1.0))
-
-    def test_of_nothing_has_no_share(self):
-        assert summary(searched([[]]), truth=NONE).fmc_over_limit.median is None
 
 
 def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import sysconfig
 import threading
 import time
 from dataclasses import replace
@@ -25,13 +24,10 @@ from merge_sumo.engine.evaluate import _lost_result, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import (
-    TRIED,
-    InProcess,
     LocalProcesses,
     Workers,
     dask_workers,
     open_workers,
-    when_worker_ends,
     workers_or_cores,
 )
 from merge_sumo.values.case import from_unit
@@ -49,13 +45,6 @@ def squares(items):
 
 def process_ids(items):
     return [os.getpid() for _ in items]
-
-
-def imported_beside(items):
-    """Have a process started that imports what lies in the working directory."""
-    command = [sys.executable, "-c", "import beside"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    return [done.stdout for _ in items]
 
 
 def refuse(items):
@@ -251,14 +240,6 @@ class TestWorkersThatBeginHere:
         assert sorted(found) == [0, 1, 2, 3]
         assert os.getpid() not in found.values()
 
-    def test_start_no_process_while_there_is_time(self):
-        with open_workers(2, here_s=60.0) as workers:
-            assert workers.chunk_size(20) == TRIED
-            found = dict(workers.run(process_ids, range(1000), no_loss))
-            assert set(found.values()) == {os.getpid()}
-            # All of them are known to take no time.
-            assert workers.chunk_size(20) == 20
-
     def test_stay_here_where_the_system_starts_no_more_threads(self, monkeypatch):
         def refuses(count):
             raise UserError("no more")
@@ -286,19 +267,6 @@ class TestACampaign:
         plan = replace(plan_for("design1", corridors=2), versions=other)
         with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
             open_simulators(plan, workers)
-
-
-def test_an_ending_is_called_once():
-    called = []
-
-    def ending() -> None:
-        called.append(1)
-
-    for _ in range(2):
-        when_worker_ends(ending)
-    InProcess().shutdown()
-    InProcess().shutdown()
-    assert called == [1]
 
 
 def test_no_workers_are_refused_in_a_sentence():
@@ -366,29 +334,3 @@ class TestADaskCluster:
             open_workers("tcp://127.0.0.1:1")
         with pytest.raises(UserError, match="no Dask scheduler at"):
             dask_workers("nonsense://")
-
-
-class TestFolderWhereAPersonIs:
-    """A folder that somebody sent is data, also where one works in it."""
-
-    SHADOWED = ("multiprocessing", "json", "numpy", "threadpoolctl", "merge_sumo")
-
-    @pytest.mark.slow
-    def test_brings_no_modules(self, tmp_path):
-        for name in self.SHADOWED:
-            (tmp_path / f"{name}.py").write_text("raise SystemExit('it was run')\n")
-        script = Path(sysconfig.get_path("scripts")) / "merge-sumo"
-        command = [str(script), "campaign", "--vut", "design2", "--level", "0", "--cases", "8"]
-        command += ["--sampler", "uniform", "--workers", "2", "--out", "run"]
-        ended = subprocess.run(command, check=False, cwd=tmp_path, capture_output=True, text=True)
-        assert ended.returncode == 0, ended.stderr
-        assert "it was run" not in ended.stdout + ended.stderr
-
-    @pytest.mark.slow
-    def test_is_searched_by_what_a_worker_starts(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        (tmp_path / "beside.py").write_text("print('mine')\n")
-        with open_workers(2) as workers:
-            found = dict(workers.run(imported_beside, [None, None], lambda _: None, chunk=1))
-        assert set(found.values()) == {"mine\n"}
-        assert "PYTHONSAFEPATH" not in os.environ

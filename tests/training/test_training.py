@@ -31,7 +31,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import QuickRegret, play, returns_of
-from merge_sumo.training.env import MergeGame, MergeVectorEnv, exploring_starts, pool_starts
+from merge_sumo.training.env import MergeGame, MergeVectorEnv, pool_starts
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
@@ -128,25 +128,6 @@ class TestEnvironments:
         finally:
             games.close()
 
-    @pytest.mark.parametrize("timeout_s", [30.0, 40.0])
-    def test_a_game_is_truncated_by_the_timeout_of_its_own_scenario(self, timeout_s):
-        scenario = dataclasses.replace(US23, timeout_s=timeout_s)
-        one = gymnasium.make(ENV_ID, role="vut", scenario=scenario)
-        several = gymnasium.make_vec(ENV_ID, num_envs=2, role="vut", scenario=scenario)
-        for games, brake in ((one, 0), (several, np.zeros(2, dtype=np.int64))):
-            try:
-                games.reset(seed=0)
-                truncated = [np.any(games.step(brake)[3]) for _ in range(round(2 * timeout_s))]
-                assert [bool(t) for t in truncated] == [False] * (len(truncated) - 1) + [True]
-            finally:
-                games.close()
-
-    def test_starts_of_half_the_size_are_half_of_the_paper_s(self):
-        for starts in (pool_starts, exploring_starts):
-            one = starts(500, np.random.default_rng(7), scenario=US23)
-            half = starts(500, np.random.default_rng(7), scenario=HALF)
-            assert half == pytest.approx(one / 2, rel=1e-12)
-
     @pytest.mark.parametrize(
         ("settings", "sentence"),
         [
@@ -159,16 +140,6 @@ class TestEnvironments:
     def test_settings_that_make_no_game_are_refused_in_a_sentence(self, settings, sentence):
         with pytest.raises(UserError, match=sentence):
             MergeVectorEnv(1, **settings)
-
-    @pytest.mark.long
-    def test_another_library_trains_on_it(self, env):
-        from stable_baselines3 import DQN
-
-        agent = DQN("MlpPolicy", env, learning_starts=50, seed=0, device="cpu")
-        before = [p.clone() for p in agent.policy.parameters()]
-        agent.learn(300)
-        changed = [not torch.equal(*p) for p in zip(before, agent.policy.parameters(), strict=True)]
-        assert any(changed)
 
 
 def test_the_tutorial_shows_the_code_that_its_commands_run():
@@ -323,14 +294,6 @@ class TestGame:
         assert returns[over] == pytest.approx(expected[over], abs=1e-9)
         assert over.any()
 
-    def test_playing_every_action_out_is_never_worse_than_the_policy(self, policy):
-        game = Game("pov", None, REWARD)
-        start, svo_rad = pool_starts(40, np.random.default_rng(3), scenario=US23), np.zeros(40)
-        before = game.play(start, svo_rad, policy)
-        after = game.play(start, svo_rad, game.improved(policy))
-        assert (after >= before - 1e-9).all()
-        assert after.mean() > before.mean() + 0.1
-
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
         agent = ddqn.export(ddqn.make_network(FEATURES, 16))
@@ -482,20 +445,3 @@ class TestTrainingForAnotherScenario:
     def test_a_check_without_the_scenario_says_what_is_missing(self, trained):
         done = invoke("train", "--check", "--out", trained[0], "--only", "pov1")
         assert "was trained for ring: say with --scenario" in str(done.exception)
-
-    def test_networks_of_two_scenarios_do_not_mix_in_a_folder(self, trained):
-        with pytest.raises(UserError, match=r"pov1 .* was trained for another scenario, ring"):
-            train_library(trained[0], ("vut2",), settings=SMALL, scenario=US23)
-        with pytest.raises(UserError, match="has a pov1 of another scenario"):
-            train_library(trained[0], ("pov1",), settings=SMALL, scenario=US23)
-
-    @pytest.mark.parametrize(
-        "record",
-        [7, {"x_vut0_m": "far"}, {"x_vut0_m": -40.0, "mainline": ["e"]}, {"a_min_mps2": 4.0}],
-    )
-    def test_a_manifest_with_no_such_scenario_is_refused(self, trained, tmp_path, record):
-        manifest = json.loads((trained[0] / MANIFEST).read_text())
-        manifest["networks"]["pov1"]["scenario"] = record
-        (tmp_path / MANIFEST).write_text(json.dumps(manifest))
-        with pytest.raises(UserError, match="is not a readable manifest of policies"):
-            read_manifest(tmp_path)

@@ -11,15 +11,10 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from hypothesis import given
 from hypothesis import strategies as st
-from plans import key_of, plan_for
 from test_score import CASE, ending
 
-from merge_sumo.campaigns.store import Run
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.truth import ground_truth
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion, vocabulary
@@ -169,9 +164,6 @@ class TestRefused:
         with pytest.raises(UserError, match="--fail-when has 1001 characters: 1000 are the most"):
             Criterion(f"{longest} ")
 
-    def test_nesting_as_deep_as_it_may_be_is_read(self):
-        assert of("not " * 240 + "ttc_s < 1", ending(20.0)) == MOST_MARGIN
-
 
 class TestMeasures:
     def test_every_name_has_a_value_in_every_episode(self):
@@ -277,18 +269,6 @@ class TestNamed:
         assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
 
 
-class TestTheVerdictAlone:
-    @pytest.mark.parametrize("dx", [0.0, 5.5, -4.9, -25.0, 80.0])
-    @pytest.mark.parametrize(
-        "text", ["paper", "contact", "unsafe", "ttc_s < 1.5", "last_avoidable_s < 2 or contact"]
-    )
-    def test_is_that_of_the_whole_outcome(self, text, dx):
-        episode = ending(dx, v_pov=36.0, v_vut=26.0)
-        whole, alone = Criterion(text).outcome(0, 0, episode), Criterion(text).judged(episode)
-        assert (alone.failed, alone.margin) == (whole.failed, whole.margin)
-        assert alone.signed_gap_m == whole.signed_gap_m
-
-
 def lines(apart_m, ends_m=-20.0):
     """Return a mainline along y = 0 and a ramp beside it that only joins in the last metre."""
     mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
@@ -330,14 +310,6 @@ class TestBodiesBeforeM:
         assert lines(1.0, ends_m=-20.0).together_m == pytest.approx(20.0, abs=SPACING_M)
         assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
         assert nearest(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
-
-    def test_on_the_shipped_roads(self):
-        # The ramp of US-23 comes in at 8.8 degrees: 2.3 / sin(8.8 degrees) is 15 m.
-        us23 = centre_lines(road_for(US23))
-        assert us23.together_m == pytest.approx(15.0, abs=0.5)
-        assert nearest(beside(0.0), us23) < 0.0
-        assert nearest(beside(0.0, x_vut=-14.9), us23) > 0.0
-        assert centre_lines(road_for(US23)) is us23
 
     def test_before_m_are_a_measure_of_their_own(self):
         hit = beside(0.0)
@@ -395,38 +367,6 @@ class TestCampaigns:
         assert all(Criterion("brake_after_mps2 > 2").margin(harsh.trajectory(o.index), o.measures)
                    == o.margin for o in harsh.outcomes)  # fmt: skip
         assert any(o.measures.end is End.MERGED for o in failing)
-
-    def test_with_margins_of_another_criterion_are_refused(self, harsh, tmp_path):
-        (tmp_path / "trajectories").mkdir()
-        record = {**harsh.settings, "fail_when": "paper"}
-        (tmp_path / "campaign.json").write_text(json.dumps(record), encoding="utf-8")
-        lines = (harsh.folder / "outcomes.jsonl").read_bytes()
-        (tmp_path / "outcomes.jsonl").write_bytes(lines)
-        with pytest.raises(UserError, match="not judged by the criterion"):
-            Run(tmp_path)
-
-    def test_decide_on_one_case_of_theirs(self, harsh, command_line):
-        ends = {o.failed: o for o in harsh.outcomes if o.measures.end is End.MERGED}
-        for failed, outcome in ends.items():
-            code, _, _ = command_line("run", "--case", harsh.folder, outcome.index)
-            assert code == int(failed)
-        assert set(ends) == {True, False}
-
-
-class TestTruth:
-    def test_is_of_its_criterion(self, tmp_path):
-        paths = {
-            key_of(criterion=Criterion(text)).path(tmp_path)
-            for text in ("paper", "contact", "ttc_s < 2", "ttc_s  <2", "ttc_s < 3")
-        }
-        assert len(paths) == 4
-
-    def test_has_the_scores_of_its_criterion(self, tmp_path):
-        criterion = Criterion("merged_first == 'VUT'")
-        found = ground_truth(plan_for("design2", criterion=criterion), 0, 60, cache=tmp_path)
-        assert set(found.score.tolist()) == {score_of(-1.0), score_of(1.0)}
-        again = ground_truth(plan_for("design2", criterion=criterion), 0, 60, cache=tmp_path)
-        assert np.array_equal(found.score, again.score)
 
 
 class TestSamplers:

@@ -111,12 +111,6 @@ class TestClosedForms:
         points = np.outer(np.arange(5) * distance, unit_vector(3, dimension))
         assert fmc(points) == pytest.approx(5 * BALL[dimension], rel=1e-9)
 
-    @DIMENSIONS
-    @pytest.mark.parametrize("distance", [0.003, 0.05, 0.07])
-    def test_a_row_of_balls(self, dimension, distance):
-        points = np.outer(np.arange(30) * distance, unit_vector(4, dimension))
-        assert fmc(points) == pytest.approx(chain(30, distance, dimension), rel=1e-6)
-
     @pytest.mark.parametrize("distance", [0.02, 0.05, 0.08])
     def test_balls_right_above_each_other_as_the_slices_see_them(self, distance):
         # Concentric discs in every slice, and equal ones half-way between two balls.
@@ -155,17 +149,6 @@ class TestLattices:
         expected = covering_lattice_area(count, spacing)
         assert fmc(lattice(count, spacing, 2)) == pytest.approx(expected, rel=1e-9)
 
-    @pytest.mark.parametrize(
-        ("dimension", "spacing"),
-        [(2, 2 * RADIUS), (2, 0.08), (3, 2 * RADIUS), (3, 0.08), (3, math.sqrt(2) * RADIUS)],
-    )
-    def test_lattice_with_holes_where_only_neighbours_overlap(self, dimension, spacing):
-        count = 6
-        edges = dimension * count ** (dimension - 1) * (count - 1)
-        expected = count**dimension * BALL[dimension] - edges * lens(spacing, dimension)
-        result = fmc(lattice(count, spacing, dimension))
-        assert result == pytest.approx(expected, rel=TOLERANCE[dimension])
-
     def test_a_flat_lattice_in_space(self):
         # All slices would meet the balls at the same heights if they were parallel to it.
         points = np.column_stack([lattice(20, 0.08, 2), np.full(400, 0.3)])
@@ -181,19 +164,6 @@ class TestReferences:
         expected, error = monte_carlo(points, seed=7)
         assert error < 0.01 * expected
         assert abs(fmc(points) - expected) < 4 * error
-
-    @pytest.mark.parametrize(
-        ("count", "width"), [(2, 0.05), (50, 0.1), (600, 0.03), (400, 0.15), (400, 1.0)]
-    )
-    def test_enough_slices(self, count, width, monkeypatch):
-        points = np.random.default_rng(8).random((count, 3)) * width
-        result = fmc(points)
-        slices = 150 if count >= 400 else 400
-        monkeypatch.setattr(fmc_module, "_SLICES", slices)
-        monkeypatch.setattr(fmc_module, "_MAX_SLICES", slices)
-        finer = fmc(points)
-        assert result != finer
-        assert result == pytest.approx(finer, rel=1e-4)
 
 
 # No deadline: a busy machine is no failure. Derandomised: neither is luck.
@@ -223,13 +193,6 @@ class TestWhatMustNotMatter:
         random.shuffle(rows)
         assert fmc(points[rows]) == result
 
-    def test_the_direction_of_a_lattice_in_space(self):
-        # Face-centred cubic: each pole of a ball lies on five others, and all at the same heights.
-        points = lattice(8, RADIUS, 3)
-        points = points[np.rint(points.sum(axis=1) / RADIUS) % 2 == 0]
-        turned = Rotation.from_rotvec([0.4, -1.1, 0.8]).apply(points)
-        assert fmc(points) == pytest.approx(fmc(turned), rel=5e-5)
-
     @examples
     @given(point_sets(), st.floats(0.01, 100.0))
     def test_scale(self, points, factor):
@@ -246,14 +209,6 @@ class TestWhatMustNotMatter:
         gains = np.diff(covered)
         assert gains.min() >= -slack
         assert gains.max() <= BALL[d] + slack
-
-    def test_the_points_are_left_alone(self):
-        points = np.random.default_rng(10).random((20, 3))
-        before = points.copy()
-        points.flags.writeable = False
-        fmc(points)
-        regions(points)
-        assert (points == before).all()
 
 
 class TestBadInput:
@@ -280,11 +235,6 @@ class TestBadInput:
     def test_radius(self, function, radius, points):
         with pytest.raises(ValueError, match="radius must be a positive finite number, got"):
             function(points, radius)
-
-    @pytest.mark.parametrize("far", [1e6, 1.7e308])
-    def test_points_too_far_apart_for_the_precision(self, far):
-        with pytest.raises(ValueError, match="radii, more than 1e\\+06: normalise them"):
-            fmc([[-far, 0.0], [far, 0.0]])
 
 
 class TestRegions:
@@ -377,7 +327,3 @@ class TestTheBoundOfGrowth:
             growths.append(after - before)
         assert np.mean(growths) <= np.mean(bounds)
         assert np.mean(growths) >= 0.4 * np.mean(bounds)
-
-    def test_does_not_depend_on_the_order(self):
-        points = np.random.default_rng(0).random((30, 2))
-        assert growth_bound(points) == growth_bound(points[::-1])

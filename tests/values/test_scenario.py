@@ -154,33 +154,6 @@ class TestACampaign:
         due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
         assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
 
-    def test_clips_at_the_limits_of_its_scenario(self, tmp_path):
-        (tmp_path / "hard.py").write_text("def vut(seen):\n    return 2.0\n")
-        settings = CampaignSettings(
-            vut=f"{tmp_path / 'hard.py'}:vut",
-            levels=(0,),
-            cases=1,
-            sampler="uniform",
-            batch=1,
-            scenario=OTHER,
-        )
-        trajectory = run_campaign(settings, tmp_path / "run").trajectory(0)
-        assert trajectory.a_vut_mps2.max() == 1.5
-        assert trajectory.clipped_steps == len(trajectory.motion) - 1
-
-    def test_times_out_when_its_scenario_says(self, tmp_path):
-        (tmp_path / "stop.py").write_text("def vut(seen):\n    return -4.0\n")
-        settings = CampaignSettings(
-            vut=f"{tmp_path / 'stop.py'}:vut",
-            levels=(0,),
-            cases=1,
-            sampler="uniform",
-            batch=1,
-            scenario=OTHER,
-        )
-        (outcome,) = run_campaign(settings, tmp_path / "run").outcomes
-        assert (outcome.measures.end, outcome.measures.t_end_s) == (End.TIMEOUT, 12.0)
-
 
 @pytest.mark.parametrize("name", ["curved", "lane drop", "OpenDRIVE"])
 def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):

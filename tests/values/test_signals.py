@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,22 +16,18 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.system.arrays import read_arrays
 from merge_sumo.system.records import decode
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.signals import (
     CHARACTERS,
     MOST_NAMES,
-    Left,
     SignalRuns,
     Signals,
     as_signals,
     from_runs,
-    series,
     to_record,
 )
-from merge_sumo.vuts.host import wire
 
 LEAVES = """
 class Vut:
@@ -147,17 +142,6 @@ def test_hostile_names_and_words_are_cut_and_harm_nobody(campaign, tmp_path):
     assert first[-5] == "'=1+1"
 
 
-def test_new_names_at_every_step_do_not_grow_a_case():
-    left: list[tuple[int, Left]] = [
-        (row, {f"{row} {n}": 1.0 for n in range(5)}) for row in range(100)
-    ]
-    found = series(left, 100)
-    assert found is not None
-    assert len(found) == MOST_NAMES
-    assert all(len(values) == 100 for values in found.values())
-    assert len(json.dumps(to_record(found))) < 500
-
-
 @pytest.mark.parametrize(
     "left", [None, 3, [1], "mode", {1: 2.0}, {"x": None}, {"x": float("inf")}, {}, {"x": [1.0]}]
 )
@@ -189,30 +173,6 @@ def test_a_file_of_a_stranger_is_refused(record):
         from_runs(decode(json.dumps(record), SignalRuns), 5)
 
 
-def test_a_file_that_was_changed_is_named(campaign):
-    run = campaign(LEAVES, cases=4, batch=4)
-    path = run.folder / "trajectories" / "00000.npz"
-    arrays: dict[str, Any] = read_arrays(path)
-    for text in (b'{"0": {"x": [[9, 1.0]]}}', b'{"77": {}}', b"[", b"\xff", b"[" * 99_999, b"3"):
-        with path.open("wb") as file:
-            arrays["signals"] = np.frombuffer(text, np.uint8)
-            np.savez(file, **arrays)
-        with pytest.raises(UserError, match="cannot read the trajectories"):
-            Run(run.folder).trajectory(0)
-
-
 def test_what_is_kept_is_read_as_it_was():
     signals: Signals = {"mode": ("go", "go", None), "gap_m": (1.5, -2.0, None)}
     assert from_runs(decode(json.dumps(to_record(signals)), SignalRuns), 3) == signals
-
-
-@pytest.mark.parametrize(
-    "said", [b"{}", b'{"reasons": {}, "signals": []}', b'{"reasons": {}, "signals": {"x": {}}}']
-)
-def test_a_process_that_says_something_else_is_no_signal(said):
-    content = np.zeros(2).tobytes() + said
-    with pytest.raises((wire.WireError, KeyError, ValueError, AttributeError)):
-        wire.unpack_answers(content, 2)
-    more = b'{"reasons": {}, "signals": {"7": {"x": 1.0}, "1": {"x": [1], "y": 2.0}}}'
-    found = wire.unpack_answers(np.zeros(2).tobytes() + more, 2)
-    assert found.signals == {1: {"y": 2.0}}
