@@ -115,6 +115,7 @@ from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import (
     check_new,
     check_new_file,
+    check_ours,
     check_own,
     dated,
     link_latest,
@@ -826,7 +827,7 @@ def stress(run: AnyRun, **given: Unpack[RerunKeywords]) -> ladder.Stress:
     """
     check_keywords("stress", given, RerunKeywords)
     before = _opened(run).run
-    check_own(before.folder / ladder.STRESS)
+    check_ours(before.folder / ladder.STRESS, ladder.Stress.__struct_fields__)
     total = sum(map(ladder.runs_of, ladder.RUNGS))
     cases = total * sum(outcome.is_tested for outcome in before.outcomes)
     with _study_of(before, given, "cases again", cases, engine=None) as study:

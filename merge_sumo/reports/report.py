@@ -26,13 +26,11 @@ from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import head_words, sections_of, shared_words
-from merge_sumo.system.folders import cannot_write, check_own, replace_own
+from merge_sumo.system.folders import check_ours, replace_own
 from merge_sumo.system.workers import Workers
 
 REPORT: Final = "report.html"
-GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 """By this a report is known as ours, and may be replaced by a newer one."""
-HEAD_BYTES: Final = 1000
 FIRST_S: Final = 2.0
 """Seconds after which the report of a running campaign first appears."""
 EVERY_S: Final = 5
@@ -53,7 +51,6 @@ def write_report(
     `ReportModel` for the other arguments. Raises `UserError` when it cannot be written, or what is
     there is no report of ours.
     """
-    check_report(run.folder)
     path = run.folder / REPORT
     html = report_page(run, summary, workers, on_part)
     replace_own(path, html.encode(errors="backslashreplace"))
@@ -91,7 +88,6 @@ class RunningReport:
     def _write(self, *, running: bool) -> None:
         self._is_there = False
         with suppress(UserError):
-            check_report(self._folder)
             html = report_page(Run(self._folder), learns=False, running=running)
             replace_own(self._folder / REPORT, html.encode(errors="backslashreplace"))
             self._is_there = True
@@ -99,22 +95,8 @@ class RunningReport:
 
 def check_report(folder: Path) -> None:
     """Raise `UserError` where `report.html` in a folder is something else than our report."""
-    check_page(folder / REPORT)
-    check_own(folder / AGAINST_PAGE)
-
-
-def check_page(path: Path) -> None:
-    """Raise `UserError` where a path is taken by something else than a page of ours."""
-    check_own(path)
-    try:
-        with path.open("rb") as file:
-            ours = GENERATOR in file.read(HEAD_BYTES)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise cannot_write(path, error) from error
-    if not ours:
-        raise UserError(f"{path} is no report of merge-sumo and is not replaced: move it away")
+    check_ours(folder / REPORT)
+    check_ours(folder / AGAINST_PAGE)
 
 
 def report_page(

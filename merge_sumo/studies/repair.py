@@ -26,6 +26,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -410,7 +411,7 @@ class RepairJournal:
             whole = [line for line in lines if line.endswith(b"\n")]
             self._recorded = [decode(line, Trial) for line in whole]
             if len(whole) < len(lines):
-                replace_own(folder / TRIALS, b"".join(whole))
+                os.truncate(folder / TRIALS, sum(map(len, whole)))
         self._written = bool(self._recorded)
 
     _written = False

@@ -7,6 +7,7 @@ written again, but not through links, which somebody may have put there.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import secrets
@@ -14,7 +15,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -30,6 +31,9 @@ ROOM: Final = 64
 """Bytes that the name of a file of ours in a folder needs, with the folder's other name."""
 NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
 """Flags to open a file that is no link."""
+GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
+HEAD_BYTES: Final = 1000
+"""In which a page of ours has that."""
 DEFAULT: Final = Path("runs")
 """Folder of what nobody gave a name to."""
 
@@ -262,12 +266,49 @@ def write_new(path: Path, content: bytes, option: str = "--out") -> None:
         file.write(content)
 
 
+def check_ours(path: Path, keys: Iterable[str] = ()) -> None:
+    """Raise `UserError` where something is at `path` that we did not write.
+
+    A page of ours names its generator; a record of ours has more of the `keys` than others, which
+    may be of another version. Other files are those of folders that are known to be ours.
+    """
+    check_own(path)
+    try:
+        if path.suffix == ".html":
+            with path.open("rb") as file:
+                ours = GENERATOR in file.read(HEAD_BYTES)
+        elif path.suffix in (".json", ".jsonl"):
+            ours = _is_like(path.read_bytes(), path.suffix, set(keys))
+        else:
+            return
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise cannot_write(path, error) from error
+    if not ours:
+        raise UserError(f"{path} is not of our making and is not replaced: move it away")
+
+
+def _is_like(content: bytes, suffix: str, keys: set[str]) -> bool:
+    found = _keys(content, suffix)
+    return len(found & keys) > len(found ^ keys)
+
+
+def _keys(content: bytes, suffix: str) -> set[str]:
+    """Return the keys of a record, or of the first of many."""
+    try:
+        record = json.loads(content.partition(b"\n")[0] if suffix == ".jsonl" else content)
+    except (ValueError, RecursionError):
+        return set()
+    return set(record) if isinstance(record, dict) else set()
+
+
 def replace_own(path: Path, content: bytes) -> None:
     """Write a file of ours, in the place of an older one, whole or not at all; sync it.
 
-    Raises `UserError` when a link is there or it cannot be written.
+    Raises `UserError` when something else is there (`check_ours`) or it cannot be written.
     """
-    check_own(path)
+    check_ours(path, _keys(content, path.suffix))
     try:
         with _temporary(path) as (new, file):
             file.write(content)

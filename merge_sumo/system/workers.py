@@ -13,6 +13,7 @@ import multiprocessing.util
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections import deque
@@ -378,7 +379,12 @@ class LocalProcesses(ProcessPoolExecutor):
         spawn = multiprocessing.get_context("spawn")
         with without_cwd():  # its locks have a process of their own
             cores = spawn.Semaphore(os.cpu_count() or 1)
-            super().__init__(workers, spawn, _begin_worker, (cores, preload))
+            # A worker that is killed leaves its temporary files behind.
+            self._scratch = tempfile.TemporaryDirectory(
+                prefix="merge-sumo-", ignore_cleanup_errors=True
+            )
+            given = cores, preload, self._scratch.name
+            super().__init__(workers, spawn, _begin_worker, given)
         self.submit(int)  # with the first task they start
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -394,6 +400,12 @@ class LocalProcesses(ProcessPoolExecutor):
         if exception[0] is not None and not issubclass(exception[0], Exception):
             self._kill()
         return super().__exit__(*exception)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the workers end; remove what they have left."""
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        if wait:
+            self._scratch.cleanup()
 
     def end(self) -> None:
         """End the workers, whatever they do: nobody waits for it."""
@@ -433,8 +445,9 @@ def end_worker() -> None:
         _endings.pop()()
 
 
-def _begin_worker(cores: Semaphore, preload: str | None) -> None:
+def _begin_worker(cores: Semaphore, preload: str | None, scratch: str) -> None:
     """Set up a worker process, when one of the cores is free for that."""
+    tempfile.tempdir = os.environ["TMPDIR"] = scratch
     forget_safe_path()
     leave_signals_to_parent()
     # Processes of multiprocessing end without atexit.

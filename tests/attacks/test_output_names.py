@@ -20,8 +20,6 @@ import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.campaigns.store import (
     OUTCOMES,
     SETTINGS,
@@ -35,7 +33,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.studies import probability, reproduction
-from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies import stress as ladder
+from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.training import helix
@@ -153,7 +152,7 @@ def no_cases(monkeypatch) -> None:
     monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: None)
     for name in ("evaluate", "evaluate_chunks"):
         monkeypatch.setattr(conductor, name, stop)
-    monkeypatch.setattr(reproduction, "_column", stop)
+    monkeypatch.setattr(reproduction.Study, "compare", stop)
 
 
 @pytest.fixture(scope="module")
@@ -278,13 +277,6 @@ class TestAHundredNames:
         )
         assert set(appeared) == {*ODD, "empty", "empty/", "full/../empty"} & {*names}
 
-    def test_of_a_policy_touch_nothing(self, world, call, names):
-        arguments = ("policies", "export", "vut1")
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call(*arguments, f"--out={name}"), names
-        )
-        assert set(appeared) == {*ODD} & {*names} - {"new/sub", "new/deep/er", "missing/../new8"}
-
 
 class TestANameOfNothing:
     @pytest.mark.parametrize("name", [*NAMELESS, "/", "//", "///", "/.", "/..", "/../.."])
@@ -366,18 +358,6 @@ class TestAFileOfOurs:
             folders.replace_own(tmp_path / "report", b"new")
         assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"report": "old"}
 
-    @pytest.mark.parametrize("kind", ["link", "dangling link", "pipe"])
-    def test_is_not_written_where_something_else_is(self, tmp_path, kind):
-        (tmp_path / "theirs").write_text("theirs")
-        if kind == "pipe":
-            os.mkfifo(tmp_path / "report")
-        else:
-            (tmp_path / "report").symlink_to("theirs" if kind == "link" else "nowhere")
-        before = tree(tmp_path)
-        with pytest.raises(UserError, match="not of our making"):
-            folders.replace_own(tmp_path / "report", b"new")
-        assert tree(tmp_path) == before
-
 
 @pytest.fixture
 def received(run, tmp_path) -> Path:
@@ -395,6 +375,47 @@ def cut_to_one_batch(folder: Path) -> None:
 def moved_behind_a_link(path: Path, elsewhere: Path) -> None:
     path.rename(elsewhere / path.name)
     path.symlink_to(elsewhere / path.name)
+
+
+def replaced_as(place: str, content: bytes):
+    """Return what writes a file as a command does."""
+    return (lambda folder: folders.replace_own(folder / place, content)), place
+
+
+def stressed(folder: Path) -> None:
+    """Write what `rerun --stress` does; what is there is looked at before any case runs."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ladder, "RUNGS", ())
+        ms.stress(folder, workers=1)
+
+
+PAGE_OF_OURS = b'<!doctype html><head><meta name="generator" content="merge-sumo">'
+WRITERS = {
+    "report": (lambda folder: write_report(Run(folder)), REPORT),
+    "against": replaced_as("against.html", PAGE_OF_OURS),
+    "stress": (stressed, "stress.json"),
+    "avoidance": (
+        lambda folder: write_avoidance(folder, [Avoidance(0, ("fsm",), None, True)]),
+        "avoidance.jsonl",
+    ),
+    "repeats": replaced_as("repeats.jsonl", b'{"index": 1, "same": true}\n'),
+    "repair": replaced_as("repair.html", PAGE_OF_OURS),
+    "search": replaced_as("benchmark.json", b'{"number_is": "a mean", "cases": 3}'),
+    "explanation": (lambda folder: ms.explain(folder, workers=1), "explanations.jsonl"),
+    "probability": (
+        lambda folder: ms.probability(folder, out=folder / "probability.json", cases=4),
+        "probability.json",
+    ),
+}
+"""Of every file with a name of ours: what writes it into a run folder, and where."""
+KINDS = {
+    "page": lambda path: path.write_text("<!doctype html><title>notes on merge-sumo</title>"),
+    "record": lambda path: path.write_text('{"mine": 1}\n'),
+    "folder": Path.mkdir,
+    "link": lambda path: path.symlink_to("../ours/bashrc"),
+    "dangling link": lambda path: path.symlink_to("../ours/new"),
+    "pipe": os.mkfifo,
+}
 
 
 class TestAReceivedFolder:
@@ -424,28 +445,30 @@ class TestAReceivedFolder:
     def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received, tmp_path):
         (received / f".{SETTINGS}").symlink_to("../ours/bashrc")
         with Journal.reopen(received)[0] as journal:
-            journal.rewrite_settings({"vut": "design1"})
+            journal.rewrite_settings(settings := {**Run(received).settings, "cases": 70})
         assert (tmp_path / "ours" / "bashrc").read_text() == "ours"
-        assert read_settings(received) == {"vut": "design1"}
+        assert read_settings(received) == settings
 
-    @pytest.mark.parametrize("target", ["../ours/bashrc", "../ours/new", "../ours"])
-    def test_with_a_link_for_a_report_gets_none(self, received, tmp_path, target):
-        (received / REPORT).unlink(missing_ok=True)
-        (received / REPORT).symlink_to(target)
+    @pytest.mark.parametrize("kind", KINDS)
+    @pytest.mark.parametrize("name", WRITERS)
+    def test_keeps_what_is_somebodys_in_every_place(self, received, tmp_path, name, kind):
+        write, place = WRITERS[name]
+        path = received / place
+        path.unlink(missing_ok=True)
+        KINDS[kind](path)
         before = tree(tmp_path)
-        with pytest.raises(UserError, match=r"report\.html: it is a link"):
-            write_report(Run(received))
+        with pytest.raises(UserError, match=place):
+            write(received)
         assert tree(tmp_path) == before
 
-    def test_with_a_page_of_somebodys_keeps_it(self, received, tmp_path):
-        (received / REPORT).write_text("<!doctype html><title>my notes on merge-sumo</title>")
-        before = tree(tmp_path)
-        with pytest.raises(UserError, match=r"report\.html is no report of merge-sumo"):
-            write_report(Run(received))
-        assert tree(tmp_path) == before
-        (received / REPORT).unlink()
-        first = write_report(Run(received)).read_bytes()
-        assert write_report(Run(received)).read_bytes() == first, "ours is replaced"
+    @pytest.mark.parametrize("name", ["report", "stress", "avoidance", "search", "repair"])
+    def test_has_what_is_ours_replaced(self, received, name):
+        write, place = WRITERS[name]
+        (received / place).unlink(missing_ok=True)
+        write(received)
+        first = (received / place).read_bytes()
+        write(received)
+        assert (received / place).read_bytes() == first
 
     @pytest.mark.parametrize("name", [SCENARIOS, "exports"])
     @pytest.mark.parametrize("file_format", ["sumo", "openscenario", "csv"])
@@ -457,16 +480,6 @@ class TestAReceivedFolder:
         said = CliRunner().invoke(cli.app, ["export", str(received), "59", "--format", file_format])
         assert isinstance(said.exception, UserError)
         assert "it is a link" in str(said.exception)
-        assert tree(tmp_path) == before
-
-    def test_with_a_link_for_a_probability_gets_none(self, received, tmp_path, monkeypatch):
-        monkeypatch.setattr(probability, "run_fresh", lambda *_: 1 / 0)
-        run, out = Run(received), received / probability.RESULT
-        out.symlink_to("../ours/new")
-        before = tree(tmp_path)
-        study = RunStudy(run, today := settings_of(received, run.settings), resolve(today))
-        with pytest.raises(UserError, match=r"probability\.json exists"):
-            probability.failure_probability(study, out, cases=4)
         assert tree(tmp_path) == before
 
     def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received, tmp_path):

@@ -28,6 +28,7 @@ from merge_sumo.reports.report import (
     REPORT,
     RunningReport,
 )
+from merge_sumo.system.folders import GENERATOR
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,7 @@ class TestTheReportOfACampaignThatRuns:
         def slow(*_, **__):
             clock[0] += 2.0
             written.append(clock[0])
-            return report.GENERATOR.decode()
+            return GENERATOR.decode()
 
         monkeypatch.setattr(report, "report_page", slow)
         page = RunningReport(run.folder)
