@@ -123,7 +123,7 @@ from merge_sumo.system.folders import (
     write_new,
 )
 from merge_sumo.system.interrupt import Stopped
-from merge_sumo.system.printable import quoted
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
@@ -1014,7 +1014,10 @@ def check_vut(
     fields = recordable({name: value for name, value in hosting.items() if name != "pov"})
     driven = US23 if scenario is None else scenario_of(scenario)
     settings = CampaignSettings(vut=spec, levels=(0,), scenario=driven, **fields)
-    return vut_check.check_vut(resolve(settings))
+    plan = resolve(settings)
+    with Bars() as bars:
+        bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
+        return vut_check.check_vut(plan)
 
 
 def scenarios() -> Shown:

@@ -519,9 +519,11 @@ class Journal:
                 self._outcomes.truncate(end)
                 raise
         except OSError as error:
+            goes_on = f"`merge-sumo campaign --resume {quoted(self.folder)}`"
+            kept = f"; what ran before is kept: go on with {goes_on}"
             raise UserError(
-                f"cannot write {self.folder}: {error.strerror}; what ran before is kept: go on "
-                f"with `merge-sumo campaign --resume {quoted(self.folder)}`"
+                f"cannot write {self.folder}: {error.strerror}"
+                f"{kept if (self.folder / OUTCOMES).is_file() else ''}"
             ) from error
 
     def rewrite_settings(self, settings: dict[str, Any]) -> None:

@@ -27,6 +27,8 @@ LINE_S: Final = 1.0
 """Seconds between two of these lines, at least."""
 FRESH_S: Final = 0.25
 """Seconds for which what a terminal shows may be old."""
+SLOW_S: Final = 60.0
+"""Seconds after which a line stands whatever has ended."""
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
@@ -58,10 +60,16 @@ class _Work:
     said_s: float = -1e9
 
     def is_due(self, done: int, *, drawn: bool) -> bool:
-        """Return whether to show it: on a terminal what is fresh, else a tenth; the end always."""
+        """Return whether to show it: on a terminal what is fresh, else a tenth; the end always.
+
+        Where things take long, each of them is.
+        """
         now_s = time.monotonic()
         since, since_s = done - self.said, now_s - self.said_s
-        due = since_s >= (FRESH_S if drawn else LINE_S) and (drawn or since * LINES >= self.total)
+        slow = now_s - max(self.said_s, self.start_s) >= SLOW_S
+        due = since_s >= (FRESH_S if drawn else LINE_S) and (
+            drawn or since * LINES >= self.total or (since > 0 and slow)
+        )
         if due or (done >= self.total and since > 0):
             self.said, self.said_s = done, now_s
             return True

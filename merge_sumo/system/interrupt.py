@@ -1,5 +1,7 @@
 """SIGINT and SIGTERM: the first finishes what is running, the second stops at once.
 
+Who sends SIGTERM sends no second one, but SIGKILL: it has what is running finish in a few seconds.
+
 What has nothing to finish stops at the first, in good order.
 """
 
@@ -17,6 +19,8 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 ENDING: Final = ("SIGTERM", "SIGHUP")
 """SIGHUP comes when a terminal is closed; not every platform has it."""
 STDERR: Final = 2
+PATIENCE_S: Final = 5.0
+"""Seconds after SIGTERM in which what is running may end."""
 
 
 class Stopped(BaseException):
@@ -43,6 +47,8 @@ class Interrupt:
         self._note = f"\n{note}\n".encode()
         self._number: int | None = None
         self._before: list[Any] = []
+        self._again = threading.Timer(PATIENCE_S, os.kill, (os.getpid(), signal.SIGTERM))
+        self._again.daemon = True
 
     def check(self) -> None:
         """Raise `Stopped` when a signal has come."""
@@ -55,12 +61,15 @@ class Interrupt:
         self._number = number
         # Not print: the signal may have come in the middle of one.
         os.write(STDERR, self._note)
+        if number == signal.SIGTERM:
+            self._again.start()
 
     def __enter__(self) -> Self:
         self._before = [signal.signal(number, self._handle) for number in SIGNALS]
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._again.cancel()
         for number, handler in zip(SIGNALS, self._before, strict=True):
             signal.signal(number, handler)
 

@@ -32,7 +32,7 @@ from merge_sumo.campaigns.store import (
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.studies import probability, reproduction
+from merge_sumo.studies import probability
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.system import folders
@@ -152,7 +152,7 @@ def no_cases(monkeypatch) -> None:
     monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: None)
     for name in ("evaluate", "evaluate_chunks"):
         monkeypatch.setattr(conductor, name, stop)
-    monkeypatch.setattr(reproduction.Study, "compare", stop)
+    monkeypatch.setattr("merge_sumo.studies.sampler_study.Study.compare", stop)
 
 
 @pytest.fixture(scope="module")
