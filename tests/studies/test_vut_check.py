@@ -87,14 +87,6 @@ def test_limits_and_answers_to_nonsense_are_notes(check):
     assert "To a state that is not a number it answers 5 m/s2." in said
 
 
-def test_a_policy_is_exported_and_its_path_printed(tmp_path):
-    pytest.importorskip("onnx")
-    path = tmp_path / "vut1.onnx"
-    done = CliRunner().invoke(cli.app, ["policies", "export", "vut1", "--out", str(path)])
-    assert done.stdout.strip() == str(path)
-    assert path.stat().st_size > 1000
-
-
 @pytest.mark.parametrize("name", shipped_scenarios())
 @pytest.mark.parametrize("vut", ["design1", "sumo:IDM"])
 def test_a_good_vut_is_good_on_every_shipped_scenario(name, vut):
