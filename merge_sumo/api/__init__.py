@@ -102,7 +102,7 @@ from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.comparison import Comparison
-from merge_sumo.studies.counterfactuals import note_avoidance
+from merge_sumo.studies.counterfactuals import avoidance, write_avoidance
 from merge_sumo.studies.probability import ProbabilityResult
 from merge_sumo.studies.run_study import RunStudy, notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy, Study
@@ -290,7 +290,9 @@ def _write_findings(
 
     # The careful drivers are models of merges.
     if isinstance(plan.scenario, MergeScenario):
-        note_avoidance(done, plan, workers=opened, check=checks, on_part=careful)
+        known = avoidance(done, plan, workers=opened, check=checks, on_part=careful)
+        if known:
+            write_avoidance(done.folder, known)
     explanation.note_explanation(done, plan, workers=opened, check=checks)
     link_latest(done.folder)
     # Learned on another machine, surrogates may differ in a last bit. More workers than cores

@@ -370,7 +370,11 @@ class TruthResult(Result):
                 "too_small": truth.is_small,
                 "fail_when": self.criterion.text,
                 "in_sumo": truth.in_sumo,
-                **self._runs_of(truth),
+                **(
+                    {}
+                    if truth.runs is None
+                    else {"runs": truth.all_runs, "tolerated": self.tolerated}
+                ),
             }
             for level, truth in self.truths.items()
         ]
@@ -379,11 +383,6 @@ class TruthResult(Result):
         sums = {name: getattr(self, name) for name in ("cases", "failures", "fmc", "real_regions")}
         text = self.criterion.text
         return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": records}
-
-    def _runs_of(self, truth: Truth) -> dict[str, Any]:
-        if truth.runs is None:
-            return {}
-        return {"runs": truth.all_runs, "tolerated": self.tolerated}
 
     def lines(self) -> list[str]:
         """Return a line for each level, and any criterion but the default one in words."""

@@ -105,23 +105,6 @@ class Avoidance:
 # The file of a campaign.
 
 
-def note_avoidance(
-    run: Run,
-    plan: SimulationPlan,
-    *,
-    workers: Workers | None = None,
-    check: Callable[[], None] = lambda: None,
-    on_part: Callable[[int, int], None] = lambda _done, _total: None,
-) -> None:
-    """Find which drivers would have avoided the failures of a campaign, and write that.
-
-    The arguments are those of `avoidance`.
-    """
-    known = avoidance(run, plan, workers=workers, check=check, on_part=on_part)
-    if known:
-        write_avoidance(run.folder, known)
-
-
 def write_avoidance(folder: Path, avoidances: Iterable[Avoidance]) -> Path:
     """Write avoidances into the folder of a campaign, in the place of an older one."""
     path = folder / AVOIDANCE

@@ -137,6 +137,10 @@ class Trial(Record, frozen=True):
         """Whether it was run and broke nothing."""
         return not self.refused and not self.broke
 
+    def costs_more(self, cost: Cost) -> float:
+        """Return the extra cost, 0 where it costs no more than today."""
+        return max(self.extra.get(cost, 0.0), 0.0)
+
 
 @dataclass(frozen=True, slots=True)
 class RepairSettings:
@@ -332,11 +336,6 @@ def _indices(indices: Sequence[int]) -> str:
     return f"{shown}, the first {MOST_INDICES}" if len(indices) > MOST_INDICES else shown
 
 
-def _extra(trial: Trial, cost: Cost) -> float:
-    """Return the extra cost of a trial, 0 where it costs no more than today."""
-    return max(trial.extra.get(cost, 0.0), 0.0)
-
-
 def change_of(
     values: Mapping[str, float], today: Mapping[str, float], ranges: Sequence[Range]
 ) -> float:
@@ -497,8 +496,10 @@ class Search:
         for number in range(1, self._settings.rounds + 1):
             self._round = number
             with self._opened():
-                self._run_today()
-                failing = failing or tuple(i for i in range(self._own) if not self._passed(i))
+                self._before += self._run(self._plan, self.cases[len(self._before) :])
+                failing = failing or tuple(
+                    i for i in range(self._own) if not passes(self._before[i])
+                )
                 if not failing:
                     raise UserError(
                         f"every case passes with {self._plan.vut.spec}: nothing is to be repaired"
@@ -548,26 +549,14 @@ class Search:
         ]
         return compare_outcomes(today, campaign, self._plan.vut.spec)
 
-    def _passed(self, index: int) -> bool:
-        return passes(self._before[index])
-
-    def _run_today(self) -> None:
-        """Run the cases that have not run with today's values."""
-        new = range(len(self._before), len(self.cases))
-        self._before += self._outcomes(self._plan, new)
-
-    def _outcomes(self, plan: SimulationPlan, indices: Sequence[int]) -> list[Outcome]:
-        """Return the outcomes of cases by their numbers, in order."""
-        return self._run(plan, [self.cases[index] for index in indices])
-
     def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
         ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
         return [outcome for _, outcome in sorted(ran, key=itemgetter(0))]
 
     def _selected(self) -> list[int]:
         """Return the cases of a trial: what does not pass, near misses, and a share of the rest."""
-        failing = [i for i in range(len(self.cases)) if not self._passed(i)]
-        passing = [i for i in range(len(self.cases)) if self._passed(i)]
+        failing = [i for i, before in enumerate(self._before) if not passes(before)]
+        passing = [i for i, before in enumerate(self._before) if passes(before)]
         passing.sort(key=lambda i: (self._before[i].score or 0.0, i))
         near, rest = passing[: len(failing)], passing[len(failing) :]
         rng = np.random.default_rng([self._settings.seed, self._round])
@@ -588,7 +577,9 @@ class Search:
         if earlier is None:
             self._check_effect(found)
         present = found[0]
-        better = sorted((t for t in found if t.holds), key=self._rank)
+        better = sorted(
+            (t for t in found if t.holds), key=lambda t: (*self._aims(t), self._size(t))
+        )
         for trial in better[:CONFIRMED]:
             if len(trial.fails) >= len(present.fails):
                 return None
@@ -631,7 +622,9 @@ class Search:
             study.tell(asked, state=optuna.trial.TrialState.FAIL)
             return trial
         asked.set_constraint("broke", float(len(trial.broke)))
-        study.tell(asked, [len(trial.fails), _extra(trial, self._settings.cost), self._size(trial)])
+        study.tell(
+            asked, [len(trial.fails), trial.costs_more(self._settings.cost), self._size(trial)]
+        )
         return trial
 
     def _trial(
@@ -657,7 +650,8 @@ class Search:
                 after = [self._before[index] for index in indices]
             else:
                 vut = VutFactory(spec, self._plan.vut.options)
-                after = self._outcomes(replace(self._plan, vut=vut), indices)
+                cases = [self.cases[index] for index in indices]
+                after = self._run(replace(self._plan, vut=vut), cases)
         except UserError as error:
             return Trial(wanted.round, wanted.values, refused=str(error))
         pairs = [(i, self._before[i], now) for i, now in zip(indices, after, strict=True)]
@@ -668,7 +662,12 @@ class Search:
             fails=tuple(i for i, old, now in pairs if not passes(old) and not passes(now)),
             broke=tuple(i for i, old, now in pairs if passes(old) and not passes(now)),
             extra={
-                cost: fmean(_of(now, name) - _of(old, name) for old, now in both) if both else 0.0
+                cost: fmean(
+                    float(now.measures.value(name) or 0.0) - float(old.measures.value(name) or 0.0)
+                    for old, now in both
+                )
+                if both
+                else 0.0
                 for cost, (name, _) in MEASURED_BY.items()
             },
             differs=any(old.measures != now.measures for _, old, now in pairs),
@@ -690,11 +689,8 @@ class Search:
 
     def _aims(self, trial: Trial) -> tuple[int, int]:
         """Return what is compared before the change: failures, and steps of extra cost."""
-        extra = _extra(trial, self._settings.cost)
+        extra = trial.costs_more(self._settings.cost)
         return len(trial.fails), math.ceil(round(extra / COST_STEP, 9))
-
-    def _rank(self, trial: Trial) -> tuple[float, ...]:
-        return *self._aims(trial), self._size(trial)
 
     def _trimmed(self, best: Trial, selected: Sequence[int]) -> Trial:
         """Return a trial with values as near to today's as the choice allows, with a reserve."""
@@ -702,33 +698,29 @@ class Search:
 
         def as_good(name: str, value: float) -> bool:
             nonlocal kept
-            trial = self._trial({**kept.values, name: self._ranges[name].rounded(value)}, selected)
+            trial = self._trial({**kept.values, name: value}, selected)
             good = trial.holds and self._aims(trial) <= aims
             kept = trial if good else kept
             return good
 
         by_change = sorted(
             self._settings.ranges,
-            key=lambda one: (
-                -abs(kept.values[one.name] - self.today[one.name]) / (one.high - one.low)
-            ),
+            key=lambda one: -change_of(kept.values, self.today, [one]),
         )
         for one in by_change:
             today, good = self.today[one.name], kept.values[one.name]
             if good == today:
                 continue
-            before = self._trial({**kept.values, one.name: today}, selected)
-            if before.holds and self._aims(before) <= aims:
-                kept = before
+            if as_good(one.name, today):
                 continue
             bad = today
             for _ in range(BISECTIONS):
                 middle = (bad + good) / 2.0
-                if as_good(one.name, middle):
+                if as_good(one.name, one.rounded(middle)):
                     good = middle
                 else:
                     bad = middle
-            as_good(one.name, good + RESERVE * (good - today))
+            as_good(one.name, one.rounded(good + RESERVE * (good - today)))
         return kept
 
 
@@ -744,10 +736,6 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
         near = np.clip(centre + offsets, 0.0, 1.0)
         found += from_unit(near, case.level, scenario=case.scenario)
     return found
-
-
-def _of(outcome: Outcome, name: str) -> float:
-    return float(outcome.measures.value(name) or 0.0)
 
 
 def _outcomes_of(results: CaseResults) -> list[Outcome]:

@@ -223,10 +223,6 @@ OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
 """Coordinates that are no state of another car."""
 
 
-def _with_step(plan: SimulationPlan) -> SimulationPlan:
-    return replace(plan, substeps=round(DT_S / PART_S))
-
-
 def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
     act = plan.scenario.act
     for name in values:
@@ -264,7 +260,7 @@ RUNGS: Final = (
     Change(
         name="step",
         about=f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
-        plan=_with_step,
+        plan=lambda plan: replace(plan, substeps=round(DT_S / PART_S)),
     ),
     *(
         Change(
@@ -336,7 +332,7 @@ def _rung(
         for draw in range(runs):
             cases = [_case(o.case, change, draw, changed.scenario) for o in tested]
             found: dict[int, Verdict] = {}
-            for place, verdict in evaluate(changed, cases, workers, keep=_verdicts):
+            for place, verdict in evaluate(changed, cases, workers, keep=CaseResults.verdicts):
                 found[place] = verdict
                 study.on_cases(1)
             flips.append(flips_of(tested, found))
@@ -354,10 +350,6 @@ def _case(case: Case, change: Change, draw: int, scenario: Scenario) -> Case:
     if change.case is None:
         return case
     return change.case(case, np.random.default_rng([draw, case.seed]))
-
-
-def _verdicts(results: CaseResults) -> list[Verdict]:
-    return results.verdicts()
 
 
 def flips_of(tested: Sequence[Outcome], found: Mapping[int, Verdict]) -> Flips:
