@@ -2,7 +2,6 @@
 
 Every reader of what comes from outside is given files that it wrote itself with a few bytes
 changed, and files of anything at all. A `UserError` of one line is the only exception allowed.
-`pytest -m long tests/attacks/test_fuzz.py` looks for more, and uses atheris where it is installed.
 """
 
 # mypy: no-strict-optional
