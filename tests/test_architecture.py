@@ -297,7 +297,7 @@ class TestImports:
         assert offenders(others, {"merge_sumo.cli", "merge_sumo.commands", "typer"}) == {}
 
     def test_of_a_command_are_the_api_and_what_prints(self):
-        beside = {"complete", "options", "printing"}
+        beside = {"options", "printing"}
         commands = {f for f in files_below("commands") if f.stem not in {*beside, "application"}}
         assert len(commands) > 1
         allowed = {"merge_sumo.api", "merge_sumo.errors", "merge_sumo.commands"}

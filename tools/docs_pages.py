@@ -66,10 +66,7 @@ def _options_table(application: Any) -> str:
 
 COMPLETION = """
 
-`merge-sumo --install-completion` teaches your shell to complete commands, options and values: VUTs
-(`my.py:` shows the classes and functions of a file, which is not run), levels, samplers, scenarios,
-gates, networks, and the folders of campaigns, the newest first. `--show-completion` prints what it
-would add.
+`merge-sumo --install-completion` teaches your shell to complete commands and options.
 """
 
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
-from merge_sumo.commands import complete
 from merge_sumo.commands.application import Given, app
 from merge_sumo.commands.options import (
     HOSTING,
@@ -49,9 +48,7 @@ def campaign(
     resume: Annotated[
         Path | None,
         typer.Option(
-            metavar="RUN",
-            help="Go on with the campaign in this folder; --cases may be more.",
-            autocompletion=complete.runs,
+            metavar="RUN", help="Go on with the campaign in this folder; --cases may be more."
         ),
     ] = None,
     gate: Annotated[
@@ -60,7 +57,6 @@ def campaign(
             metavar="GATE",
             help='Exit with 1 if there are failures, errors, timeouts, "fmc>X": an FMC above X at '
             "some level, or, with --against, regressions. May be given several times.",
-            autocompletion=complete.gates,
         ),
     ] = None,
     junit: Annotated[
@@ -115,10 +111,7 @@ def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     own={
         "vut": VUT_AGAIN,
         "level": optional(
-            str,
-            "POV level: 0, 1, 2 or own.",
-            show_default="0, with --case the campaign's",
-            autocompletion=complete.one_level,
+            str, "POV level: 0, 1, 2 or own.", show_default="0, with --case the campaign's"
         ),
         "debug": flag(
             "Run the VUT in this process without a deadline: breakpoints work.", "--debug"
@@ -231,9 +224,7 @@ def compare(
     given: Given,
     runs: Annotated[
         list[Path],
-        typer.Argument(
-            help="Folders of campaigns, the oldest first.", autocompletion=complete.runs
-        ),
+        typer.Argument(help="Folders of campaigns, the oldest first."),
     ],
     out: Annotated[
         Path | None,
@@ -271,7 +262,6 @@ def compare(
             "OpenSCENARIO and OpenDRIVE. csv, parquet: "
             "one table of motion.",
             "--format",
-            autocompletion=complete.formats,
         ),
         "out": optional(
             Path, "Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
@@ -305,7 +295,7 @@ def replay(
     given: Given,
     folder: Annotated[
         Path,
-        typer.Argument(help="A scenario folder, or a campaign's.", autocompletion=complete.runs),
+        typer.Argument(help="A scenario folder, or a campaign's."),
     ],
     case: Annotated[
         int | None, typer.Argument(help="Index of the campaign's case in outcomes.jsonl.")

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo.commands import complete
 from merge_sumo.commands.application import Commands, Given, app
 from merge_sumo.commands.options import HOSTING, PANEL_OF, Shared, flag, option, optional
 
@@ -16,9 +15,7 @@ app.add_typer(scenario, name="scenario", rich_help_panel=PANEL_OF["scenario"])
 
 
 def _scenario_option(help: str, show_default: str) -> Shared:
-    return optional(
-        str, help, metavar="NAME|FILE", show_default=show_default, autocompletion=complete.scenarios
-    )
+    return optional(str, help, metavar="NAME|FILE", show_default=show_default)
 
 
 @app.verb(options=["policies"])
@@ -41,7 +38,7 @@ def check_vut(
     given: Given,
     vut: Annotated[
         str,
-        typer.Argument(help="Vehicle under test, as after --vut.", autocompletion=complete.vuts),
+        typer.Argument(help="Vehicle under test, as after --vut."),
     ],
 ) -> None:
     """Let a VUT drive a few cases, and print what is wrong with it and the cost of a step.
@@ -99,9 +96,7 @@ def check_scenario(
     given: Given,
     name: Annotated[
         str,
-        typer.Argument(
-            metavar="NAME|FILE", help="Scenario to check.", autocompletion=complete.scenarios
-        ),
+        typer.Argument(metavar="NAME|FILE", help="Scenario to check."),
     ],
 ) -> None:
     """Check that a scenario can be hosted, and that the learned drivers were trained on it.
@@ -116,11 +111,7 @@ def check_scenario(
 @app.verb(
     options=["quiet"],
     own={
-        "only": optional(
-            list[str],
-            "Network to train: pov1, vut1, pov2 or vut2.",
-            autocompletion=complete.networks,
-        ),
+        "only": optional(list[str], "Network to train: pov1, vut1, pov2 or vut2."),
         "seed": option(int, 0, "Same seed, same weights on one machine."),
         "scenario": _scenario_option("Scenario, or a file of one.", "us23"),
         "out": optional(

@@ -11,7 +11,6 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from merge_sumo.commands import complete
 from merge_sumo.errors import UserError
 from merge_sumo.samplers import DEFAULT_SAMPLER
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
@@ -97,12 +96,9 @@ VutOption = Annotated[
         metavar="SPEC",
         help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
         "`merge-sumo vuts` lists the kinds.",
-        autocompletion=complete.vuts,
     ),
 ]
-RunArgument = Annotated[
-    Path, typer.Argument(help="Folder of a campaign.", autocompletion=complete.runs)
-]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
 def _runs_of_a_case(text: str) -> int | str:
@@ -131,19 +127,17 @@ CORES: Final = _workers_option(
 SEED: Final = option(int, 0, "Same seed, same cases.")
 OPTIONS: Final[Mapping[str, Shared]] = {
     "vut": (VutOption, ""),
-    "level": option(str, "all", "POV level: 0, 1, 2, own or all.", autocompletion=complete.levels),
+    "level": option(str, "all", "POV level: 0, 1, 2, own or all."),
     "against": optional(
         str,
         "An earlier version of the VUT, of any kind but traci: each case runs with both, and the "
         "sampler looks for those that the VUT alone fails.",
         metavar="SPEC",
-        autocompletion=complete.vuts,
     ),
     "pov": optional(
         str,
         "A POV of your own, of any kind that --vut takes but traci: it drives at level own.",
         metavar="SPEC",
-        autocompletion=complete.vuts,
     ),
     "policies": optional(
         Path,
@@ -157,7 +151,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "Scenario that `merge-sumo scenario list` names, or a TOML file of your own: "
         "`merge-sumo scenario new` writes one.",
         metavar="NAME|FILE",
-        autocompletion=complete.scenarios,
     ),
     "follow_up": optional(
         float,
@@ -183,12 +176,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "psi": optional(float, "Social value orientation of the POV in rad, at level 2."),
     "headway_ahead": optional(float, "Headway to the car ahead in s, in traffic."),
     "headway_behind": optional(float, "Headway of the car behind in s, in traffic."),
-    "sampler": option(
-        str,
-        DEFAULT_SAMPLER,
-        "What chooses the cases: {samplers}.",
-        autocompletion=complete.samplers,
-    ),
+    "sampler": option(str, DEFAULT_SAMPLER, "What chooses the cases: {samplers}."),
     "cases": option(int, 800, "Number of test cases."),
     "in_flight": optional(
         int,
@@ -232,7 +220,6 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "sumo, or kinematic: the equations of motion alone, and SUMO for at least one case of a "
         "hundred. For VUTs and POVs of this package.",
         metavar="NAME",
-        autocompletion=complete.engines,
     ),
     "workers": _workers_option(
         "Processes that run cases, or a Dask scheduler, tcp://HOST:PORT; the outcomes are the "
@@ -254,7 +241,6 @@ VUT_AGAIN: Final = optional(
     "here: a run folder names no code to run.",
     metavar="SPEC",
     show_default="the campaign's",
-    autocompletion=complete.vuts,
 )
 """Option of what drives in cases of a recorded campaign."""
 HOSTING: Final = ("deadline", "vut_memory")

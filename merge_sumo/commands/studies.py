@@ -8,7 +8,6 @@ from typing import Annotated, Final
 
 import typer
 
-from merge_sumo.commands import complete
 from merge_sumo.commands.application import Given, app
 from merge_sumo.commands.options import (
     CORES,
@@ -48,7 +47,6 @@ TRUTH_CASES: Final = "10000, at level 2 20000"
             "hundred. Or sumo for all.",
             metavar="NAME",
             show_default="kinematic where VUT and POV are of this package",
-            autocompletion=complete.engines,
         ),
         "workers": CORES,
     },
@@ -92,11 +90,7 @@ def benchmark(
     vut: VutOption,
     samplers: Annotated[
         str | None,
-        typer.Option(
-            help="Names, separated by commas: {samplers}.",
-            show_default="all",
-            autocompletion=complete.samplers,
-        ),
+        typer.Option(help="Names, separated by commas: {samplers}.", show_default="all"),
     ] = None,
 ) -> None:
     """Compare samplers with each other and with the ground truth, over several seeds.
@@ -126,7 +120,6 @@ def benchmark(
             "With how many cars a merge fails in a traffic: exid-2, exid-3, exid-5, or a TOML file "
             "with density and speeds.",
             metavar="NAME|FILE",
-            autocompletion=complete.traffics,
         ),
         "distribution": optional(
             Path, "JSON: how often cases occur.", metavar="FILE", show_default="uniform"
@@ -195,7 +188,6 @@ def explain(
             "The controller to repair.",
             metavar="SPEC",
             show_default="the campaign's, as its files are now",
-            autocompletion=complete.vuts,
         ),
         "cost": option(
             str,

@@ -1,4 +1,4 @@
-"""The command line as a whole: groups of options, help, completion, and how it stops."""
+"""The command line as a whole: groups of options, help, and how it stops."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ import typer
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.commands import complete
 from merge_sumo.commands.application import unwrapped
 from merge_sumo.commands.options import GROUP_OF, GROUPS, PANELS
 
@@ -107,54 +106,6 @@ class TestHelp:
 
     def test_joins_the_lines_of_a_paragraph(self):
         assert unwrapped("A\n    b.\n\n    C\n    d.\n    ") == "A b.\n\nC d."
-
-
-class TestCompletion:
-    def test_of_a_vut_knows_names_kinds_files_and_what_is_in_them(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        Path("mine.py").write_text("class Vut: ...\ndef drive(seen): ...\n_x = 1\nraise SystemExit")
-        assert [value for value, _ in complete.vuts("design")] == ["design1", "design2"]
-        assert tuple(
-            next(value for value, _ in complete.vuts(begun)) for begun in ("tr", "fm", "mi")
-        ) == ("traci:", "fmu:", "mine.py:")
-        names = [value for value, _ in complete.vuts("mine.py:")]
-        assert names == ["mine.py:Vut", "mine.py:drive"]
-        assert complete.vuts("mine.py:d") == [("mine.py:drive", "")]
-
-    def test_of_a_run_shows_the_newest_first(self, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        for age, name in enumerate(("new", "old")):
-            folder = Path("runs") / name
-            folder.mkdir(parents=True)
-            settings = folder / "campaign.json"
-            settings.write_text("{}")
-            os.utime(settings, (1e9 - age, 1e9 - age))
-        (Path("runs") / "none").mkdir()
-        assert [v for v, _ in complete.runs("")][:2] == ["runs/new", "runs/old"]
-        assert [v for v, _ in complete.runs("runs/o")] == ["runs/old"]
-
-    def test_of_samplers_goes_on_behind_a_comma(self):
-        found = [value for value, _ in complete.samplers("uniform,")]
-        assert "uniform,gpr" in found
-        assert "uniform,uniform" not in found
-
-    @pytest.mark.parametrize(
-        ("typed", "wanted"),
-        [
-            ("campaign --sampler co", "coverage"),
-            ("campaign --level o", "own"),
-            ("check-vut des", "design1"),
-        ],
-    )
-    def test_answers_a_shell(self, typed, wanted):
-        words = f"merge-sumo {typed}"
-        asked = {
-            "_MERGE_SUMO_COMPLETE": "complete_bash",
-            "COMP_WORDS": words,
-            "COMP_CWORD": str(len(words.split()) - 1),
-        }
-        done = CliRunner().invoke(cli.app, [], prog_name="merge-sumo", env=asked)
-        assert wanted in done.output.split()
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
