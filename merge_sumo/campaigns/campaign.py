@@ -15,7 +15,6 @@ from merge_sumo.campaigns.in_flight import Flight, by_rounds, conduct_in_flight
 from merge_sumo.campaigns.plan import resolve_earlier
 from merge_sumo.campaigns.prefetch import ChunkResults, Prefetch, RunChunks, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
-from merge_sumo.campaigns.sampler_copy import search_on_two_cores
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.campaigns.store import FILES, RAN_AGAIN, Batch, Journal, Run, spread_failures
 from merge_sumo.engine.evaluate import (
@@ -340,9 +339,7 @@ def _search(
     if against is not None:
         return _against(campaign, against, workers, on_case)
     settings, plan, history = campaign.settings, campaign.plan, campaign.history
-    picks = settings.new_sampler(twin_of(settings, plan))
-    search_on_two_cores(picks, workers, settings.cases - len(history))
-    sampler = settings.with_repeats(picks)
+    sampler = settings.with_repeats(settings.new_sampler(twin_of(settings, plan)))
     motions = None
     if campaign.before is not None and sampler.uses_predictions:
         motions = {o.index: t.motion for o, t in campaign.recorded()}

@@ -8,9 +8,9 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
@@ -27,7 +27,6 @@ from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -49,63 +48,21 @@ PATIENCE: Final = 40
 """Cases before near misses stand in for failures."""
 
 
-class SamplerCopy(Protocol):
-    """A copy of a sampler, in another process, that is told what the sampler is told.
-
-    Attributes:
-        levels: levels that it searches.
-    """
-
-    levels: Sequence[int]
-
-    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
-        """Tell it outcomes; see `Sampler.tell`."""
-
-    def pend(self, cases: Sequence[Case]) -> None:
-        """Tell it which cases run at present; see `Sampler.pend`."""
-
-    def begin(self, n: int) -> bool:
-        """Have it begin to search a batch of `n` cases; return whether it does."""
-
-    def proposals(self) -> dict[int, Proposal] | None:
-        """Return the batch of each of its levels; None where the copy is gone."""
-
-
 class CoverageSampler(Sampler):
     """Maximises the expected new coverage over all levels.
 
     Gains are in balls, not in volumes: volumes of two and of three dimensions do not compare, and
     level 2 would get no case.
-
-    Attributes:
-        copy: searches some of the levels while this process searches the others; None for all
-            levels here. The proposals are the same.
     """
 
     about = "asks for the batch that promises the most new coverage"
     colour = "#D55E00"
     uses_predictions = True
     overlaps = True
-    copy: SamplerCopy | None = None
-
-    def tell(
-        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
-    ) -> None:
-        """Take outcomes; see `Sampler.tell`."""
-        super().tell(outcomes, motions)
-        if self.copy is not None:
-            self.copy.tell(outcomes, motions)
-
-    def pend(self, cases: Iterable[Case]) -> None:
-        """Take the cases that run at present; see `Sampler.pend`."""
-        pending = list(cases)
-        super().pend(pending)
-        if self.copy is not None:
-            self.copy.pend(pending)
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
-        proposals = self._proposals(n)
+        proposals = self.search(self.pool.levels, n)
         shares = self._shares(proposals, n)
         self._predictions = [
             prediction
@@ -134,17 +91,7 @@ class CoverageSampler(Sampler):
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return the number of cases for each level; they add up to `n`."""
-        return self._shares(self._proposals(n), n)
-
-    def _proposals(self, n: int) -> dict[int, Proposal]:
-        """Return the batch of each level on its own."""
-        levels = self.pool.levels
-        if self.copy is None or not self.copy.begin(n):
-            return self.search(levels, n)
-        theirs = self.copy.levels
-        proposals = self.search([level for level in levels if level not in theirs], n)
-        proposals |= self.copy.proposals() or self.search(theirs, n)
-        return {level: proposals[level] for level in levels}
+        return self._shares(self.search(self.pool.levels, n), n)
 
     def search(self, levels: Sequence[int], n: int) -> dict[int, Proposal]:
         """Return the batch of each of some levels.

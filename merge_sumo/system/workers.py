@@ -76,18 +76,14 @@ class Workers(AbstractContextManager["Workers"]):
         recycle_after: int | None = None,
         on_close: Callable[[], None] | None = None,
         here_s: float | None = None,
-        open_beside: Callable[[], LocalProcesses | None] = lambda: None,
     ) -> None:
         """Open an executor with `count` workers.
 
         `died` is what a future raises when its worker is dead. The executor is closed and opened
         anew after a death, and after `recycle_after` chunks per worker. With `here_s` it is opened
-        only when work in this process has taken so many seconds. `open_beside` is for
-        `start_beside`.
+        only when work in this process has taken so many seconds.
         """
         self.count = count
-        self._open_beside = open_beside
-        self._beside: LocalProcesses | None = None
         self._open = open_executor
         self._here_s, self._here_items = here_s, 0
         """Seconds that this process goes on for, and items that it has begun; None for no more."""
@@ -124,15 +120,6 @@ class Workers(AbstractContextManager["Workers"]):
         chunks = (items[first : first + size] for first in range(0, len(items), size))
         for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
             yield from enumerate(results, start=first)
-
-    def start_beside(self) -> Executor | None:
-        """Start one process more, for what this process would do itself; return its executor.
-
-        None where one worker is to be all, or where the system lets no more processes start.
-        """
-        if self._beside is None:
-            self._beside = self._open_beside()
-        return self._beside
 
     @property
     def here(self) -> bool:
@@ -228,8 +215,6 @@ class Workers(AbstractContextManager["Workers"]):
         """Close the executor; only where work was left behind does it hear of an exception."""
         left_behind = any(not future.done() for future in self._left)
         try:
-            if self._beside is not None:
-                self._beside.end()
             self._executor.__exit__(*(exception if left_behind else (None, None, None)))
         finally:
             if self._on_close is not None:
@@ -312,14 +297,7 @@ def open_workers(
                 return InProcess()
         return LocalProcesses(count, preload)
 
-    def beside() -> LocalProcesses | None:
-        try:
-            check_threads(threads)
-        except UserError:
-            return None
-        return LocalProcesses(1)
-
-    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s, open_beside=beside)
+    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s)
 
 
 def dask_workers(address: str) -> Workers:
@@ -406,11 +384,6 @@ class LocalProcesses(ProcessPoolExecutor):
         super().shutdown(wait, cancel_futures=cancel_futures)
         if wait:
             self._scratch.cleanup()
-
-    def end(self) -> None:
-        """End the workers, whatever they do: nobody waits for it."""
-        self._kill()
-        self.shutdown(wait=True, cancel_futures=True)
 
     def _kill(self) -> None:
         for process in list((self._processes or {}).values()):
