@@ -60,6 +60,8 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Return a project in which a campaign has run, of 6 of 12 cases."""
     folder = project(tmp_path / "mine")
     monkeypatch.chdir(folder)
+    # A module of this name of another test is in another folder.
+    monkeypatch.delitem(sys.modules, "my_vut", raising=False)
     run_campaign(campaign_settings(**FEW, cases=6), Path("run"))
     assert ran(folder)
     return folder

@@ -371,7 +371,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
 
 
-@pytest.mark.parametrize("name", some([None, "curved", "left turn"], None, "left turn"))
+@pytest.mark.parametrize("name", some([None, "curved"], None, "curved"))
 def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
     if name is not None:
         corridor = corridor_of(name, tmp_path)

@@ -184,10 +184,14 @@ class TestParameters:
         )
         keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.0015"}
         run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, **keywords)
-        (of_brake,) = ms.explain(run, 0, params=["brake_mps2=0..4"]).found.parameters
+        (of_brake,) = ms.explain(
+            run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=0..4"]
+        ).found.parameters
         # It fails above 2.0015, and thousandths of the range's digits are tried.
         assert of_brake == Axis("brake_mps2", 3.0, 0.0, 4.0, 0.1, 3, below=2.001)
-        (refused,) = ms.explain(run, 0, params=["brake_mps2=1.9..4"]).found.parameters
+        (refused,) = ms.explain(
+            run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=1.9..4"]
+        ).found.parameters
         assert refused.below == 2.001
 
 
@@ -228,7 +232,7 @@ def test_a_controller_that_is_another_now_or_decides_by_chance_is_refused(tmp_pa
     turns = "import itertools\nTURNS = itertools.cycle([1.0] * 997 + [-2.0] * 991)\n"
     mine.write_text(f"{turns}def drive(seen):\n    {now}\n")
     with pytest.raises(UserError, match="nothing can be said of its changes"):
-        ms.explain(own)
+        ms.explain(own, vut=f"{mine}:drive")
 
 
 class TestTheFile:

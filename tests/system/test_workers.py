@@ -171,15 +171,6 @@ class TestLocalProcesses:
             stopped()
         assert died == []
 
-    def test_end_at_once_while_they_are_given_more_than_a_pipe_holds(self):
-        workers = LocalProcesses(1)
-        for _ in range(3):
-            workers.submit(asleep, bytes(3_000_000))
-        ending = threading.Thread(target=workers.end, daemon=True)
-        ending.start()
-        ending.join(30.0)
-        assert not ending.is_alive()
-
     @pytest.mark.slow
     def test_are_replaced_after_a_number_of_chunks(self):
         with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
