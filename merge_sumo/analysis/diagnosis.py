@@ -137,13 +137,9 @@ def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
     return (*(_due(row) for row in cars), v, x, *others)
 
 
-def _of_coordinate(coordinate: Coordinate) -> Feature:
-    return Feature(
-        coordinate.name,
-        coordinate.unit,
-        DECIMALS.get(coordinate.unit, coordinate.digits),
-        lambda case: coordinate.of(case) or 0.0,
-    )
+def _of_coordinate(c: Coordinate) -> Feature:
+    digits = DECIMALS.get(c.unit, c.digits)
+    return Feature(c.name, c.unit, digits, lambda case: c.of(case) or 0.0)
 
 
 def _due(row: int) -> Feature:

@@ -551,7 +551,7 @@ def export(
     Args:
         run: the campaign, or its folder.
         indices: its cases; of a table all of them when left out.
-        file_format: "sumo" or "openscenario" for folders, "csv" or "parquet" for one
+        file_format: "sumo" or "openscenario" for folders, "csv" for one
             table, or the name of a format that an installed package brings.
         out: folder; `scenarios` or `exports` in that of the campaign when left out.
     """

@@ -71,7 +71,7 @@ class CampaignSettings:
                 raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
         if OWN in self.levels and self.pov is None:
             raise UserError("level own is that of a POV of your own: name one as pov")
-        self._check_sampler()
+        self.new_sampler()
         for name in ("cases", "batch", "in_flight", "repeat"):
             number = getattr(self, name)
             if isinstance(number, int) and number < 1:
@@ -107,9 +107,6 @@ class CampaignSettings:
                     f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
                     "rename it"
                 )
-
-    def _check_sampler(self) -> None:
-        self.new_sampler()
 
     def _check_in_flight(self, in_flight: int) -> None:
         if self.batch is not None:

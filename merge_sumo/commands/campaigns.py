@@ -259,7 +259,7 @@ def compare(
             str,
             "sumo",
             "Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
-            "OpenSCENARIO and OpenDRIVE. csv, parquet: "
+            "OpenSCENARIO and OpenDRIVE. csv: "
             "one table of motion.",
             "--format",
         ),
@@ -273,7 +273,7 @@ def export(
     run: RunArgument,
     case: Annotated[
         list[int] | None,
-        typer.Argument(help="Indices of cases in outcomes.jsonl; csv, parquet: all if left out."),
+        typer.Argument(help="Indices of cases in outcomes.jsonl; csv: all if left out."),
     ] = None,
 ) -> None:
     """Write cases of a campaign for SUMO, for other simulators, or as a table.

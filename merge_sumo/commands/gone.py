@@ -51,6 +51,7 @@ OPTIONS: Final[Mapping[str, str]] = {
     "--vut-command": 'the spec has the command, as in --vut "traci:python my.py {port}"',
     "--v-vut0": "a scenario file has v_vut0_mps, and `merge-sumo run` has --at v_vut0_mps=NUMBER",
     "export commonroad": "`--format openscenario` writes the motion for other simulators",
+    "export parquet": "`--format csv` writes the same table",
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "campaign --batch": "a sampler chooses the size of its batches; `ms.campaign(batch=20)` in "
     "Python has another",

@@ -1,7 +1,6 @@
 """Cases of a campaign for others: SUMO folders, OpenSCENARIO, tables of motion.
 
-Nothing here loads libsumo. Parquet is written by polars and not by pyarrow: libsumo is linked with
-an Arrow of its own and warns wherever a pyarrow is installed.
+Nothing here loads libsumo.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -89,41 +87,25 @@ def columns_of(scenario: Scenario) -> tuple[str, ...]:
     return ("case", "level", "time_s", *motion, *merged, *place, SEVERITY)
 
 
-def write_table(run: Run, indices: Sequence[int], folder: Path, file_format: str) -> Path:
-    """Write the motion of cases as one table, "csv" or "parquet", one row a step; return its path.
+def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
+    """Write the motion of cases as one table, one row a step; return its path.
 
-    Raises `UserError` when the file exists, a case has no trajectory, or polars is missing.
+    Raises `UserError` when the file exists, or a case has no trajectory.
     """
     check_place(folder)
-    path = folder / f"{TABLE}.{file_format}"
+    path = folder / f"{TABLE}.csv"
     check_new(path)
-    if file_format == "parquet":
-        polars = _need("polars")
     names = _signal_names(run, indices)
     columns = (*columns_of(run.scenario), *(f"{SIGNAL}{name}" for name in names))
     rows = _rows(run, indices, names)
     make_place(folder)
     with new_file(path) as file:
-        if file_format == "parquet":
-            # Not into the file: where that cannot be written, polars raises an error of its own.
-            content = io.BytesIO()
-            numbers = dict.fromkeys(columns, polars.Float64)
-            integers = {"case", "level", MERGED}.intersection(columns)
-            schema = numbers | dict.fromkeys(integers, polars.Int64)
-            schema[SEVERITY] = polars.String
-            for place in range(len(columns) - len(names), len(columns)):
-                if any(isinstance(row[place], str) for row in rows):
-                    schema[columns[place]] = polars.String
-                    rows = [_with_text(row, place) for row in rows]
-            polars.DataFrame(rows, schema, orient="row").write_parquet(content)
-            file.write(content.getbuffer())
-        else:
-            text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-            writer = csv.writer(text)
-            writer.writerow(columns)
-            writer.writerows(map(_without_formulas, rows))
-            text.flush()
-            text.detach()
+        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
+        writer = csv.writer(text)
+        writer.writerow(columns)
+        writer.writerows(map(_without_formulas, rows))
+        text.flush()
+        text.detach()
     return path
 
 
@@ -139,12 +121,6 @@ def _without_formulas(row: Row) -> Row:
         f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
         for value in row
     )
-
-
-def _with_text(row: Row, place: int) -> Row:
-    """Return a row with a text in a place: a column has numbers or texts."""
-    value = row[place]
-    return row if value is None else (*row[:place], str(value), *row[place + 1 :])
 
 
 def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
@@ -350,9 +326,4 @@ SUMO: Final = ExportFormat(
 OPENSCENARIO: Final = ExportFormat(
     about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
 )
-CSV: Final = ExportFormat(
-    about="one table of motion", write_table=partial(write_table, file_format="csv")
-)
-PARQUET: Final = ExportFormat(
-    about="one table of motion, as columns", write_table=partial(write_table, file_format="parquet")
-)
+CSV: Final = ExportFormat(about="one table of motion", write_table=write_table)

@@ -14,7 +14,6 @@ FORMATS: Final[Registry[ExportFormat]] = Registry(
         "sumo": "merge_sumo.reports.exports:SUMO",
         "openscenario": "merge_sumo.reports.exports:OPENSCENARIO",
         "csv": "merge_sumo.reports.exports:CSV",
-        "parquet": "merge_sumo.reports.exports:PARQUET",
     },
     accepts=lambda item: (
         isinstance(item, ExportFormat) and (item.write_case is None) != (item.write_table is None)

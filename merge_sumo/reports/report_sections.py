@@ -16,7 +16,6 @@ from markupsafe import Markup
 from merge_sumo.analysis.diagnosis import BRAKED_MPS, MEANING
 from merge_sumo.analysis.merging import REAR_HEADWAY_S, SITES, SOURCE
 from merge_sumo.analysis.plausibility import doubts
-from merge_sumo.analysis.predictions import prediction_in_words
 from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import in_words
@@ -78,7 +77,7 @@ def shared_words(model: ReportModel) -> dict[str, Any]:
         "levels": levels,
         "any_truth": any(level["truth"] is not None for level in levels),
         "counted": summary.cases - len(model.shown),
-        "predicted": prediction_in_words(run.outcomes),
+        "predicted": any(outcome.prediction for outcome in run.outcomes),
         "avoidance": list(REFERENCES) if model.avoidance else [],
         "varied": any(one.varies for one in model.repeated.values()),
         "repeated": model.repeated,

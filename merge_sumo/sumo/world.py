@@ -287,8 +287,12 @@ class World:
         try:
             if merged is not None:
                 self._change_lanes(merged, expected_m[VUT], v_mps[VUT])
-            if self.vut_type is not None or self.car_type is not None:
-                self._put_driven(expected_m, v_mps, a_mps2)
+            driven_by_sumo = self.vut_type is not None or self.car_type is not None
+            for row, k in np.argwhere(~self._obeys).tolist() if driven_by_sumo else ():
+                name, x = self._ids[row * self.corridors + k], float(expected_m[row, k])
+                lane, start_m = self._lane_at(row, k, x)
+                self._move_to(name, lane, x - start_m)
+                self._set_previous_speed(name, float(v_mps[row, k]), float(a_mps2[row, k]))
             # A vehicle that keeps its speed needs no command: SUMO holds the last one.
             told = (v_mps != self.v_mps) & self._obeys
             names, speeds = [*compress(self._ids, told.ravel().tolist())], v_mps[told].tolist()
@@ -311,14 +315,6 @@ class World:
             self._merged[k] = True
             lane, start_m = self._lane_at(VUT, k, float(x_m[k]))
             self._move_to(self._ids[VUT * self.corridors + k], lane, float(x_m[k]) - start_m)
-
-    def _put_driven(self, x_m: FloatArray, v_mps: FloatArray, a_mps2: FloatArray) -> None:
-        """Put the vehicles that SUMO drives where eq. (4) leads."""
-        for row, k in np.argwhere(~self._obeys).tolist():
-            name, x = self._ids[row * self.corridors + k], float(x_m[row, k])
-            lane, start_m = self._lane_at(row, k, x)
-            self._move_to(name, lane, x - start_m)
-            self._set_previous_speed(name, float(v_mps[row, k]), float(a_mps2[row, k]))
 
     def read(self) -> None:
         """Read positions and speeds of all vehicles from SUMO, wherever it has driven them."""

@@ -336,9 +336,8 @@ class TestATextOfAStranger:
 
     def test_is_in_no_table_and_leaves_xml_readable(self, name, honest, tmp_path):
         folder = received(honest, tmp_path / "run", TEXTS[name])
-        for file_format in ("csv", "parquet"):
-            code, _, err = call("export", folder, "--format", file_format, "--out", tmp_path / "t")
-            assert code == 0, err
+        code, _, err = call("export", folder, "--format", "csv", "--out", tmp_path / "t")
+        assert code == 0, err
         with (tmp_path / "t" / "trajectories.csv").open(newline="") as file:
             header, *rows = csv.reader(file)
         assert all(name.replace("_", "").isalnum() for name in header)

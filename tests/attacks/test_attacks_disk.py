@@ -74,7 +74,6 @@ WRITERS = {
     "probability": ("probability", "run", "--cases", "40", "--out", "{disk}/p.json"),
     "export": ("export", "run", "0", "1", "--out", "{disk}/new"),
     "export csv": ("export", "run", "--format", "csv", "--out", "{disk}/new"),
-    "export parquet": ("export", "run", "--format", "parquet", "--out", "{disk}/new"),
     "openscenario": ("export", "run", "0", "--format", "openscenario", "--out", "{disk}/new"),
     "report": ("report", "{disk}/stopped"),
     "junit": (*SMALL, "--out", "new", "--junit", "{disk}/junit.xml"),
@@ -114,7 +113,7 @@ def test_a_disk_that_is_full_ends_every_writer_in_a_sentence(name, left, run, sm
     news = set(after) - set(before)
     begun = ("policies/", "paper/", "new/", "p.jsonl", "stopped/trajectories/", "cache/key")
     assert not [n for n in news if not n.startswith(begun)]
-    assert not {n for n in news if n.endswith((".csv", ".parquet", ".onnx", ".html", "p.json"))}
+    assert not {n for n in news if n.endswith((".csv", ".onnx", ".html", "p.json"))}
     for campaign, cases in (("new", 0), ("stopped", 20)):
         if f"{campaign}/{OUTCOMES}" in after:
             assert len(Run(small_disk / campaign).outcomes) == cases

@@ -44,7 +44,7 @@ COMMANDS = {
     "check-vut --vut design1": 0,
     "probability --vut design1 --level 0 --cases 20 --out new": 0,
     "truth --vut design1 --level 0 --cases 100 --out new": None,
-    "compare --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform --out new": None,
+    "benchmark --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform": None,
 }
 """Commands, and the exit codes that they have; None where it is as without the attack."""
 

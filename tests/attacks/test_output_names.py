@@ -218,14 +218,12 @@ class TestAHundredNames:
         )
         assert set(appeared) == {*ODD, *FOLDERS} & {*names}
 
-    @pytest.mark.parametrize(("file_format", "odd"), [("csv", ODD), ("parquet", ODD[:6])])
-    def test_of_a_table_touch_nothing(self, world, call, made, file_format, odd, names):
-        arguments = ("export", made.folder, 1, "--format", file_format)
-        names = [name for name in names if name not in ODD or name in odd]
+    def test_of_a_table_touch_nothing(self, world, call, made, names):
+        arguments = ("export", made.folder, 1, "--format", "csv")
         appeared = assert_nothing_was_touched(
             world, lambda name: call(*arguments, f"--out={name}"), names
         )
-        assert set(appeared) >= {*odd} & {*names}
+        assert set(appeared) >= {*ODD} & {*names}
 
     def test_of_openscenario_touch_nothing(self, world, call, made, names):
         names = [*(name for name in names if name not in ODD), "a:b", "${HOME}", "a%b", "a,b"]

@@ -26,7 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import columns_of, write_folders, write_openscenario, write_table
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import BEHIND, DT_S, US23
+from merge_sumo.values.scenario import BEHIND, DT_S
 
 
 @pytest.fixture(scope="module")
@@ -195,10 +195,9 @@ class TestAMergeFromALane:
         )
         assert (into, out) == (set(), {("-1", "-1"), ("-2", "-2")})
 
-    @pytest.mark.parametrize("file_format", ["csv", "parquet"])
-    def test_is_a_column_of_a_table(self, made, tmp_path, file_format):
-        path = write_table(made, [0, 1], tmp_path / "table", file_format)
-        frame = (polars.read_csv if file_format == "csv" else polars.read_parquet)(path)
+    def test_is_a_column_of_a_table(self, made, tmp_path):
+        path = write_table(made, [0, 1], tmp_path / "table")
+        frame = polars.read_csv(path)
         assert frame.columns == list(columns_of(made.scenario))
         first, second = (frame.filter(case=case)["merged"].to_list() for case in (0, 1))
         assert first == [*(0 for _ in first[1:]), 1]
@@ -207,7 +206,7 @@ class TestAMergeFromALane:
 
 class TestATable:
     def test_has_a_row_for_every_step_of_every_case(self, made, tmp_path):
-        path = write_table(made, [0, 3], tmp_path, "csv")
+        path = write_table(made, [0, 3], tmp_path)
         with path.open(newline="") as file:
             header, *rows = csv.reader(file)
         assert header == [
@@ -226,18 +225,11 @@ class TestATable:
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
 
-    def test_is_the_same_in_parquet(self, made, tmp_path):
-        frame = polars.read_parquet(write_table(made, [0, 3], tmp_path, "parquet"))
-        text = polars.read_csv(write_table(made, [0, 3], tmp_path, "csv"))
-        assert frame.columns == list(columns_of(US23))
-        assert frame.rows() == text.rows()
-
-    @pytest.mark.parametrize("file_format", ["csv", "parquet"])
-    def test_has_all_cars_and_all_coordinates_of_the_case(self, tmp_path, file_format):
+    def test_has_all_cars_and_all_coordinates_of_the_case(self, tmp_path):
         scenario = named_scenario("us23-traffic")
         run = write_run(tmp_path / "run", 2, levels=(1, 2), error=None, scenario=scenario)
-        path = write_table(run, [0, 1], tmp_path / "table", file_format)
-        frame = (polars.read_csv if file_format == "csv" else polars.read_parquet)(path)
+        path = write_table(run, [0, 1], tmp_path / "table")
+        frame = polars.read_csv(path)
         assert frame.columns[9:15] == [
             *("x_ahead_m", "v_ahead_mps", "a_ahead_mps2"),
             *("x_behind_m", "v_behind_mps", "a_behind_mps2"),
@@ -258,19 +250,16 @@ class TestTheCommand:
         assert isinstance(said.exception, UserError)
         assert "indices" in str(said.exception)
 
-    @pytest.mark.parametrize(
-        ("package", "file_format"), [("polars", "parquet"), ("scenariogeneration", "openscenario")]
-    )
-    def test_says_what_to_install(self, made, tmp_path, monkeypatch, package, file_format):
+    def test_says_what_to_install(self, made, tmp_path, monkeypatch):
         load = importlib.import_module
 
         def refuse(name, *rest):
-            if name == package:
+            if name == "scenariogeneration":
                 raise ImportError(name)
             return load(name, *rest)
 
         monkeypatch.setattr(importlib, "import_module", refuse)
-        said = invoke("export", made.folder, 1, "--format", file_format, "--out", tmp_path)
+        said = invoke("export", made.folder, 1, "--format", "openscenario", "--out", tmp_path)
         assert isinstance(said.exception, UserError)
         assert "merge-sumo[export]" in str(said.exception)
         assert list(tmp_path.iterdir()) == []

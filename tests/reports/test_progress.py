@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import io
-import sys
-import types
 from dataclasses import replace
 
 import pytest
@@ -18,7 +16,6 @@ from merge_sumo.reports import report
 from merge_sumo.reports.progress import (
     Bars,
     CampaignBars,
-    is_watched,
     rate_text,
 )
 from merge_sumo.reports.report import (
@@ -130,14 +127,6 @@ class TestARate:
             bars.counted("truth", 50, 200, "cases")
         assert "50/200" in drawn.getvalue()
         assert "0:00:06 left" in drawn.getvalue()
-
-
-def test_a_notebook_is_watched(monkeypatch):
-    notebook = types.ModuleType("IPython")
-    vars(notebook).update(get_ipython=lambda: types.SimpleNamespace(kernel=object()))
-    assert not is_watched()
-    monkeypatch.setitem(sys.modules, "IPython", notebook)
-    assert is_watched()
 
 
 class TestTheReportOfACampaignThatRuns:

@@ -61,7 +61,7 @@ def test_help_and_lists_name_what_it_brings(merge_sumo):
     options = merge_sumo("campaign", "--help")
     assert "coverage or middle" in options
     assert "unsafe or near" in options
-    assert "parquet or endings" in merge_sumo("export", "--help")
+    assert "csv or endings" in merge_sumo("export", "--help")
     assert "constant:MPS2" in merge_sumo("vuts")
 
 

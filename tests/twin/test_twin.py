@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from plans import POVS, plan_for
 
-from merge_sumo.analysis.predictions import prediction_error_m, prediction_in_words, surprises
+from merge_sumo.analysis.predictions import prediction_error_m, surprises
 from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.engine.evaluate import run_cases
@@ -297,12 +296,6 @@ def test_a_sampler_without_games_is_the_surrogate_alone():
 
 
 class TestTheReport:
-    def test_says_how_well_it_was_predicted(self, whole):
-        words = prediction_in_words(whole.outcomes)
-        assert words is not None
-        assert re.match(r"In half of the last \d+ cases the error was below \d", words)
-        assert prediction_in_words([outcome(0, 1.0)]) is None
-
     def test_lists_what_came_otherwise_than_predicted(self):
         told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
         missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))

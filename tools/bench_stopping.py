@@ -1,0 +1,57 @@
+"""Show where `--stop-when-converged` ends a search: `python tools/bench_stopping.py`.
+
+For each VUT it runs 1,600 cases, and prints the number of cases at which the coverage of all levels together first has
+.97 of that of the whole search, the number at which the rule stops, and the share found by then.
+`--vut SPEC` names others, `--seed` another search.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import merge_sumo as ms
+from merge_sumo.campaigns.stopping import coverage_by_level, has_converged
+from merge_sumo.values.score import Outcome
+
+VUTS = ("design1", "design2", "gap", "sumo:IDM")
+CASES = 1600
+NEARLY = 0.97
+
+
+def ends_of_batches(outcomes: Sequence[Outcome]) -> list[int]:
+    """Return the numbers of cases after each batch."""
+    last = {outcome.batch: outcome.index + 1 for outcome in outcomes}
+    return sorted(last.values())
+
+
+def row(vut: str, seed: int, folder: Path) -> str:
+    """Return the line of a VUT."""
+    run = ms.campaign(vut, cases=CASES, seed=seed, out=folder, progress=False, workers=None)
+    outcomes = run.run.outcomes
+    whole = sum(coverage_by_level(outcomes).values())
+    if not whole:
+        return f"{vut:12s} no failure"
+    ends = ends_of_batches(outcomes)
+    share = {n: sum(coverage_by_level(outcomes[:n]).values()) / whole for n in ends}
+    nearly = next(n for n in ends if share[n] >= NEARLY)
+    stop = next((n for n in ends if has_converged(outcomes[:n])), CASES)
+    return f"{vut:12s} {nearly:6d} {stop:6d} {share[stop]:8.3f}"
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--vut", action="append", help="a VUT; may be given several times")
+    parser.add_argument("--seed", type=int, default=11)
+    options = parser.parse_args()
+    print(f"{'VUT':12s} {NEARLY:6.2f} {'stop':>6s} {'share':>8s}")
+    for vut in options.vut or VUTS:
+        with tempfile.TemporaryDirectory() as folder:
+            print(row(vut, options.seed, Path(folder) / "run"), flush=True)
+
+
+if __name__ == "__main__":
+    main()
