@@ -1,8 +1,8 @@
 """Show where `--stop-when-converged` ends a search: `python tools/bench_stopping.py`.
 
-For each VUT it runs 1,600 cases, and prints the number of cases at which the coverage of all levels together first has
-.97 of that of the whole search, the number at which the rule stops, and the share found by then.
-`--vut SPEC` names others, `--seed` another search.
+For each VUT it runs 1,600 cases, and prints the number of them at which the coverage of all levels
+together first has .97 of that of the whole search, the number at which the rule stops, and the
+share found by then. `--vut SPEC` names others, `--seed` another search.
 """
 
 from __future__ import annotations
