@@ -67,12 +67,12 @@ class Change(StrEnum):
     BROKE = "broke"
     LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
-    NEITHER = "passes with neither"
+    NEITHER = "pass with neither"
     STILL_CONTACT = "contact without failure"
     FIXED = "fixed"
     EARLIER_ALONE = "found in the earlier alone"
     NOT_SEEN = "not looked at"
-    BOTH = "passes with both"
+    BOTH = "pass with both"
 
 
 def passes(outcome: Outcome) -> bool:

@@ -224,7 +224,7 @@ def test_json_has_the_transitions_and_every_case(call, run, fixed):
     (step,) = told["steps"]
     assert told["worse"] is False
     assert sum(row["cases"] for row in step["transitions"]) == 60
-    assert {case["change"] for case in step["cases"]} == {"passes with neither"}
+    assert {case["change"] for case in step["cases"]} == {"pass with neither"}
     assert len(step["cases"]) == len(failures(run.outcomes))
     assert call("compare", fixed.folder, run.folder).code == 1
     assert call("compare", run.folder, fixed.folder).code == 0
