@@ -140,3 +140,13 @@ def small_disk(tmp_path):
     require(done.returncode == 0, f"mount: {done.stderr.decode().strip()}")
     yield disk
     subprocess.run([UMOUNT, "--lazy", str(disk)], check=True)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item):
+    """Measure coverage behind a test in which an exception of a signal has ended the tracer."""
+    tracer = sys.gettrace()
+    yield
+    if tracer is not None and sys.gettrace() is None:
+        item.warn(pytest.PytestWarning("the tracer of coverage had ended and goes on"))
+        sys.settrace(tracer)

@@ -45,6 +45,7 @@ def test_a_controller_that_merges_earlier_fails_less(tmp_path, monkeypatch, comm
     assert "`Late` fails in 47 of these 100 cases" in PAGE
     assert "2 failures" in first_gap
     assert "fails in 2 of 100 cases" in PAGE
-    assert "47, 2, 0, 0, 0, 0, 0" in compared
+    assert "47 failures" in compared
+    assert "2 failures" in compared
     assert median(places(tmp_path / "runs" / "late")) == pytest.approx(0.83, abs=0.005)
     assert median(places(tmp_path / "runs" / "first-gap")) < 0.05

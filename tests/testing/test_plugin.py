@@ -96,7 +96,7 @@ def test_the_report_has_its_section_and_a_column_for_its_measure(folder):
 
 @pytest.mark.slow
 def test_commands_that_read_the_campaign_know_it(folder, merge_sumo):
-    assert "closest approach" in merge_sumo("run", "--case", "run", "3")
+    assert "closest approach" in merge_sumo("run", "--case", "run", "3", "--vut", "constant:0.5")
     merge_sumo("export", "run", "--format", "endings", "--out", "written")
     lines = (merge_sumo.work / "written" / "endings.jsonl").read_text().splitlines()
     assert len(lines) == 40

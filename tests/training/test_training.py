@@ -418,7 +418,7 @@ class TestTrainingForAnotherScenario:
     @pytest.mark.slow
     def test_the_regret_is_printed_and_the_manifest_has_the_scenario(self, trained):
         folder, said = trained
-        assert "pov1: mean regret" in said
+        assert "network  mean regret" in said
         entry = read_manifest(folder)["pov1"]
         assert entry["command"] == "merge-sumo train --only pov1 --seed 0 --scenario ring"
         assert entry["scenario"]["x_vut0_m"] == -40.02
