@@ -12,6 +12,8 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from bench_record import add_record_option, append_record
+
 import merge_sumo as ms
 from merge_sumo.campaigns.stopping import coverage_by_level, has_converged
 from merge_sumo.values.score import Outcome
@@ -46,11 +48,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--vut", action="append", help="a VUT; may be given several times")
     parser.add_argument("--seed", type=int, default=11)
+    add_record_option(parser)
     options = parser.parse_args()
+    rows = {}
     print(f"{'VUT':12s} {NEARLY:6.2f} {'stop':>6s} {'share':>8s}")
     for vut in options.vut or VUTS:
         with tempfile.TemporaryDirectory() as folder:
-            print(row(vut, options.seed, Path(folder) / "run"), flush=True)
+            rows[vut] = row(vut, options.seed, Path(folder) / "run")
+            print(rows[vut], flush=True)
+    append_record(options.record, "stopping", rows)
 
 
 if __name__ == "__main__":

@@ -73,17 +73,6 @@ def test_batches_that_were_not_written_to_their_end_run_again(in_turn, tmp_path,
     assert recorded(tmp_path / "run") == in_turn
 
 
-def test_who_does_not_learn_is_foreseen_in_every_batch():
-    pool = Pool(levels=(0, 1, 2), scenario=US23)
-    sampler, history = make_sampler("uniform", pool, 7), [episode(0)[0], episode(1)[0]]
-    sampler.tell(history)
-    ahead = list(proposals(make_sampler("uniform", pool, 7), history, 50, 20))
-    assert [len(batch) for batch in ahead] == [20, 20, 8]
-    for batch in ahead:
-        assert sampler.ask(len(batch)) == batch
-        sampler.skip(batch)
-
-
 @pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "uniform"])
 def test_who_learns_is_not_foreseen(name):
     assert SAMPLERS[name].learns

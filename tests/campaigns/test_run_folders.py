@@ -175,7 +175,10 @@ class TestAChangedController:
 
 class TestCodeThatOthersMayWrite:
     @pytest.mark.parametrize("what", ["my_vut.py", "."])
-    def test_is_not_run(self, mine: Path, what: str, command_line: Call) -> None:
+    def test_is_not_run(
+        self, mine: Path, what: str, command_line: Call, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.syspath_prepend(mine)  # before folders of other tests
         (mine / what).chmod(0o777)
         for vut in (SPEC, "my_vut:Vut", f"traci:{sys.executable} my_vut.py {{port}}"):
             said = command_line("campaign", "--vut", vut, "--cases", 2, "-q")
