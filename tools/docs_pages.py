@@ -33,11 +33,30 @@ def cli_page() -> str:
     from merge_sumo import cli
 
     command = typer.main.get_command(cli.app)
+    _keep_summaries_whole(command)
     text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="merge-sumo")
     # An example is on a line of its own in --help, and is a block here.
     text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
     head = "# Commands\n\nThis is `merge-sumo COMMAND --help` of all commands.\n"
-    return text.replace("# `merge-sumo`\n", head + _options_table(command), 1)
+    head += EXIT_CODES + _options_table(command)
+    return text.replace("# `merge-sumo`\n", head, 1)
+
+
+def _keep_summaries_whole(command: Any) -> None:
+    """Set the summaries of commands in a list of them, which click would cut at 45 characters."""
+    for below in getattr(command, "commands", {}).values():
+        below.short_help = below.help.partition("\n\n")[0]
+        _keep_summaries_whole(below)
+
+
+EXIT_CODES = """
+| exit code | meaning |
+|---|---|
+| 0 | finished |
+| 1 | finished, with the result that the command describes below, such as a case that broke |
+| 2 | wrong usage, or a limit of the system (disk, memory, processes), with one sentence |
+| 130, 141, 143 | stopped by Ctrl-C, by a closed pipe, by SIGTERM |
+"""
 
 
 SHARED = (
@@ -60,7 +79,7 @@ def _options_table(application: Any) -> str:
             rows.append(f"| `{name}` | {' | '.join(marks)} |")
     titles = " | ".join(f"`--{name.replace('_', '-')}`" for name in SHARED)
     rule = "|---" * (len(SHARED) + 1) + "|"
-    about = "\nOptions that several commands have are the same in all of them:\n\n"
+    about = "\nOptions that several commands have; defaults may differ between commands:\n\n"
     return f"{about}| command | {titles} |\n{rule}\n" + "\n".join(rows) + COMPLETION
 
 

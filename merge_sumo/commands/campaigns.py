@@ -68,7 +68,7 @@ def campaign(
     Ctrl-C lets the running batch end and says how to go on; twice stops at once.
 
     Exit code 1 when a --gate is met, and always when the VUT merged in no case: then
-    nothing was tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
+    nothing was tested. 2 for bad use, 130, 141 or 143 when it was stopped, else 0.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
