@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
+from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.campaigns.store import SETTINGS, scenario_of
 from merge_sumo.drivers.policies import policies_in, policies_name

@@ -17,10 +17,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.wrapper import SamplerWrapper
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, fails_above, runs_needed
 from merge_sumo.values.fmc import radius_for
+from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
 
 ONE_IN: Final = 8
@@ -35,15 +35,20 @@ LEAST_GAIN: Final = 0.05
 """Of a decision on a case in the midst of decided failing cases, as a share of one far from all."""
 
 
-class RepeatingSampler(SamplerWrapper):
-    """A sampler among whose picks repeats are."""
+class RepeatingSampler(Sampler):
+    """A sampler that puts repeats among the picks of another one."""
 
     draws: int = 1
-    """How often each pick of the sampler runs at once."""
+    """How often each pick of the other sampler runs at once."""
 
     def __init__(self, sampler: Sampler) -> None:
         """Take a sampler that was told nothing."""
-        super().__init__(sampler)
+        super().__init__(sampler.pool, sampler.seed)
+        self._sampler = sampler
+        self.learns, self.overlaps = sampler.learns, sampler.overlaps  # type: ignore[misc]
+        self.uses_predictions = sampler.uses_predictions  # type: ignore[misc]
+        self._places: list[int | None] = []
+        """By the place in the last batch, the place among the other sampler's picks."""
         self._drawn: dict[Case, int] = {}
         """Draws proposed of each case by its start, but for those that are pending."""
 
@@ -52,13 +57,18 @@ class RepeatingSampler(SamplerWrapper):
         """Return the repeats of the next `n` cases, at most so many."""
 
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases: repeats, then the sampler's own picks with their draws."""
+        """Return the next `n` cases: repeats, then the other sampler's picks with their draws."""
         repeats = self.repeats(n)
         rest = n - len(repeats)
         own = self._sampler.ask(ceil(rest / self.draws)) if rest else []
         pairs = [(number, draw) for number in range(len(own)) for draw in range(self.draws)][:rest]
         self._places = [*(None for _ in repeats), *(n if draw == 0 else None for n, draw in pairs)]
         return [*repeats, *(replace(own[number], draw=draw) for number, draw in pairs)]
+
+    def prediction(self, place: int) -> Prediction | None:
+        """Return the prediction of a case of the last batch; None for a repeat."""
+        number = self._places[place]
+        return None if number is None else self._sampler.prediction(number)
 
     def batch_size(self) -> int:
         """Return the preferred number of cases of the next batch."""
@@ -69,12 +79,19 @@ class RepeatingSampler(SamplerWrapper):
     ) -> None:
         """Take outcomes, also those of repeats."""
         super().tell(outcomes, motions)
+        self._sampler.tell(outcomes, motions)
         _count(self._drawn, (outcome.case for outcome in outcomes))
+
+    def pend(self, cases: Iterable[Case]) -> None:
+        """Take the cases that run at present."""
+        super().pend(cases)
+        self._sampler.pend(self._pending)
 
     def skip(self, cases: Iterable[Case]) -> None:
         """Count cases as proposed whose outcomes will not be told."""
         skipped = list(cases)
         super().skip(skipped)
+        self._sampler.skip(skipped)
         _count(self._drawn, skipped)
 
     def drawn(self) -> dict[Case, int]:

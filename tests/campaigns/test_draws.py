@@ -13,8 +13,8 @@ import pytest
 from campaigning import resume_campaign, run_campaign
 
 from merge_sumo import api
+from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.repeats import read_repeats
-from merge_sumo.campaigns.repetition import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
