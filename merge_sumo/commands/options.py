@@ -193,7 +193,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     "repeat": option(
         str,
         "1",
-        "Run each case so often, with another draw of what is random; auto repeats a case where "
+        "Number of runs of each case, each with other random numbers; auto repeats a case where "
         "chance decides on it. Each run is one of the --cases.",
         metavar="N|auto",
         callback=_runs_of_a_case,

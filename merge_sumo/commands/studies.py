@@ -168,10 +168,10 @@ def explain(
 ) -> None:
     """Say why a failure fails: the smallest change of one thing with which it passes.
 
-    Each coordinate of the start, psi, the level of the POV, and each parameter that is named: cases
-    with other values run, and what is said of one runs twice. A campaign does this, but for the
-    parameters, for its worst failure if the VUT is of this package; `report` shows all that were
-    explained.
+    Each coordinate of the start, the level of the POV and each named parameter changes by itself:
+    cases with other values run, and each value that is printed runs a second time. A campaign
+    explains its worst failure, without parameters, if the VUT is of this package. `report` shows
+    all failures that were explained.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -192,8 +192,7 @@ def explain(
         "cost": option(
             str,
             "time",
-            "What the repair is to cost least of, as a mean over the cases: time to the merge, or "
-            "braking of the VUT.",
+            "Cost to keep low, as a mean over the cases: time to the merge, or braking of the VUT.",
             metavar="time|braking",
         ),
         "trials": option(int, 60, "Sets of values that a round tries."),
@@ -231,7 +230,7 @@ def repair(
     chosen that cost least, and of these the smallest change. Then all cases run, and a fresh
     campaign with another seed is compared with the one before. Needs the extra repair.
 
-    Exit code 0 when values were found and the fresh campaign shows nothing that broke or grew, else
+    Exit code 0 when values were found and the fresh campaign shows no case that broke, else
     1: then it says which cases stay.
 
     Example:  merge-sumo repair runs/design1 --param gap_m=10..40 --param x2_m=10..90
