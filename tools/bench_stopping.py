@@ -18,7 +18,11 @@ import merge_sumo as ms
 from merge_sumo.campaigns.stopping import coverage_by_level, has_converged
 from merge_sumo.values.score import Outcome
 
-VUTS = ("design1", "design2", "gap", "sumo:IDM")
+VUTS = (
+    *("design1", "design2", "gap", "level0", "sumo:IDM"),
+    *(f"tools/trial_vuts.py:{name}" for name in ("Idm", "Rss", "Courteous", "Delayed")),
+    *(f"tools/held_out_vuts.py:{name}" for name in ("Islands", "Shell", "Slots")),
+)
 CASES = 1600
 NEARLY = 0.97
 
@@ -34,13 +38,14 @@ def row(vut: str, seed: int, folder: Path) -> str:
     run = ms.campaign(vut, cases=CASES, seed=seed, out=folder, progress=False, workers=None)
     outcomes = run.run.outcomes
     whole = sum(coverage_by_level(outcomes).values())
+    name = vut.rpartition(":")[2]
     if not whole:
-        return f"{vut:12s} no failure"
+        return f"{name:12s} no failure"
     ends = ends_of_batches(outcomes)
     share = {n: sum(coverage_by_level(outcomes[:n]).values()) / whole for n in ends}
     nearly = next(n for n in ends if share[n] >= NEARLY)
     stop = next((n for n in ends if has_converged(outcomes[:n])), CASES)
-    return f"{vut:12s} {nearly:6d} {stop:6d} {share[stop]:8.3f}"
+    return f"{name:12s} {nearly:6d} {stop:6d} {share[stop]:8.3f}"
 
 
 def main() -> None:

@@ -89,8 +89,7 @@ class Settings(Setup, total=False):
         batch: cases per batch; by default as many as the sampler wants.
         in_flight: most cases that run or wait while the sampler is asked, instead of batches.
         seed: same seed, same outcomes.
-        stop_when_converged: stop when the last 100 cases added less than 2 % to the coverage of
-            each level with failures.
+        stop_when_converged: stop when the last 100 cases added less than 1 % to the coverage.
         repeat: how often each case runs, once by default, with another draw of what is random;
             "auto" repeats cases where chance decides. Runs count as cases.
         tolerated: share of its runs in which a case may fail, 0 by default: it fails where more do.

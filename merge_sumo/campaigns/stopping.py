@@ -16,22 +16,19 @@ from merge_sumo.values.score import Outcome
 
 WINDOW: Final = 100
 """Cases of all levels together that are looked at."""
-LITTLE: Final = 0.02
-"""Growth of the coverage of a level over the window below which it has converged."""
+LITTLE: Final = 0.01
+"""Growth of the coverage over the window below which it has converged."""
 
 
 def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
-    """Return whether the last cases added little to the coverage of each level with failures.
+    """Return whether the last cases added little to the coverage of all levels together.
 
     A pure function of the outcomes, in the order of their index, so that a resumed campaign ends
     where it would have ended. A search that knows no failure goes on. A case fails where more than
     the `tolerated` share of its runs do.
     """
-    before = coverage_by_level(outcomes[:-WINDOW], tolerated)
-    now = coverage_by_level(outcomes, tolerated)
-    return bool(now) and all(
-        covered < (1.0 + LITTLE) * before.get(level, 0.0) for level, covered in now.items()
-    )
+    before = sum(coverage_by_level(outcomes[:-WINDOW], tolerated).values())
+    return sum(coverage_by_level(outcomes, tolerated).values()) < (1.0 + LITTLE) * before
 
 
 def coverage_by_level(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> dict[int, float]:

@@ -186,8 +186,7 @@ OPTIONS: Final[Mapping[str, Shared]] = {
     ),
     "seed": option(int, 0, "Same seed, same outcomes."),
     "stop_when_converged": flag(
-        "Stop early when the last 100 cases have added less than 2 % to the coverage of each level "
-        "with failures.",
+        "Stop early when the last 100 cases have added less than 1 % to the coverage.",
         "--stop-when-converged",
     ),
     "repeat": option(
