@@ -111,7 +111,7 @@ from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
 from merge_sumo.sumo.replay import Replay
-from merge_sumo.sumo.replay_folder import write_scenario
+from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
     check_new,
     check_new_file,
@@ -610,7 +610,7 @@ def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
             f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 3`"
         )
     exported = path / SCENARIOS / case_name(index)
-    if not exported.is_dir():
+    if not (exported / CONFIG).is_file():
         export(folder, index)
     return exported
 

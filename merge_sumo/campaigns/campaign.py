@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -33,7 +32,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import check_new, check_own
+from merge_sumo.system.folders import TakenError, check_new, check_own
 from merge_sumo.system.hashing import Files, files_now
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
@@ -162,9 +161,9 @@ def resume_campaign(
         opened: list[_Open] = []
         rewrites = []
         for at, of_version, planned in _with_earlier(folder, settings, plan, workers):
-            if opened and not (opened[0].history or os.path.lexists(at)):
-                # It was stopped between the making of its two folders.
-                with Journal.create(at, record_of(of_version, planned)):
+            if opened and not opened[0].history:
+                # It may have been stopped before its second folder was whole.
+                with suppress(TakenError), Journal.create(at, record_of(of_version, planned)):
                     pass
             journal, before, dropped = Journal.reopen(at)
             journals.enter_context(journal)
@@ -327,7 +326,7 @@ def _run(
     done = campaign.ended(ended, workers)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         folder = done.folder / SCENARIOS / case_name(outcome.index)
-        if not os.path.lexists(folder):  # written whole, before the campaign was stopped
+        with suppress(TakenError):  # whatever it is, the campaign has ended
             export_case(done, outcome.index, folder, campaign.plan.road)
     return done
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.folders import check_own, new_folder, replace_own, sync_folder
+from merge_sumo.system.folders import check_own, make_place, replace_own, sync_folder, write_folder
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import decode
 from merge_sumo.values.case import FloatArray, to_unit
@@ -441,7 +441,7 @@ def settings_sha256(settings: dict[str, Any]) -> str:
 class Journal:
     """Writes a campaign's folder, as the only process that does; to be used in `with`.
 
-    The folder appears whole or not at all, and what was appended once stays.
+    A folder with settings is whole, and what was appended once stays.
     """
 
     def __init__(self, folder: Path, outcomes: io.FileIO) -> None:
@@ -450,16 +450,13 @@ class Journal:
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
+        make_place(folder / TRAJECTORIES)
 
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
         """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        with new_folder(folder) as new:
-            (new / TRAJECTORIES).mkdir()
-            _write(new / SETTINGS, _settings_text(settings))
-            journal = cls(folder, (new / OUTCOMES).open("wb", buffering=0))
-            sync_folder(new)
-        return journal
+        write_folder(folder, {OUTCOMES: b"", SETTINGS: _settings_text(settings)})
+        return cls(folder, (folder / OUTCOMES).open("r+b", buffering=0))
 
     @classmethod
     def reopen(cls, folder: Path) -> tuple[Self, Run, int]:

@@ -23,7 +23,7 @@ from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import check_new, check_place, make_place, new_file, new_folder
+from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
 from merge_sumo.values.bodies import WIDTH_M
 from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
@@ -59,15 +59,13 @@ def write_folders(
 ) -> Iterator[Path]:
     """Write cases as folders below `target`, and yield the file to open of each.
 
-    Raises `UserError` for a case or a folder that is not as it should be before it writes anything.
+    Raises `UserError` before it writes anything where there is no such case or no such place.
     """
     check_place(target)
-    folders = {index: target / case_name(index) for index in indices}
-    for index, folder in folders.items():
+    for index in indices:
         run.outcome(index)
-        check_new(folder)
-    for index, folder in folders.items():
-        yield write(run, index, folder, road)
+    for index in indices:
+        yield write(run, index, target / case_name(index), road)
 
 
 def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
@@ -167,15 +165,15 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
     folder exists or the package scenariogeneration is missing.
     """
-    xosc = _need("scenariogeneration").xosc
+    scenariogeneration = _need("scenariogeneration")
+    xosc, prettify = scenariogeneration.xosc, scenariogeneration.prettify
     trajectory, name = run.trajectory(index), case_name(index)
     title = f"{run.vut}, {name} ({run.outcome(index).measures.became})"
     recorded = _scenario(xosc, trajectory, road, name, title, free=False)
     free = _scenario(xosc, trajectory, road, name, f"{run.vut}, {name}, free VUT", free=True)
-    with new_folder(folder) as new:
-        (new / ROAD).write_bytes(opendrive(road))
-        recorded.write_xml(str(new / f"{name}.xosc"))
-        free.write_xml(str(new / f"{name}-free.xosc"))
+    scenarios = {f"{name}-free.xosc": free, f"{name}.xosc": recorded}
+    files = {of: prettify(scenario.get_element(), "utf-8") for of, scenario in scenarios.items()}
+    write_folder(folder, {ROAD: opendrive(road), **files})
     return folder / f"{name}.xosc"
 
 

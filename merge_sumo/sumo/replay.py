@@ -32,7 +32,7 @@ from merge_sumo.sumo.replay_folder import (
     Road,
     corridor_of_hosted,
     corridor_of_shipped,
-    write_files,
+    files_of,
 )
 from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
@@ -205,7 +205,9 @@ def _checked_record(
 def _staged(episode: _Episode) -> Iterator[Path]:
     """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
     with scratch_folder() as stage:
-        write_files(stage, episode.road, episode.types, episode.record, episode.labels)
+        files = files_of(episode.road, episode.types, episode.record, episode.labels)
+        for name, content in files.items():
+            (stage / name).write_bytes(content)
         yield stage
 
 

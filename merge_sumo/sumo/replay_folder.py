@@ -26,7 +26,7 @@ from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile, Point
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
-from merge_sumo.system.folders import new_folder
+from merge_sumo.system.folders import write_folder
 from merge_sumo.values.case import Case
 from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
@@ -135,14 +135,13 @@ class Road:
 def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder and return the path of its configuration.
 
-    Raises `UserError` when the folder exists or cannot be written; nothing is overwritten.
+    Raises `UserError` when something else is there or it cannot be written (`write_folder`).
     """
     written = _road(road, folder)
-    with new_folder(folder) as new:
-        (new / CASE).write_text(json.dumps(outcome.to_record(), indent=2) + "\n", "utf-8")
-        record = _fcd(written.corridor, trajectory)
-        labels = labels_of(outcome, _picture(written, record))
-        write_files(new, written, _types(trajectory), record, labels)
+    record = _fcd(written.corridor, trajectory)
+    labels = labels_of(outcome, _picture(written, record))
+    case = (json.dumps(outcome.to_record(), indent=2) + "\n").encode()
+    write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, labels)})
     return folder / CONFIG
 
 
@@ -191,25 +190,15 @@ def corridor_of_hosted(content: bytes, path: Path, lane_end_m: float = 0.0) -> C
     )
 
 
-def write_files(
-    folder: Path,
-    road: Road,
-    types: etree._Element,
-    record: etree._Element,
-    labels: etree._Element | None,
-) -> None:
-    """Write all that SUMO reads, the configuration last; without labels where there are none."""
-    (folder / road.file).write_bytes(road.net)
-    (folder / TYPES).write_bytes(received.serialize(types))
-    if road.surroundings is not None:
-        (folder / SURROUNDINGS).write_bytes(received.serialize(road.surroundings))
-    if labels is not None:
-        (folder / LABELS).write_bytes(received.serialize(labels))
-    (folder / RECORD).write_bytes(received.serialize(record))
-    (folder / VIEW).write_bytes(received.serialize(_view(_picture(road, record))))
+def files_of(
+    road: Road, types: etree._Element, record: etree._Element, labels: etree._Element | None
+) -> dict[str, bytes]:
+    """Return all that SUMO reads, the configuration last; without labels where there are none."""
     additional = {TYPES: types, SURROUNDINGS: road.surroundings, LABELS: labels}
-    names = [name for name, root in additional.items() if root is not None]
-    (folder / CONFIG).write_bytes(received.serialize(_config(road, names, len(record))))
+    given = {name: root for name, root in additional.items() if root is not None}
+    view, config = _view(_picture(road, record)), _config(road, [*given], len(record))
+    roots = {**given, RECORD: record, VIEW: view, CONFIG: config}
+    return {road.file: road.net} | {name: received.serialize(r) for name, r in roots.items()}
 
 
 def _types(trajectory: Trajectory) -> etree._Element:

@@ -1,8 +1,8 @@
 """Where we write: nothing that a call did not make itself is removed, replaced or followed.
 
-What a person names is checked before anything runs for it. A new folder is filled under a name of
-ours and takes its own in the end, whole or not at all. Files of ours in a folder of ours may be
-written again, but not through links, which somebody may have put there.
+What a person names is checked before anything runs for it. A folder is written in an order that
+shows whether it is whole, so that the next writer goes on where one was killed. Files of ours in a
+folder of ours may be written again, but not through links, which somebody may have put there.
 """
 
 from __future__ import annotations
@@ -11,11 +11,10 @@ import json
 import os
 import re
 import secrets
-import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import BinaryIO, Final
 from merge_sumo.errors import UserError
 
 TEMPORARY: Final = ".merge-sumo-"
-"""How the name begins under which a folder or file is written; the name has 28 bytes."""
+"""How the name begins under which a file is written; the name has 28 bytes."""
 LONGEST_NAME: Final = 255
 """Bytes of a name that file systems take."""
 ROOM: Final = 64
@@ -121,27 +120,52 @@ def check_own(*paths: Path) -> None:
             raise UserError(f"cannot write {path}: it is {what}, and not of our making; remove it")
 
 
-@contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
-    """Give an empty folder to fill; it is at `path` in the end, or nowhere.
+class TakenError(UserError):
+    """The name of what is to be written is that of something else."""
 
-    Raises `UserError` where `path` exists, or when something cannot be written. Then what was made
-    here is gone again, folders above `path` included.
+
+def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
+    """Write a folder of files in their order, of which the last says that it is whole.
+
+    Where a writer was killed, the next one goes on: a folder with nothing but the beginning of what
+    is written, or all of it, loses nothing. Raises `TakenError` where `path` is anything else, and
+    `UserError` when it cannot be written; then what was made here is gone again.
     """
-    check_new(path)
     with ExitStack() as undo:
         try:
-            _make_above(path, undo)
-            new = path.with_name(f"{TEMPORARY}{secrets.token_hex(8)}")
-            new.mkdir()
-            undo.callback(_remove_if_empty, new)
-            undo.callback(_remove_all_in, new)
-            yield new
-            _take_name(new, path)
+            if path.is_symlink() or not path.is_dir():
+                make_folder(path)
+                undo.callback(_remove_if_empty, path)
+            there = {entry.name: entry for entry in path.iterdir()}
+            if not all(_begins(entry, files.get(name)) for name, entry in there.items()):
+                raise _exists(path)
+            for name, content in files.items():
+                file = path / name
+                if name not in there:
+                    file.touch(exist_ok=False)
+                    undo.callback(file.unlink, missing_ok=True)
+                elif there[name].stat().st_size == len(content):
+                    continue
+                with open(file, "r+b", opener=_not_a_link) as opened:
+                    opened.write(content)
+                    opened.flush()
+                    os.fsync(opened.fileno())
+            sync_folder(path)
             sync_folder(path.parent)
         except OSError as error:
             raise cannot_write(path, error) from error
         undo.pop_all()
+
+
+def _begins(path: Path, content: bytes | None) -> bool:
+    """Return whether a path is a file with the beginning of a content, or all of it."""
+    if content is None or not stat.S_ISREG((found := path.lstat()).st_mode):
+        return False
+    return found.st_size <= len(content) and content.startswith(path.read_bytes())
+
+
+def _not_a_link(path: str, flags: int) -> int:
+    return os.open(path, flags | NO_LINK, 0o666)
 
 
 def make_folder(path: Path, option: str = "--out") -> None:
@@ -184,32 +208,6 @@ def _make_above(path: Path, undo: ExitStack) -> None:
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
-
-
-def _remove_all_in(folder: Path) -> None:
-    """Remove what is in a folder of ours, as far as that can be."""
-    with suppress(OSError):
-        for path in list(folder.iterdir()):
-            if path.is_dir() and not path.is_symlink():
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                path.unlink(missing_ok=True)
-
-
-def _take_name(new: Path, path: Path) -> None:
-    """Rename a folder, and never over another one: a rename replaces one that is empty."""
-    if sys.platform == "win32":  # a rename replaces nothing there
-        new.rename(path)
-        return
-    try:
-        path.mkdir()
-    except FileExistsError as error:
-        raise _exists(path) from error
-    try:
-        new.replace(path)
-    except BaseException:
-        _remove_if_empty(path)
-        raise
 
 
 @contextmanager
@@ -386,5 +384,5 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
-def _exists(path: Path, option: str = "--out") -> UserError:
-    return UserError(f"{path} exists: choose another name with {option}, or remove it first")
+def _exists(path: Path, option: str = "--out") -> TakenError:
+    return TakenError(f"{path} exists: choose another name with {option}, or remove it first")

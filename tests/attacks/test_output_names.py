@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import stat
 import subprocess
+import sys
 from pathlib import Path
 from unicodedata import category
 
@@ -289,69 +291,85 @@ class TestANameOfNothing:
                 ms.campaign("design1", level=0, cases=2, out=name)
 
 
-def fails_in(new: Path, *theirs: Path) -> None:
-    for path in (new / "ours", *theirs):
-        path.write_text("something")
-    raise RuntimeError
+FILES = {"first": b"12345", "empty": b"", "last": b"67"}
+KILLED = """
+import os, sys
+from pathlib import Path
+from merge_sumo import api
+from merge_sumo.system import folders
+
+def killed(*_):
+    if {path.name for path in Path(sys.argv[2]).iterdir()} >= {sys.argv[3]}:
+        os.kill(os.getpid(), 9)
+
+os.fsync = killed
+api.export(sys.argv[1], [59], out=Path(sys.argv[2]).parent)
+"""
 
 
-class TestANewFolder:
-    def test_is_not_there_before_it_is_whole(self, tmp_path):
-        with folders.new_folder(tmp_path / "a" / "b") as new:
-            (new / "file").write_text("ours")
-            assert not (tmp_path / "a" / "b").exists()
-        assert (tmp_path / "a" / "b" / "file").read_text() == "ours"
-        assert [path.name for path in (tmp_path / "a").iterdir()] == ["b"]
+class TestAFolderOfFiles:
+    @pytest.mark.parametrize("file", ["case.json", "episode.fcd.xml", "replay.sumocfg"])
+    def test_whose_writer_is_killed_is_gone_on_with_and_nothing_is_hidden(
+        self, run, tmp_path, file
+    ):
+        folder = tmp_path / "out" / case_name(59)
+        arguments = [sys.executable, "-c", KILLED, run.folder, folder, file]
+        assert subprocess.run(arguments, check=False).returncode == -signal.SIGKILL
+        assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+        ms.export(run.folder, [59], out=folder.parent)
+        ms.export(run.folder, [59], out=tmp_path / "whole")
+        whole = tmp_path / "whole" / folder.name
+        assert {p.name: p.read_bytes() for p in folder.iterdir()} == {
+            path.name: path.read_bytes() for path in whole.iterdir()
+        }
 
-    def test_goes_with_the_folders_above_it_when_it_fails(self, tmp_path):
-        (tmp_path / "mine").mkdir()
-        with pytest.raises(RuntimeError), folders.new_folder(tmp_path / "mine" / "a" / "b") as new:
-            fails_in(new)
-        assert list((tmp_path / "mine").iterdir()) == []
+    @pytest.mark.parametrize("begun", [{}, {"first": b"123"}, {"first": b"12345", "last": b"6"}])
+    def test_is_gone_on_with_where_its_beginning_is_there(self, tmp_path, begun):
+        for name, content in begun.items():
+            (tmp_path / name).write_bytes(content)
+        folders.write_folder(tmp_path, FILES)
+        before = {path: path.stat() for path in tmp_path.iterdir()}
+        assert {path.name: path.read_bytes() for path in before} == FILES
+        folders.write_folder(tmp_path, FILES)
+        assert {path: path.stat().st_mtime_ns for path in before} == {
+            path: found.st_mtime_ns for path, found in before.items()
+        }
 
-    def test_leaves_a_folder_above_it_that_somebody_uses_by_then(self, tmp_path):
-        with pytest.raises(RuntimeError), folders.new_folder(tmp_path / "a" / "b") as new:
-            fails_in(new, (tmp_path / "a" / "theirs"))
-        assert [path.name for path in (tmp_path / "a").iterdir()] == ["theirs"]
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda out: out.symlink_to("nowhere"),
+            lambda out: out.write_text("theirs"),
+            lambda out: (out.mkdir(), (out / "theirs").touch()),
+            lambda out: (out.mkdir(), (out / "first").mkdir()),
+            lambda out: (out.mkdir(), (out / "first").write_text("124")),
+            lambda out: (out.mkdir(), (out / "first").write_text("123456")),
+            lambda out: (out.mkdir(), (out / "first").symlink_to("../ours")),
+        ],
+    )
+    def test_of_somebody_else_stays(self, tmp_path, make):
+        (tmp_path / "ours").write_text("123")
+        make(tmp_path / "out")
+        before = tree(tmp_path)
+        with pytest.raises(folders.TakenError, match="out exists"):
+            folders.write_folder(tmp_path / "out", FILES)
+        assert tree(tmp_path) == before
 
-    @pytest.mark.parametrize("what", ["empty", "full", "file", "link"])
-    def test_does_not_replace_what_came_there_meanwhile(self, tmp_path, what, monkeypatch):
-        path = tmp_path / "out"
-        take_name = folders._take_name
+    def test_is_gone_when_it_cannot_be_written(self, tmp_path, monkeypatch):
+        monkeypatch.setattr(os, "fsync", full)
+        with pytest.raises(UserError, match="No space left"):
+            folders.write_folder(tmp_path / "out", FILES)
+        assert list(tmp_path.iterdir()) == []
 
-        def overtaken(*arguments) -> None:
-            if what == "file":
-                path.write_text("theirs")
-            elif what == "link":
-                path.symlink_to("nowhere")
-            else:
-                path.mkdir()
-            if what == "full":
-                (path / "file").write_text("theirs")
-            before.update(tree(tmp_path))
-            take_name(*arguments)
 
-        before: dict[str, tuple[str, object]] = {}
-        monkeypatch.setattr(folders, "_take_name", overtaken)
-        with pytest.raises(UserError, match="out exists"), folders.new_folder(path):
-            pass
-        theirs = {name: kind for name, kind in before.items() if folders.TEMPORARY not in name}
-        assert tree(tmp_path) == theirs
-
-    def test_takes_a_name_of_255_bytes(self, tmp_path):
-        with folders.new_folder(tmp_path / ("x" * 255)):
-            pass
-        assert (tmp_path / ("x" * 255)).is_dir()
+def full(_: int) -> None:
+    raise OSError(28, "No space left on device")
 
 
 class TestAFileOfOurs:
     def test_is_whole_or_as_it_was(self, tmp_path, monkeypatch):
         (tmp_path / "report").write_text("old")
-
-        def fail(_: int) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "fsync", fail)
+        monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(UserError, match="No space left"):
             folders.replace_own(tmp_path / "report", b"new")
         assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"report": "old"}

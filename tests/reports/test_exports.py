@@ -23,7 +23,7 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.store import failures
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
-from merge_sumo.reports.exports import columns_of, write_folders, write_openscenario, write_table
+from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.scenario import BEHIND, DT_S
@@ -263,13 +263,6 @@ class TestTheCommand:
         assert isinstance(said.exception, UserError)
         assert "merge-sumo[export]" in str(said.exception)
         assert list(tmp_path.iterdir()) == []
-
-
-def test_folders_are_checked_before_the_first_is_written(made, tmp_path):
-    (tmp_path / "case-00002").mkdir()
-    with pytest.raises(UserError, match="case-00002 exists"):
-        list(write_folders(made, [1, 2], tmp_path, write_openscenario, road_of()))
-    assert not (tmp_path / "case-00001").exists()
 
 
 def test_no_export_loads_libsumo():
