@@ -26,12 +26,12 @@ from merge_sumo.studies.probability import (
     STREAM,
     Counted,
     cells_of,
-    clopper_pearson,
     draw,
     estimate,
     expected_cells,
 )
 from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
 SEEDS = range(1000, 1200)

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.values.case import Case, FloatArray, to_unit
-from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, fails_above, runs_needed
+from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, runs_needed
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
@@ -204,7 +204,7 @@ class RepeatedWhereItMatters(RepeatingSampler):
         decided = [
             one
             for one, runs in zip(failing, needed, strict=True)
-            if not runs and fails_above(one, self._tolerated)
+            if not runs and one.share > self._tolerated
         ]
         waiting = Counter(case.start for case in self._pending)
         ranked = []

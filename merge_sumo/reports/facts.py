@@ -20,7 +20,7 @@ from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
 from merge_sumo.studies.probability import RESULT, probability_of
 from merge_sumo.studies.stress import STRESS, stress_of
 from merge_sumo.system.printable import printable
-from merge_sumo.values.chance import MOST_RUNS, by_case, fails_above, is_decided
+from merge_sumo.values.chance import MOST_RUNS, by_case, is_decided
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import FAILURE_SCORE, Outcome
@@ -197,7 +197,7 @@ def _repeats(run: Run) -> Iterator[Fact]:
     untold = [
         one
         for one in cases
-        if fails_above(one, tolerated)
+        if one.share > tolerated
         and one.runs < MOST_RUNS
         and not is_decided(one.failures, one.runs, tolerated)
     ]

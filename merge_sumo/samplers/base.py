@@ -13,7 +13,7 @@ import numpy as np
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
-from merge_sumo.values.chance import RunsOfCase, by_case, fails_above
+from merge_sumo.values.chance import RunsOfCase, by_case
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.score import Outcome, gap_limit_m
 
@@ -160,7 +160,7 @@ class Sampler(ABC):
         scores = [np.array([run.score for run in one.outcomes], dtype=float) for one in cases]
         return replace(
             self._rows_of(worst, level),
-            failed=np.array([fails_above(one, self.tolerated) for one in cases], dtype=bool),
+            failed=np.array([one.share > self.tolerated for one in cases], dtype=bool),
             batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),
             runs=np.array([one.runs for one in cases], dtype=np.int64),
             failures=np.array([one.failures for one in cases], dtype=np.int64),

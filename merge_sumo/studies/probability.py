@@ -25,7 +25,6 @@ most of the levels.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +43,10 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.system.records import Record, read_record, to_plain
+from merge_sumo.system.records import Record, read_record, to_json, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import Scenario, level_name
 
@@ -246,7 +246,7 @@ def failure_probability(
         engine=study.plan.engine,
         campaign=study.record(),
     )
-    write_new(out, (json.dumps(to_plain(result), indent=2, allow_nan=False) + "\n").encode())
+    write_new(out, to_json(result, indent=2))
     return result
 
 
@@ -388,16 +388,6 @@ def _stratum(counted: Sequence[Counted], whole: float, confidence: float) -> Str
     )
 
 
-def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
-    """Return the exact interval of a probability by independent cases; (0, 1) without any."""
-    from scipy.stats import binomtest
-
-    if not cases:
-        return 0.0, 1.0
-    found = binomtest(failures, cases).proportion_ci(confidence, method="exact")
-    return float(found.low), float(found.high)
-
-
 def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]) -> PerMerge:
     """Return the range over mixtures of levels.
 
@@ -436,8 +426,7 @@ class ProbabilityResult(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
-        record: dict[str, Any] = to_plain(self.found)
-        return {**record, "file": str(self.file)}
+        return {**to_plain(self.found), "file": str(self.file)}
 
     def lines(self) -> list[str]:
         """Return the probability and its interval, the strata, the levels, and what is counted."""

@@ -74,7 +74,7 @@ class RunsOfCase:
         it fails exactly where the case does.
         """
         spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
-        ordered = sorted(self.outcomes, key=lambda outcome: (_score(outcome), outcome.index))
+        ordered = sorted(self.outcomes, key=lambda outcome: (outcome.score or 0.0, outcome.index))
         return ordered[spared]
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -82,11 +82,7 @@ class RunsOfCase:
 
         It holds for a number of runs that outcomes do not decide.
         """
-        return clopper_pearson(self.failures, self.runs, (1.0 - confidence) / 2.0)
-
-
-def _score(outcome: Outcome) -> float:
-    return 0.0 if outcome.score is None else outcome.score
+        return clopper_pearson(self.failures, self.runs, confidence)
 
 
 def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
@@ -107,14 +103,9 @@ def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
     return [RunsOfCase(case, tuple(runs)) for case, runs in cases]
 
 
-def fails_above(one: RunsOfCase, tolerated: float = 0.0) -> bool:
-    """Return whether more than a tolerated share of the runs of a case fail."""
-    return one.share > tolerated
-
-
 def failing_cases(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[RunsOfCase]:
     """Return the cases that fail in more than a tolerated share of their runs, as `by_case`."""
-    return [one for one in by_case(outcomes) if fails_above(one, tolerated)]
+    return [one for one in by_case(outcomes) if one.share > tolerated]
 
 
 def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Outcome]:
@@ -145,10 +136,10 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
 
 
 @cache
-def runs_needed(failures: int, runs: int, tolerated: float, most: int = MOST_RUNS) -> int:
-    """Return how many further runs of a case decide at least (`is_decided`); 0 from `most` on."""
+def runs_needed(failures: int, runs: int, tolerated: float) -> int:
+    """Return how many further runs of a case decide at least; 0 from `MOST_RUNS` on."""
     further = 0
-    while runs + further < most:
+    while runs + further < MOST_RUNS:
         ends = failures, failures + further
         if any(is_decided(end, runs + further, tolerated) for end in ends):
             break
@@ -165,16 +156,14 @@ def check_tolerated(tolerated: float) -> None:
         )
 
 
-def clopper_pearson(failures: int, cases: int, risk: float) -> tuple[float, float]:
-    """Return both ends for the share of failures among independent cases, each wrong by `risk`.
+def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
+    """Return the exact interval of a probability by independent cases; (0, 1) without any.
 
     Source: Clopper and Pearson (1934). Never for cases that a sampler has chosen.
     """
-    from scipy.stats import beta
+    from scipy.stats import binomtest
 
-    low, high = 0.0, 1.0
-    if failures > 0:
-        low = float(beta.ppf(risk, failures, cases - failures + 1))
-    if failures < cases:
-        high = float(beta.isf(risk, failures + 1, cases - failures))
-    return low, high
+    if not cases:
+        return 0.0, 1.0
+    found = binomtest(failures, cases).proportion_ci(confidence, method="exact")
+    return float(found.low), float(found.high)

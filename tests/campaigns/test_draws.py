@@ -16,7 +16,6 @@ from merge_sumo import api
 from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.testing.contracts import SamplerContract, play, play_case
@@ -212,12 +211,6 @@ class TestACampaign:
         row = api.open_run(folder).cases[repeats[0].index]
         as_row = api.run(settings.vut, case=row, fail_when=settings.fail_when)
         assert as_row.outcome.case == repeats[0].case
-
-    def test_refuses_other_repeats_of_a_folder(self, tmp_path):
-        run_campaign(self.settings(tmp_path, cases=20), tmp_path / "run")
-        for name, value in (("repeat", 3), ("tolerated", 0.1)):
-            with pytest.raises(UserError, match=f"^{name} differs"):
-                resume_campaign(tmp_path / "run", {name: value, "cases": 40})
 
     def test_counts_cases_and_not_runs_in_what_it_says(self, tmp_path):
         run_campaign(self.settings(tmp_path), tmp_path / "run")

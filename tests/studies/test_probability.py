@@ -22,13 +22,13 @@ from merge_sumo.studies.probability import (
     Cells,
     Counted,
     cells_of,
-    clopper_pearson,
     draw,
     estimate,
     probability_of,
 )
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.values.case import dimensions
+from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
 LEVELS = (0, 1, 2)
@@ -66,13 +66,6 @@ def measured(cells, fails, cases, seed, confidence=0.95):
 
 
 class TestTheInterval:
-    def test_of_plain_cases_is_that_of_clopper_and_pearson(self):
-        """By hand: no failure in n gives 1 - (alpha/2)^(1/n); 10 of 100 are in each table."""
-        assert clopper_pearson(0, 100, 0.95) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
-        assert clopper_pearson(100, 100, 0.95) == pytest.approx((0.025 ** (1 / 100), 1.0))
-        assert clopper_pearson(10, 100, 0.95) == pytest.approx((0.0490, 0.1762), abs=1e-4)
-        assert clopper_pearson(0, 0, 0.95) == (0.0, 1.0)
-
     def test_of_two_strata_shares_the_risk_out(self):
         """Of 90 % no case of 300 fails, of 10 % all 100 do: at 5 %, each stratum has 2.5 %."""
         numbers = np.arange(10)

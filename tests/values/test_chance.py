@@ -16,8 +16,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.chance import (
     by_case,
+    clopper_pearson,
     failing_cases,
-    fails_above,
     is_decided,
     one_per_case,
     runs_needed,
@@ -93,7 +93,6 @@ def test_runs_are_counted_by_case_in_the_order_of_the_first_run():
     assert failing_cases(told) == [one]
     assert failing_cases(told, 0.66) == [one]
     assert failing_cases(told, 2 / 3) == []
-    assert fails_above(one, 0.66)
 
 
 def test_without_repeats_each_outcome_with_a_verdict_is_a_case():
@@ -108,6 +107,10 @@ def test_the_interval_is_that_of_clopper_and_pearson():
     (one,) = by_case(outcomes(runs))
     assert one.interval() == pytest.approx((0.0667, 0.6525), abs=1e-4)
     assert by_case(outcomes(runs[3:4]))[0].interval() == pytest.approx((0.0, 0.975))
+    # By hand: no failure in n gives 1 - (alpha/2)^(1/n).
+    assert clopper_pearson(0, 100, 0.95) == pytest.approx((0.0, 1.0 - 0.025 ** (1 / 100)))
+    assert clopper_pearson(100, 100, 0.95) == pytest.approx((0.025 ** (1 / 100), 1.0))
+    assert clopper_pearson(0, 0, 0.95) == (0.0, 1.0)
 
 
 def test_the_run_that_stands_for_a_case_fails_as_the_case_does():
