@@ -5,9 +5,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from dataclasses import dataclass
 from html import escape
-from typing import Any
+from typing import Any, ClassVar
 
 from merge_sumo.system.printable import printable
+from merge_sumo.system.records import to_plain
 
 
 class Result:
@@ -17,10 +18,13 @@ class Result:
     """
 
     __slots__ = ()
+    computed: ClassVar[tuple[str, ...]] = ()
+    """Properties that `--json` prints beside the fields."""
 
-    @abstractmethod
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
+        record: dict[str, Any] = to_plain(self)
+        return record | {name: to_plain(getattr(self, name)) for name in self.computed}
 
     @abstractmethod
     def lines(self) -> list[str]:

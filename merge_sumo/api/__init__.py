@@ -124,6 +124,7 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
@@ -575,7 +576,7 @@ def report(run: AnyRun) -> Shown:
     """Write the report of a campaign again, and return its facts; as `merge-sumo report`."""
     opened = _opened(run)
     path = str(opened.report())
-    return Shown({"report": path, "facts": [asdict(fact) for fact in opened.facts]}, [path])
+    return Shown({"report": path, "facts": to_plain(opened.facts)}, [path])
 
 
 def replay(folder: AnyRun, index: int | None = None) -> Replay:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
@@ -37,6 +37,7 @@ from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.comparison import Change, Comparison, compare_against
 from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import counted, printable, quoted
+from merge_sumo.system.records import to_plain
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
@@ -206,7 +207,7 @@ class CampaignRun(Result):
         """Return what `merge-sumo campaign --json` prints."""
         outcomes, criterion = self._run.cases, self._run.criterion
         return {
-            **asdict(self.summary),
+            **to_plain(self.summary),
             **self.verdict.to_record(),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
@@ -214,7 +215,7 @@ class CampaignRun(Result):
             "fail_when": criterion.text,
             "notes": doubts(outcomes, criterion),
             **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
-            "repeats": [repeat.to_record() for repeat in self.repeats],
+            "repeats": to_plain(self.repeats),
             "run": str(self.folder),
             "report": str(self.report_file),
         }
@@ -423,10 +424,6 @@ def _engine_of(truth: Truth) -> str:
 
 class PolicyChecks(Result, dict[str, "PolicyCheck"]):
     """`PolicyCheck` by the name of the network."""
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the checks by network."""
-        return {name: asdict(check) for name, check in self.items()}
 
     def lines(self) -> list[str]:
         """Return a table of the checks."""

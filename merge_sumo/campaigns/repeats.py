@@ -16,10 +16,8 @@ The file of a folder that somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -27,7 +25,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import read_indexed
+from merge_sumo.system.records import Record, read_indexed, replaced, to_json
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
@@ -41,8 +39,7 @@ ONE_IN: Final = 8
 """and one in so many."""
 
 
-@dataclass(frozen=True, slots=True)
-class Repeat:
+class Repeat(Record, frozen=True, omit_defaults=True):
     """A case that ran a second time.
 
     Attributes:
@@ -69,10 +66,6 @@ class Repeat:
         """Whether both times are the same."""
         return self.differs_from_s is None and not self.other_verdict
 
-    def to_record(self) -> dict[str, Any]:
-        """Return it as JSON shows it."""
-        return {name: v for name, v in asdict(self).items() if (name, v) != ("drawn", None)}
-
 
 def repeat(
     run: Run,
@@ -95,7 +88,7 @@ def repeat(
     if settings.repeat != 1 and not all(one.same for one in found):
         drawn = _drawn([outcome.case for outcome in again], run_anew)
         by_index = dict(zip((outcome.index for outcome in again), drawn, strict=True))
-        found = [one if one.same else replace(one, drawn=by_index[one.index]) for one in found]
+        found = [one if one.same else replaced(one, drawn=by_index[one.index]) for one in found]
     return sorted(found, key=lambda one: one.index)
 
 
@@ -105,10 +98,9 @@ def _drawn(
 ) -> list[bool]:
     """Return which of some cases differ between two new processes that run the same cases."""
     first, second = (dict(run_anew(cases)) for _ in range(2))
-    places = range(len(cases))
     return [
         _difference(first[place].trajectory, second[place].trajectory) != (None, None)
-        for place in places
+        for place in range(len(cases))
     ]
 
 
@@ -168,8 +160,7 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 def write_repeats(run: Run, found: Iterable[Repeat]) -> None:
     """Write what became of the cases that ran twice into the folder of their campaign."""
-    lines = "".join(json.dumps(one.to_record(), allow_nan=False) + "\n" for one in found)
-    replace_own(run.folder / REPEATS, lines.encode())
+    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)))
 
 
 def read_repeats(run: Run) -> list[Repeat]:

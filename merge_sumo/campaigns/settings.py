@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -20,7 +20,7 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import RecordError, check_fields
+from merge_sumo.system.records import RecordError, check_fields, to_plain
 from merge_sumo.values.case import Pool
 from merge_sumo.values.chance import check_tolerated
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -220,7 +220,7 @@ def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any
     """Return what `campaign.json` holds: everything that decides the outcomes."""
     folder = None if settings.policies is None else policies_name(plan.povs.policies)
     return {
-        **asdict(settings),
+        **to_plain(settings),
         "scenario": settings.scenario.to_record(),
         "policies": folder,
         "versions": dict(plan.versions),

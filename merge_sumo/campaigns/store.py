@@ -33,7 +33,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, make_place, replace_own, sync_folder, write_folder
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import decode
+from merge_sumo.system.records import decode, to_json
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -556,7 +556,7 @@ def _encoded(batch: Batch) -> tuple[bytes, bytes]:
 
 def _settings_text(settings: dict[str, Any]) -> bytes:
     record = {**settings, CHECKSUM: settings_sha256(settings)}
-    return (json.dumps(record, indent=2, allow_nan=False) + "\n").encode()
+    return to_json(record, indent=2)
 
 
 def _lock(outcomes: io.FileIO, folder: Path) -> None:

@@ -5,7 +5,6 @@ It is one HTML file without scripts that loads nothing.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +16,7 @@ from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.repair import CHANGES, MEASURED_BY, PAGE, RESULT, Repair
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
+from merge_sumo.system.records import to_json
 
 MOST_STAYING: Final = 50
 """Cases that are listed of those that still fail."""
@@ -24,7 +24,7 @@ MOST_STAYING: Final = 50
 
 def write_repair(repair: Repair, before: Run) -> None:
     """Write the result of a repair, its page, and the page of its last comparison."""
-    content = json.dumps(repair.to_record(), indent=1, allow_nan=False) + "\n"
+    content = to_json(repair.to_record(), indent=1).decode()
     files = {RESULT: content, PAGE: repair_page(repair, before)}
     best = repair.best
     if best.compared is not None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -11,6 +10,7 @@ from merge_sumo.reports import figures
 from merge_sumo.reports.pages import page
 from merge_sumo.studies.reproduction import ColumnResult, Reproduction
 from merge_sumo.system.folders import write_new
+from merge_sumo.system.records import to_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -25,8 +25,7 @@ def write_reproduction(result: Reproduction, folder: Path) -> Path:
 
     Raises `UserError` where a file is there already, or without matplotlib.
     """
-    record = json.dumps(result.to_record(), allow_nan=False)
-    write_new(folder / TABLE_JSON, f"{record}\n".encode())
+    write_new(folder / TABLE_JSON, to_json(result.to_record()))
     write_new(folder / TABLE_MARKDOWN, ("\n".join(result.lines()) + "\n").encode())
     captions = {}
     for name, figure, caption in _figures(result):

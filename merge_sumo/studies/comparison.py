@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from typing import Any, Final
@@ -252,7 +252,7 @@ class Version:
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
-        levels = {level_name(level): asdict(self.at[level]) for level in self.levels}
+        levels = {level_name(level): to_plain(self.at[level]) for level in self.levels}
         counts = judge(self.cases).to_record()
         return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
 

@@ -19,11 +19,10 @@ The file of a folder which somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -45,7 +44,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.world import World
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import read_indexed
+from merge_sumo.system.records import read_indexed, to_json
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray, MergeCase
@@ -108,8 +107,7 @@ class Avoidance:
 def write_avoidance(folder: Path, avoidances: Iterable[Avoidance]) -> Path:
     """Write avoidances into the folder of a campaign, in the place of an older one."""
     path = folder / AVOIDANCE
-    lines = "".join(json.dumps(asdict(one), allow_nan=False) + "\n" for one in avoidances)
-    replace_own(path, lines.encode())
+    replace_own(path, b"".join(map(to_json, avoidances)))
     return path
 
 

@@ -17,7 +17,6 @@ The file of a folder which somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -37,7 +36,7 @@ from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.records import Record, read_indexed, replaced, to_plain
+from merge_sumo.system.records import Record, read_indexed, replaced, to_json, to_plain
 from merge_sumo.system.suggestions import either
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -210,8 +209,8 @@ def read_explanations(run: Run) -> dict[int, Explanation]:
 def _write(run: Run, found: Explanation) -> None:
     """Write an explanation into the folder of a campaign, beside those of other cases."""
     known = {**read_explanations(run), found.index: found}
-    lines = (json.dumps(to_plain(known[index]), allow_nan=False) for index in sorted(known))
-    replace_own(run.folder / EXPLANATIONS, "".join(f"{line}\n" for line in lines).encode())
+    lines = b"".join(to_json(known[index]) for index in sorted(known))
+    replace_own(run.folder / EXPLANATIONS, lines)
 
 
 def failure_of(run: Run, index: int | None) -> Outcome:

@@ -24,12 +24,11 @@ repair.html             its page, and changes.html that of the comparison with t
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -52,7 +51,7 @@ from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import add_to, make_folder, replace_own
 from merge_sumo.system.printable import counted, quoted
-from merge_sumo.system.records import Record, decode, to_plain
+from merge_sumo.system.records import Record, decode, to_json, to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
@@ -279,7 +278,7 @@ class Repair(Result):
             "repaired": self.spec,
             "verified": self.verified,
             "parameters": [
-                {**asdict(one), "today": self.today[one.name], "repaired": values.get(one.name)}
+                {**to_plain(one), "today": self.today[one.name], "repaired": values.get(one.name)}
                 for one in ranges
             ],
             "cost": self.settings.cost.value,
@@ -393,11 +392,11 @@ class RepairJournal:
         self.folder, self._recorded = folder, list[Trial]()
         if not resume:
             make_folder(folder)
-            replace_own(folder / SETTINGS, (json.dumps(settings, indent=1) + "\n").encode())
+            replace_own(folder / SETTINGS, to_json(settings, indent=1))
             return
         before = _read(folder / SETTINGS)
         known = decode(before, dict[str, Any])
-        asked = json.loads(json.dumps(settings))
+        asked = decode(to_json(settings))
         for name in asked:
             if known.get(name) != asked[name]:
                 what = ASKED.get(name, f"--{name}")
@@ -429,8 +428,7 @@ class RepairJournal:
 
     def add(self, trial: Trial) -> None:
         """Record a trial."""
-        line = json.dumps(to_plain(trial), allow_nan=False) + "\n"
-        add_to(self.folder / TRIALS, line.encode(), new=not self._written)
+        add_to(self.folder / TRIALS, to_json(trial), new=not self._written)
         self._written = True
 
 
@@ -469,7 +467,7 @@ class Search:
             "cases_sha256": hashlib.sha256(_read(run.folder / OUTCOMES)).hexdigest(),
             "vut": plan.vut.spec,
             "vut_files": plan.vut.files,
-            "parameters": [asdict(one) for one in settings.ranges],
+            "parameters": to_plain(settings.ranges),
             **{name: getattr(settings, name) for name in ("cost", "trials", "rounds", "cases")},
             "seed": settings.seed,
             "versions": {**plan.versions, "optuna": version("optuna")},

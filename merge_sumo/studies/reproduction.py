@@ -7,7 +7,7 @@ the median. Same seeds and same versions give the same files.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -26,6 +26,7 @@ from merge_sumo.samplers.gpr import predicted_score
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.sampler_study import OnPart, SamplerStudy, Search, Study
 from merge_sumo.studies.truth import TRUTH_CASES
+from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import fmc
@@ -204,9 +205,9 @@ class Reproduction(Result):
             record = one.study.to_record()
             for summary in record["samplers"].values():
                 del summary["sampler_s"]
-            columns.append({**asdict(one.column), **record})
+            columns.append({**to_plain(one.column), **record})
         return {
-            "scale": asdict(self.scale),
+            "scale": to_plain(self.scale),
             "versions": self.versions,
             "policies_sha256": self.policies_sha256,
             "columns": columns,

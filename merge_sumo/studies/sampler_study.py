@@ -6,7 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from heapq import heappop, heapreplace
 from io import StringIO
@@ -34,6 +34,7 @@ from merge_sumo.studies.truth import (
     known_truth,
 )
 from merge_sumo.system.printable import counted
+from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray, Pool, to_unit
@@ -406,7 +407,7 @@ class SamplerStudy(Result):
             "limit_fmc": self.limit_fmc,
             "dense_fmc": {level: fmc(truth.failures) for level, truth in self.dense.items()},
             "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
-            "samplers": {name: asdict(result) for name, result in self.samplers.items()},
+            "samplers": to_plain(self.samplers),
         }
 
     def lines(self) -> list[str]:

@@ -12,7 +12,6 @@ The file of a folder which somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,7 +30,7 @@ from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.printable import counted
-from merge_sumo.system.records import Record, read_record, to_plain
+from merge_sumo.system.records import Record, read_record, to_json
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import COORDINATES, DT_S, Scenario
@@ -104,6 +103,8 @@ class Stress(Result, Record, frozen=True):
         vut: name of the VUT.
     """
 
+    computed = ("robust", "fragile")
+
     cases: int
     failures: tuple[Index, ...]
     rungs: tuple[Rung, ...]
@@ -151,11 +152,6 @@ class Stress(Result, Record, frozen=True):
         """Return the share of verdicts that flip on a rung; None where it was not run."""
         verdicts = self.cases * len(rung.runs)
         return rung.flips / verdicts if verdicts else None
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        plain: dict[str, Any] = to_plain(self)
-        return {**plain, "robust": self.robust, "fragile": self.fragile}
 
     def lines(self) -> list[str]:
         """Return a table of the rungs, and which failures are robust."""
@@ -307,8 +303,7 @@ def stress(study: RunStudy) -> Stress:
         rungs = tuple(_rung(study, plan, tested, change, opened) for change in RUNGS)
     failing = tuple(outcome.index for outcome in failures(tested))
     found = Stress(len(tested), failing, rungs, run.vut)
-    content = json.dumps(to_plain(found), indent=1, allow_nan=False) + "\n"
-    replace_own(run.folder / STRESS, content.encode())
+    replace_own(run.folder / STRESS, to_json(found, indent=1))
     return found
 
 

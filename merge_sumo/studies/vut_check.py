@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from time import perf_counter
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -41,6 +41,8 @@ class VutCheck(Result):
         us_per_step_worst: cost of the slowest step.
     """
 
+    computed = ("ok",)
+
     vut: str
     problems: list[str]
     notes: list[str]
@@ -51,10 +53,6 @@ class VutCheck(Result):
     def ok(self) -> bool:
         """Whether nothing is wrong."""
         return not self.problems
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {"vut": self.vut, "ok": self.ok, **asdict(self)}
 
     def lines(self) -> list[str]:
         """Return what is wrong in sentences, and the cost of a step."""

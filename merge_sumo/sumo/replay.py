@@ -6,9 +6,9 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from lxml import etree
 
@@ -59,6 +59,8 @@ class Replay(Result):
         detail: in what it differs.
     """
 
+    computed = ("identical",)
+
     rows: int
     diverged_at_s: float | None
     detail: str
@@ -67,10 +69,6 @@ class Replay(Result):
     def identical(self) -> bool:
         """Whether no row differs."""
         return self.diverged_at_s is None
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {"identical": self.identical, **asdict(self)}
 
     def lines(self) -> list[str]:
         """Return whether the replay is identical, in a line."""

@@ -10,7 +10,6 @@ with a text: names at the cars would lie on each other at M, where a reader look
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Sequence
@@ -27,6 +26,7 @@ from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile, Point
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
+from merge_sumo.system.records import to_json
 from merge_sumo.values.case import Case
 from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
@@ -140,7 +140,7 @@ def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: T
     written = _road(road, folder)
     record = _fcd(written.corridor, trajectory)
     labels = labels_of(outcome, _picture(written, record))
-    case = (json.dumps(outcome.to_record(), indent=2) + "\n").encode()
+    case = to_json(outcome.to_record(), indent=2)
     write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, labels)})
     return folder / CONFIG
 

@@ -8,12 +8,14 @@ file may be somebody else's.
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Container, Sequence
 from dataclasses import is_dataclass
 from enum import Enum
 from functools import cache
+from operator import methodcaller
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import (
@@ -186,8 +188,13 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
 
 
 def to_plain(value: object) -> Any:
-    """Return a value as the lists and tables that JSON has."""
-    return msgspec.to_builtins(value)
+    """Return a value as the lists and tables that JSON has; a number of numpy is one of Python."""
+    return msgspec.to_builtins(value, enc_hook=methodcaller("item"))
+
+
+def to_json(value: object, *, indent: int | None = None) -> bytes:
+    """Return a value as JSON, with its line end; `ValueError` for a number that is not finite."""
+    return (json.dumps(to_plain(value), indent=indent, allow_nan=False) + "\n").encode()
 
 
 def replaced(value: T, **changes: Any) -> T:

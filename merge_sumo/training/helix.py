@@ -11,10 +11,10 @@ import json
 import os
 import queue
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -45,6 +45,7 @@ from merge_sumo.system.folders import (
     write_new,
 )
 from merge_sumo.system.printable import quoted
+from merge_sumo.system.records import to_json, to_plain
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
@@ -206,7 +207,7 @@ def _take(folder: Path) -> None:
             )
     except OSError as error:
         raise cannot_write(folder, error) from error
-    write_new(manifest, _manifest({}))
+    write_new(manifest, to_json({"networks": {}}, indent=2))
 
 
 def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
@@ -248,8 +249,8 @@ def _plan(
         "opponent": opponent,
         "opponent_sha256": opponent_sha256,
         "seed": seed,
-        "reward_weights": asdict(reward.weights),
-        "settings": asdict(settings),
+        "reward_weights": to_plain(reward.weights),
+        "settings": to_plain(settings),
         **({} if limit is None else {LIMIT: limit}),
     }
 
@@ -278,7 +279,7 @@ def _train_in_parallel(
             while running:
                 running = wait(running, timeout=0.2).not_done
                 for progress in _pending(reports):
-                    _log(folder, progress.network, "a", json.dumps(asdict(progress)) + "\n")
+                    _log(folder, progress.network, "a", json.dumps(to_plain(progress)) + "\n")
                     if on_progress is not None:
                         on_progress(progress)
         except BaseException:
@@ -374,11 +375,8 @@ def _keep(
             **entry,
             "sha256": hashlib.sha256(content).hexdigest(),
             "versions": {package: version(package) for package in packages},
-            "check": asdict(check),
+            "check": to_plain(check),
         },
     }
-    replace_own(folder / MANIFEST, _manifest({n: known[n] for n in NETWORKS if n in known}))
-
-
-def _manifest(networks: Mapping[str, Any]) -> bytes:
-    return (json.dumps({"networks": networks}, indent=2) + "\n").encode()
+    entries = {name: known[name] for name in NETWORKS if name in known}
+    replace_own(folder / MANIFEST, to_json({"networks": entries}, indent=2))

@@ -26,6 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.studies.comparison import rerun
 from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
@@ -165,20 +166,17 @@ def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path)
     assert "the POV draws random numbers" in str(unrepeatable(repeats))
 
 
-def test_a_client_that_nobody_starts_is_not_waited_for_again(run):
+def test_drivers_of_the_package_run_once_and_a_client_that_nobody_starts_is_not_waited_for(run):
+    assert read_repeats(run) == []
+    assert not (run.folder / REPEATS).exists()
+    assert chosen_again(run.outcomes, campaign_settings(vut="design1")) == []
     settings = campaign_settings(vut="traci")
     assert chosen_again(run.outcomes, settings) == []
     started = campaign_settings(vut="traci:python3 client.py {port}")
     assert len(chosen_again(run.outcomes, started)) == 8
 
 
-def test_drivers_of_the_package_run_once(run, tmp_path):
-    assert read_repeats(run) == []
-    assert not (run.folder / REPEATS).exists()
-    assert chosen_again(run.outcomes, campaign_settings(vut="design1")) == []
-
-
-HONEST = Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=True).to_record()
+HONEST = to_plain(Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=True))
 
 
 @pytest.mark.parametrize(
