@@ -39,8 +39,8 @@ PLACES = ("moment", "sync", "torn", "worker")
 SAMPLERS = ("gpr", "coverage", "uniform")
 """The last one runs ahead, and keeps several batches at a time."""
 CASES, BATCH = 60, 12
-WRITES = 1 + 2 * CASES // BATCH
-"""Files that the journal writes: settings, then trajectories and outcomes of every batch."""
+WRITES = 2 * CASES // BATCH
+"""Files that the journal writes: trajectories and outcomes of every batch."""
 SYNCS = 3 + 3 * CASES // BATCH
 """Of settings and two folders, then of trajectories, their folder and outcomes of every batch; less
 where batches are kept together, so that some kills come too late."""

@@ -144,12 +144,11 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
                 if name not in there:
                     file.touch(exist_ok=False)
                     undo.callback(file.unlink, missing_ok=True)
-                elif there[name].stat().st_size == len(content):
-                    continue
-                with open(file, "r+b", opener=_not_a_link) as opened:
-                    opened.write(content)
-                    opened.flush()
-                    os.fsync(opened.fileno())
+                if file.lstat().st_size < len(content):
+                    with open(file, "r+b", opener=_not_a_link) as opened:
+                        opened.write(content)
+                        opened.flush()
+                        os.fsync(opened.fileno())
             sync_folder(path)
             sync_folder(path.parent)
         except OSError as error:

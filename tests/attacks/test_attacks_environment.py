@@ -35,7 +35,7 @@ COMMANDS = {
     CAMPAIGN.format(workers=1): 0,
     CAMPAIGN.format(workers=2): 0,
     "campaign --vut own.py:Vut --level 0 --cases 4 --out new": 0,
-    "run --vut design1 --level 0 --x -200 --v 30 --out new": None,
+    "run --vut design1 --level 0 --x -200 --v 30 --out new": 0,
     "report run": 0,
     "compare run run": 0,
     "export run --format csv --out new": 0,
@@ -43,7 +43,7 @@ COMMANDS = {
     "check-vut design1": 0,
     "probability run --cases 20 --out new": 0,
     "truth --vut design1 --level 0 --cases 100": 0,
-    "benchmark --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform": 0,
+    "benchmark --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform --truth-cases 100": 0,
 }
 """Commands, and the exit codes that they have; None where it is as without the attack."""
 

@@ -374,6 +374,25 @@ class TestAFileOfOurs:
             folders.replace_own(tmp_path / "report", b"new")
         assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"report": "old"}
 
+    @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+    def test_whose_writer_is_killed_has_no_name_yet(self, tmp_path, share):
+        content = b"x" * 100_000
+
+        def write() -> None:
+            with folders.new_file(tmp_path / "table.csv") as file:
+                file.write(content[: int(share * len(content))])
+                file.flush()
+                os._exit(0)
+
+        pid = os.fork()
+        if pid == 0:
+            write()
+        assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+        (left,) = tmp_path.iterdir()
+        assert left.name.startswith(folders.TEMPORARY)
+        folders.write_new(tmp_path / "table.csv", content)
+        assert (tmp_path / "table.csv").read_bytes() == content
+
 
 @pytest.fixture
 def received(run, tmp_path) -> Path:

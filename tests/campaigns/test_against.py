@@ -19,7 +19,6 @@ from scipy.spatial import cKDTree
 from merge_sumo.campaigns.against import AGAINST, earlier_run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
-from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.studies.comparison import Change, compare_against
@@ -100,11 +99,6 @@ class TestBytes:
     def whole(self) -> bytes:
         run_campaign(settings(), Path("whole"))
         return lines(Path("whole"))
-
-    def test_are_the_same_on_workers(self, whole):
-        with evaluation_workers(2) as workers:
-            run_campaign(settings(), Path("run"), workers=workers)
-        assert lines(Path("run")) == whole
 
     def test_are_the_same_after_a_stop_between_the_two_versions(self, whole):
         left = 2

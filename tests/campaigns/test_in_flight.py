@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import shutil
-import signal
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,7 @@ from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.system.interrupt import Stopped
-from merge_sumo.system.workers import LocalProcesses, Workers, dask_workers, open_workers
+from merge_sumo.system.workers import dask_workers
 from merge_sumo.testing.contracts import episode, play_case
 from merge_sumo.values.case import Pool
 from merge_sumo.values.scenario import US23
@@ -137,19 +134,6 @@ def test_many_in_flight_are_batches_for_a_sampler_that_waits():
 
 
 class TestACampaign:
-    @pytest.mark.slow
-    def test_has_the_same_bytes_on_any_number_of_workers(self, whole, tmp_path):
-        for count in (2, 5):
-            with Workers(partial(LocalProcesses, count), count) as workers:
-                run_campaign(settings(), tmp_path / str(count), workers=workers)
-            assert outcomes(tmp_path / str(count)) == outcomes(whole)
-
-    @pytest.mark.slow
-    def test_has_the_same_bytes_where_it_goes_on_in_processes(self, whole, tmp_path):
-        with open_workers(2, here_s=0.2) as workers:
-            run_campaign(settings(), tmp_path / "run", workers=workers)
-        assert outcomes(tmp_path / "run") == outcomes(whole)
-
     @pytest.mark.parametrize("lost", [1, 700, "half"])
     def test_has_the_same_bytes_after_a_cut_anywhere(self, whole, tmp_path, lost):
         folder = Path(shutil.copytree(whole, tmp_path / "run"))
@@ -171,23 +155,6 @@ class TestACampaign:
             assert {path.name for path in (folder / TRAJECTORIES).iterdir()} == {
                 path.name for path in (whole / TRAJECTORIES).iterdir()
             }
-
-    @pytest.mark.slow
-    def test_that_was_interrupted_keeps_whole_groups(self, whole, tmp_path):
-        groups = 0
-
-        def check() -> None:
-            nonlocal groups
-            groups += 1
-            if groups == 5:
-                raise Stopped(signal.SIGINT)
-
-        with open_workers(2) as workers, pytest.raises(Stopped):
-            run_campaign(settings(), tmp_path / "run", check=check, workers=workers)
-        ran = Run(tmp_path / "run")
-        assert 0 < len(ran.outcomes) == ran.whole_batches() < 60
-        resume_campaign(tmp_path / "run")
-        assert outcomes(tmp_path / "run") == outcomes(whole)
 
     @pytest.mark.slow
     def test_grows_as_one_that_had_the_cases_from_the_start(self, whole, tmp_path):

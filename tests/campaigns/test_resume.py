@@ -11,14 +11,12 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from calling import contents, invoke
 from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
-from processes import wait_for
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.store import (
@@ -249,44 +247,7 @@ class TestADisk:
         assert len(Run(run).outcomes) == 2 * BATCH, "it can still be read"
 
 
-COMMAND = [sys.executable, "-m", "merge_sumo.cli", "campaign"]
-LONG = [*("--level", "0", "--sampler", "uniform"), "--cases", "1000000"]
-
-
 class TestASignal:
-    @pytest.mark.slow
-    @pytest.mark.parametrize("number", some([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
-    def test_lets_the_batch_end_and_says_how_to_go_on(self, tmp_path, number):
-        folder = tmp_path / "run"
-        process = started(folder)
-        process.send_signal(number)
-        _, said = process.communicate(timeout=600)
-        assert process.returncode == 128 + number
-        assert "finishing the running batch" in said
-        assert f"merge-sumo campaign --resume {folder}" in said
-        assert "Traceback" not in said
-        run = Run(folder)
-        assert not run.torn
-        assert len(run.outcomes) == run.whole_batches() > 0
-        assert len(run.outcomes) % 40 == 0
-
-    @pytest.mark.slow
-    def test_stops_at_once_when_it_comes_twice_even_with_workers(self, tmp_path):
-        folder = tmp_path / "run"
-        slow = tmp_path / "slow.py"
-        slow.write_text("import time\n\ndef act(seen):\n    time.sleep(0.1)\n    return 0.0\n")
-        process = started(folder, "--workers", "2", vut=f"{slow}:act")
-        process.send_signal(signal.SIGTERM)
-        time.sleep(0.5)
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=600)
-        assert process.returncode == 130
-        assert f"merge-sumo campaign --resume {folder}" in said
-        assert "Traceback" not in said
-        assert Run(folder).outcomes == []
-        with Journal.reopen(folder)[0]:
-            pass
-
     def test_is_noted_in_this_process_and_the_second_one_raises(self, monkeypatch):
         before = signal.getsignal(signal.SIGINT)
         said: list = []
@@ -302,19 +263,6 @@ class TestASignal:
             assert stopped.value.exit_code == 130
         assert said == [(interrupt.STDERR, b"\nwait\n")]
         assert signal.getsignal(signal.SIGINT) is before
-
-
-def started(folder: Path, *options: str, vut: str = "design1") -> subprocess.Popen[str]:
-    """Start a campaign without an end, and return when it has a folder and is at work."""
-    process = subprocess.Popen(
-        [*COMMAND, "--vut", vut, *LONG, "--out", str(folder), *options],
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    assert wait_for(lambda: (folder / OUTCOMES).exists() or process.poll() is not None)
-    time.sleep(0.3)
-    assert process.poll() is None, process.stderr.read()
-    return process
 
 
 class TestTheCommand:

@@ -33,7 +33,7 @@ from merge_sumo.studies.counterfactuals import (
     run_counterfactuals,
     write_avoidance,
 )
-from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.system.workers import InProcess, Workers
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import OWN, US23
@@ -192,13 +192,6 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
 
 
 class TestWorkers:
-    @pytest.mark.slow
-    def test_of_any_number_find_the_same(self, run, found):
-        with open_workers(2) as two:
-            assert avoidance_of(run, two) == found
-        with Workers(InProcess, 3) as three:
-            assert avoidance_of(run, three) == found
-
     @pytest.mark.slow
     def test_that_die_at_a_failure_leave_out_that_one_and_no_other(self, run, found):
         left_out = found[1].index

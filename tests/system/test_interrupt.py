@@ -42,16 +42,3 @@ def test_sigterm_ends_a_controller_that_takes_seconds_a_step(tmp_path):
     said = process.communicate(timeout=20)[1]
     assert process.returncode == 128 + signal.SIGTERM
     assert "go on with: merge-sumo campaign --resume run" in said
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("more", [(), ("--in-flight", "4")])
-def test_ctrl_c_twice_leaves_no_temporary_folders(tmp_path, more):
-    process = begun(tmp_path, 0.01, "--workers", "2", *more)
-    for _ in range(2):
-        os.killpg(process.pid, signal.SIGINT)
-        time.sleep(0.5)
-    process.communicate(timeout=30)
-    # The second may come when the first has ended the campaign.
-    assert process.returncode in (128 + signal.SIGINT, -signal.SIGINT)
-    assert list((tmp_path / "tmp").iterdir()) == []

@@ -249,10 +249,6 @@ class TestACampaign:
             assert not workers.here
         assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
 
-    def test_has_the_same_outcomes_on_two_workers(self, two, expected, tmp_path):
-        run_campaign(SETTINGS, tmp_path / "run", workers=two)
-        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
-
     def test_is_refused_by_workers_with_other_software(self):
         other = {**versions(), "libsumo": "1.0"}
         plan = replace(plan_for("design1", corridors=2), versions=other)
