@@ -49,13 +49,13 @@ class Verb:
     how: str = "SIGKILL"
 
 
-CAMPAIGN = "campaign --level 0 --cases 60 --seed 1 --out new"
+CAMPAIGN = "campaign --level 0 --cases 40 --seed 1 --out new"
 RESUME = "campaign --resume new"
 VERSIONS = "--vut own.py:new --against own.py:old"
 VERBS = {
     "campaign": Verb(f"{CAMPAIGN} --vut design1 --sampler annealing", RESUME, how="SIGTERM"),
     "campaign in flight": Verb(
-        f"{CAMPAIGN} --vut design1 --in-flight 4", RESUME, how="Ctrl-C twice"
+        f"{CAMPAIGN} --vut design1 --sampler gpr --in-flight 4", RESUME, how="Ctrl-C twice"
     ),
     "campaign against": Verb(f"{CAMPAIGN} {VERSIONS}", f"{RESUME} {VERSIONS}", how="Ctrl-C"),
     "rerun": Verb("rerun run --json", how="SIGTERM"),
