@@ -213,12 +213,12 @@ OPTIONS: Final[Mapping[str, Shared]] = {
         "'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl.",
         metavar="STL",
     ),
-    "engine": option(
+    "engine": optional(
         str,
-        "sumo",
-        "sumo, or kinematic: the equations of motion alone, and SUMO for at least one case of a "
-        "hundred. For VUTs and POVs of this package.",
+        "kinematic: the equations of motion alone, and SUMO for at least one case of a "
+        "hundred. Or sumo for all.",
         metavar="NAME",
+        show_default="kinematic where VUT and POV are of this package",
     ),
     "workers": _workers_option(
         "Processes that run cases, or a Dask scheduler, tcp://HOST:PORT; the outcomes are the "

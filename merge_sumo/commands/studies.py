@@ -30,7 +30,7 @@ TRUTH_CASES: Final = "10000, at level 2 20000"
 
 
 @app.verb(
-    options=("level", *SETUP, "tolerate", "quiet"),
+    options=("level", *SETUP, "tolerate", "quiet", "engine"),
     own={
         "cases": optional(int, "Uniform cases of a level.", show_default=TRUTH_CASES),
         "repeat": optional(
@@ -41,13 +41,6 @@ TRUTH_CASES: Final = "10000, at level 2 20000"
             show_default="1, with --tolerate 20",
         ),
         "seed": SEED,
-        "engine": optional(
-            str,
-            "kinematic: the equations of motion alone, and SUMO for at least one case of a "
-            "hundred. Or sumo for all.",
-            metavar="NAME",
-            show_default="kinematic where VUT and POV are of this package",
-        ),
         "workers": CORES,
     },
 )

@@ -463,8 +463,9 @@ def _stratum_line(one: Stratum) -> str:
 
 def _per_merge_lines(one: PerMerge, at: str) -> list[str]:
     traffic = one.traffic
+    most = "" if one.most == one.least else f" to {one.most:.3g}"
     return [
-        f"failures per merge: {one.least:.3g} to {one.most:.3g} [{one.low:.3g}, {one.high:.3g}], "
+        f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
         f"{at}, whatever the shares of the POV levels",
         f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
         f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "

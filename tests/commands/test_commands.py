@@ -103,6 +103,7 @@ class TestHelp:
         shown = " ".join(help_of("campaign", 100).replace("│", " ").split())
         assert "[default: (runs/VUT-DATE)]" in shown
         assert "[default: (one a core, as soon" in shown
+        assert "[default: (kinematic where" in " ".join(help_of("probability", 200).split())
 
     def test_joins_the_lines_of_a_paragraph(self):
         assert unwrapped("A\n    b.\n\n    C\n    d.\n    ") == "A b.\n\nC d."
