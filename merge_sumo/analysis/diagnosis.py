@@ -196,7 +196,7 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
     others; its leaves with at least as many failures as other cases are the boxes, joined where
     siblings are. The shares are of cases that a sampler chose: they are no probabilities.
     """
-    scored = [o for o in outcomes if o.case.level == level and o.score is not None]
+    scored = [o for o in outcomes if o.case.level == level and o.margin is not None]
     failed = np.array([o.failed for o in scored], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []

@@ -320,7 +320,7 @@ class TruthResult(Result):
 
     Attributes:
         vut: the VUT.
-        truths: `Truth` by level: `points` in the unit cube, (n, d), their `score`, (n,), and the
+        truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
             points of the `failures`, (m, d).
         criterion: what counts as a failure.
         tolerated: share of its runs in which a case may fail.
@@ -334,7 +334,7 @@ class TruthResult(Result):
     @property
     def cases(self) -> int:
         """Number of cases, over all levels."""
-        return sum(len(truth.score) for truth in self.truths.values())
+        return sum(len(truth.margin) for truth in self.truths.values())
 
     @property
     def failures(self) -> int:
@@ -362,7 +362,7 @@ class TruthResult(Result):
             {
                 "vut": self.vut,
                 "level": level,
-                "cases": len(truth.score),
+                "cases": len(truth.margin),
                 "failures": len(truth.failures),
                 "fmc": fmc(truth.failures),
                 "region_sizes": np.bincount(regions(truth.failures)).tolist(),
@@ -392,7 +392,7 @@ class TruthResult(Result):
             lines.append(
                 f"{self.vut} at level {level_name(level)}: "
                 f"{counted(len(truth.failures), 'failure')} in "
-                f"{counted(len(truth.score), 'case')}, FMC {fmc(truth.failures):.4f}"
+                f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
                 f"{_regions_of(truth)}{_engine_of(truth)}"
             )
             lines += [f"  {remark}" for remark in truth.remarks()]

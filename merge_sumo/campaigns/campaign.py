@@ -38,7 +38,7 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.score import Outcome, gap_limit_m
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.output import LOG
 
@@ -447,8 +447,7 @@ def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
 
 def twins_of(settings: CampaignSettings, new: SimulationPlan, old: SimulationPlan) -> TwinPair:
     """Return the twins of both versions of a campaign against an earlier one."""
-    limit_m = gap_limit_m(settings.scenario, stands_in=not settings.criterion.is_papers)
-    return TwinPair(twin_of(settings, new), twin_of(settings, old), limit_m)
+    return TwinPair(twin_of(settings, new), twin_of(settings, old))
 
 
 def _plan_in(

@@ -21,7 +21,7 @@ from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, runs_needed
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.score import Outcome
 
 ONE_IN: Final = 8
 """While no chance was seen, a case repeats in every eighth place of a campaign at most,"""
@@ -158,7 +158,7 @@ class RepeatedWhereItMatters(RepeatingSampler):
         """Take outcomes, and see whether two runs of a case differ."""
         super().tell(outcomes, motions)
         for outcome in outcomes:
-            if outcome.score is None:
+            if outcome.margin is None:
                 continue
             runs = self._runs.setdefault(outcome.case.start, {})
             self._chance |= any(one.measures != outcome.measures for one in runs.values())
@@ -189,7 +189,7 @@ class RepeatedWhereItMatters(RepeatingSampler):
             one.case: (
                 not one.failures,
                 -distance.get(one.case, 0.0),
-                abs((one.outcomes[0].score or 0.0) - FAILURE_SCORE),
+                abs(one.outcomes[0].margin or 0.0),
                 one.outcomes[0].index,
             )
             for one in cases

@@ -104,7 +104,7 @@ class Run:
         self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
         for outcome in self.outcomes:
             needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
-            if needs != (outcome.margin is not None):
+            if needs == outcome.is_by_score and not self.criterion.speaks_of_score:
                 raise UserError(
                     f"case {outcome.index} in {folder / OUTCOMES} is not judged by the criterion "
                     f"that {SETTINGS} names, {self.criterion.text}"
@@ -335,7 +335,7 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
 
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the failing outcomes, the worst first."""
-    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.score, o.index))
+    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.margin, o.index))
 
 
 def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:

@@ -221,7 +221,7 @@ def _motion(run: Run) -> Iterator[Fact]:
     yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
     if not worst:
         return
-    yield Fact("worst case", worst[0].index, "", OUTCOMES, "lowest score")
+    yield Fact("worst case", worst[0].index, "", OUTCOMES, "lowest margin")
     known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     if known:
         name = "failures that full braking or full acceleration of the VUT avoids"

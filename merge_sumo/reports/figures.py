@@ -17,13 +17,12 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
+from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
 from merge_sumo.studies.sampler_study import SamplerStudy
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import OWN, US23, Dimension, level_name
-from merge_sumo.values.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -215,12 +214,12 @@ def _pool_axes(axes: Axes, x: Dimension, y: Dimension) -> None:
     axes.xaxis.set_major_locator(MaxNLocator(5))
 
 
-def predicted_scores(
-    title: str, by_batch: Mapping[int, PredictedScores], level: int, truth: FloatArray
+def predicted_margins(
+    title: str, by_batch: Mapping[int, PredictedMargins], level: int, truth: FloatArray
 ) -> Figure:
-    """Draw the surrogate's score P after some batches, with the failures of the truth, (m, 2)."""
+    """Draw the surrogate's margin after some batches, with the failures of the truth, (m, 2)."""
     x, v = dimensions(level)
-    steps = np.linspace(2.0 * FAILURE_SCORE, 0.0, 21)
+    steps = np.linspace(-1.0, 1.0, 21)
     failures = _physical(truth, level)
     with _drawing(8.6, 6.6) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
@@ -229,14 +228,14 @@ def predicted_scores(
         for unused in grid.flat[len(by_batch) :]:
             unused.set_visible(False)
         for axes, (batch, predicted) in zip(grid.flat, by_batch.items(), strict=False):
-            n = len(predicted.score)
+            n = len(predicted.margin)
             across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
             filled = axes.contourf(
-                across, up, np.minimum(predicted.score, 0.0), steps, cmap="cividis", extend="min"
+                across, up, np.minimum(predicted.margin, 1.0), steps, cmap="cividis", extend="min"
             )
             line: Any = {"colors": "white", "linewidths": 1.6, "linestyles": "solid"}
-            if predicted.score.min() < FAILURE_SCORE < predicted.score.max():
-                axes.contour(across, up, predicted.score, [FAILURE_SCORE], **line)
+            if predicted.margin.min() < 0.0 < predicted.margin.max():
+                axes.contour(across, up, predicted.margin, [0.0], **line)
             axes.scatter(
                 failures[:, 0], failures[:, 1], s=2, color="#D55E00", linewidths=0, alpha=0.5
             )
@@ -248,24 +247,24 @@ def predicted_scores(
             _pool_axes(axes, x, v)
             axes.label_outer()
         bar = figure.colorbar(filled, ax=grid, shrink=0.85, ticks=steps[::5])
-        bar.set_label(f"predicted score P (white line: {FAILURE_SCORE:.0f}, a failure)")
+        bar.set_label("predicted margin (white line: 0, below which a case fails)")
     return figure
 
 
 def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
-    """Draw cases per level and mean score per level over the batches: median and quartile band."""
+    """Draw cases per level and mean margin per level over the batches: median and quartile band."""
     with _drawing(4.6 * len(by_sampler), 6.4) as figure:
         figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
         grid = figure.subplots(2, len(by_sampler), sharex=True, sharey="row", squeeze=False)
         for column, (name, levels) in enumerate(by_sampler.items()):
-            for axes, rows in zip(grid[:, column], (levels.cases, levels.score), strict=True):
+            for axes, rows in zip(grid[:, column], (levels.cases, levels.margin), strict=True):
                 for level, values in rows.items():
                     _band(axes, values, level)
             grid[0, column].set_title(name, color=colour(name))
             grid[1, column].set_xlabel("batch")
         grid[0, 0].set_ylim(0)
         grid[0, 0].set_ylabel("cases of the batch")
-        grid[1, 0].set_ylabel("mean score P of the batch")
+        grid[1, 0].set_ylabel("mean margin of the batch")
         grid[0, 0].legend(loc="upper left", title="POV level", ncols=3)
     return figure
 
@@ -274,7 +273,7 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
     from matplotlib.ticker import MaxNLocator
 
     batches = np.arange(1, values.shape[1] + 1)
-    # A batch in which no seed has a case at this level has no mean score: there is a gap.
+    # A batch in which no seed has a case at this level has no mean margin: there is a gap.
     some = ~np.isnan(values).all(axis=0)
     parts = np.full((3, len(batches)), np.nan)
     parts[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)

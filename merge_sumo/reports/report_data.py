@@ -78,12 +78,12 @@ def listed_measures(scenario: Scenario) -> list[Measure]:
 
 
 def _headings(facts: ReportModel) -> list[dict[str, Any]]:
-    """Return the columns of the table: the score, and measures of which a case has a value."""
+    """Return the columns of the table: measures of which a case has a value."""
     scenario = facts.run.scenario
     return [
         {"name": m.name, "title": m.title_in(scenario), "digits": m.digits}
         for m in listed_measures(scenario)
-        if m.name == "score" or any(o.measures.value(m.name) is not None for o in facts.shown)
+        if any(o.measures.value(m.name) is not None for o in facts.shown)
     ]
 
 
@@ -112,7 +112,7 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
             else severities.index(Severity(o.measures.severity)),
             "failed": int(o.failed),
             **{m.name: _rounded(o.measures.value(m.name), 4) for m in listed},
-            "score": _rounded(o.score, 1),
+            "margin": _rounded(o.margin, 3),
             "region": facts.regions.get(o.index),
             **_avoidance(facts, o.index),
             "way_out": _rounded(o.measures.last_avoidable_s, 1),
@@ -124,8 +124,6 @@ def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[A
         }
         if facts.repeated:
             row["runs"] = _runs(facts.repeated.get(o.index))
-        if not facts.run.criterion.is_papers:
-            row["margin"] = _rounded(o.margin, 3)
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
     return columns or {"index": []}

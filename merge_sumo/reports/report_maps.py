@@ -21,7 +21,7 @@ from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import Scenario
-from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.score import Outcome
 
 COUNT_GRID: Final = (32, 20)
 GRID: Final = {2: (49, 49, 1), 3: (33, 33, 9)}
@@ -135,7 +135,7 @@ def _chance(surface: Surface, dims: int, axes: Axes) -> dict[str, Any]:
 def _truth(truth: Truth, dims: int, axes: Axes) -> dict[str, Any]:
     from scipy.spatial import cKDTree
 
-    failed = truth.score < FAILURE_SCORE
+    failed = truth.margin < 0.0
     if dims in GRID:
         _, near = cKDTree(truth.points).query(nodes(GRID[dims]), k=NEIGHBOURS)
         return _packed(GRID[dims], failed[near].mean(axis=1))

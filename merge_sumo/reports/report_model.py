@@ -94,7 +94,7 @@ class ReportModel:
         self.repeats = read_repeats(run)
         self.near = sorted(
             (o for o in self.cases if _is_told(o) and not o.failed),
-            key=lambda o: (o.score, o.index),
+            key=lambda o: (o.margin, o.index),
         )
         self.surprises = surprises(self.cases)[:LISTED]
         self.untested = [o for o in self.cases if not _is_told(o)]
@@ -133,7 +133,7 @@ class ReportModel:
 
 
 def _is_told(outcome: Outcome) -> bool:
-    return outcome.is_tested and outcome.score is not None
+    return outcome.is_tested and outcome.margin is not None
 
 
 def road_of_run(run: Run) -> Corridor:

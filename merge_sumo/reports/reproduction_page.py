@@ -47,7 +47,7 @@ def _figures(result: Reproduction) -> Iterator[tuple[str, Figure, str]]:
             f"design2 against all levels, {scale.batches} batches of {2 * scale.batch}",
             result.levels,
         ),
-        "How the samplers share each batch out over the POV levels, and the mean score at "
+        "How the samplers share each batch out over the POV levels, and the mean margin at "
         "each level: median over the seeds, band from the first to the third quartile.",
     )
 
@@ -71,11 +71,11 @@ def _column_figures(result: ColumnResult) -> Iterator[tuple[str, Figure, str]]:
         truth = result.panels["truth"]
         yield (
             f"gpr-surface-level{level}",
-            figures.predicted_scores(
+            figures.predicted_margins(
                 f"The surrogate of gpr on {vut} against a level-{level} POV",
                 *(result.predicted(), level, truth.points[truth.failed]),
             ),
-            "The score that the surrogate predicts, with the cases that it has learned from "
+            "The margin that the surrogate predicts, with the cases that it has learned from "
             "(white) and the failures of the truth (orange). Inside the white line it predicts a "
             "failure.",
         )

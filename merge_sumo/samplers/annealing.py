@@ -1,6 +1,6 @@
 """Simulated annealing, a baseline of the paper (Dixon and Szego, 1978; Kirkpatrick et al., 1983).
 
-Chains look for the lowest score and cool down as batches come in, so their cases end up around
+Chains look for the lowest margin and cool down as batches come in, so their cases end up around
 one minimum each: it is an optimiser, not a search for all regions of failures.
 """
 
@@ -18,8 +18,8 @@ from merge_sumo.values.case import FloatArray
 
 CHAINS: Final = 2
 """Chains per level: a single one may spend the whole budget around a minimum of no failures."""
-TEMPERATURE0: Final = 200.0
-"""Of the first move, in units of the score: a rise by it is accepted with probability 1/e."""
+TEMPERATURE0: Final = 0.4
+"""Of the first move, as a margin: a rise by it is accepted with probability 1/e."""
 COOLING: Final = 0.8
 """Factor of the temperature from batch to batch."""
 STEP0: Final = 0.25
@@ -36,7 +36,7 @@ class AnnealingSampler(LevelwiseSampler):
     and the batch, so that it is the same whenever it is replayed.
     """
 
-    about = "looks for the lowest score by simulated annealing"
+    about = "looks for the lowest margin by simulated annealing"
     colour = "#E69F00"
 
     def propose(
@@ -59,14 +59,14 @@ class AnnealingSampler(LevelwiseSampler):
         batches = np.unique(history.batch)
         first = np.flatnonzero(history.batch == batches[0])
         turns = [first[chain::CHAINS] for chain in range(min(CHAINS, len(first)))]
-        standing = np.array([turn[np.argmin(history.score[turn])] for turn in turns])
+        standing = np.array([turn[np.argmin(history.margin[turn])] for turn in turns])
         for cooled, batch in enumerate(batches[1:].tolist()):
             temperature = TEMPERATURE0 * COOLING**cooled
             moves = np.flatnonzero(history.batch == batch)
             luck = self.batch_rng(level, batch).random(len(moves))
             turn = (np.arange(len(moves)) % len(standing)).tolist()
             for chain, move, chance in zip(turn, moves.tolist(), luck.tolist(), strict=True):
-                rise = float(history.score[move] - history.score[standing[chain]])
+                rise = float(history.margin[move] - history.margin[standing[chain]])
                 # Metropolis et al. (1953): downhill always, uphill sometimes.
                 if rise <= 0.0 or chance < math.exp(-rise / temperature):
                     standing[chain] = move

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, ClassVar, Final
 import numpy as np
 
 from merge_sumo.samplers.allocation import even_shares
-from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.values.case import Case, FloatArray, Pool, to_unit
 from merge_sumo.values.chance import RunsOfCase, by_case
 from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome, gap_limit_m
+from merge_sumo.values.score import Outcome
 
 if TYPE_CHECKING:
     from merge_sumo.samplers.prediction_skill import Predictor
@@ -127,12 +127,6 @@ class Sampler(ABC):
         pending = sum(level in (None, case.level) for case in self._pending)
         return pending + (self._proposed.total() if level is None else self._proposed[level])
 
-    @property
-    def gap_limit_m(self) -> float:
-        """The limit of the gaps that are learned, within which a case fails, in m."""
-        stands_in = any(outcome.margin is not None for outcome in self.observed())
-        return gap_limit_m(self.pool.scenario, stands_in=stands_in)
-
     def history(self, level: int) -> LevelHistory:
         """Return the outcomes with a verdict at one level as arrays, a row for each case."""
         if self._repeated:
@@ -157,28 +151,27 @@ class Sampler(ABC):
         """Return the history of a level where cases ran with more than one draw."""
         cases = self.runs(level)
         worst = [one.deciding() for one in cases]
-        scores = [np.array([run.score for run in one.outcomes], dtype=float) for one in cases]
+        margins = [bounded(np.array([r.margin for r in one.outcomes], float)) for one in cases]
         return replace(
             self._rows_of(worst, level),
             failed=np.array([one.share > self.tolerated for one in cases], dtype=bool),
             batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),
             runs=np.array([one.runs for one in cases], dtype=np.int64),
             failures=np.array([one.failures for one in cases], dtype=np.int64),
-            variance=np.array([np.var(of, ddof=1) if len(of) > 1 else np.nan for of in scores]),
-            varies=any(len({run.score for run in one.outcomes}) > 1 for one in self.runs()),
+            variance=np.array([np.var(of, ddof=1) if len(of) > 1 else np.nan for of in margins]),
+            varies=any(len({run.margin for run in one.outcomes}) > 1 for one in self.runs()),
         )
 
     def _rows_of(self, outcomes: Sequence[Outcome], level: int) -> LevelHistory:
         """Return outcomes as rows, as if each were the only run of its case."""
         return LevelHistory(
             points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
-            score=np.array([o.score for o in outcomes], dtype=np.float64),
+            margin=bounded(np.array([o.margin for o in outcomes], dtype=np.float64)),
             failed=np.array([o.failed for o in outcomes], dtype=bool),
             # None becomes NaN.
-            dx_m=np.array([o.signed_gap_m for o in outcomes], dtype=np.float64),
+            gap=np.array([o.signed_gap for o in outcomes], dtype=np.float64),
             batch=np.array([o.batch for o in outcomes], dtype=np.int64),
             tolerated=self.tolerated,
-            limit_m=self.gap_limit_m,
         )
 
     def rng(self, *key: int) -> np.random.Generator:
@@ -223,7 +216,7 @@ class LevelwiseSampler(Sampler):
 
 def _observe(observed: dict[int | None, list[Outcome]], outcome: Outcome) -> None:
     """Add an outcome, if it has a verdict, to those of its level and to all."""
-    if outcome.score is not None:
+    if outcome.margin is not None:
         observed[None].append(outcome)
         observed.setdefault(outcome.case.level, []).append(outcome)
 

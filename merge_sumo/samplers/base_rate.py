@@ -30,7 +30,7 @@ PRIOR_FAILURES: Final = 0.5
 PRIOR_CASES: Final = 10.0
 """Failures and cases that the base rate begins with."""
 OFFERED: Final = 4000
-"""Points of another sequence, among which cases are chosen by the score alone."""
+"""Points of another sequence, among which cases are chosen by the margin alone."""
 LEAST_OF_SEQUENCE: Final = 0.25
 """Least share of the stand-ins that the sequence gives: only it comes everywhere."""
 JUDGED: Final = 100
@@ -42,7 +42,7 @@ class BaseRate:
 
     Attributes:
         chance: base rate of failures.
-        following: next points that stand in for picks, (n, d): of the sequence, and by the score.
+        following: next points that stand in for picks, (n, d): of the sequence, and by the margin.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class BaseRate:
         n: int,
         proposed: int,
         rng: np.random.Generator,
-        by_score: Callable[[FloatArray, int], FloatArray],
+        by_margin: Callable[[FloatArray, int], FloatArray],
     ) -> None:
         """Judge by a history and what was predicted of each of its cases.
 
@@ -64,7 +64,7 @@ class BaseRate:
             n: points of the sequence that are wanted.
             proposed: number of cases proposed at the level.
             rng: generator with which the first batch of the level began the sequence.
-            by_score: chooses so many of some points by the score alone.
+            by_margin: chooses so many of some points by the margin alone.
         """
         self._history = history
         offered = spread_out(OFFERED, history.dims, np.random.default_rng([OFFERED, history.dims]))
@@ -81,7 +81,7 @@ class BaseRate:
         stood_in = spread + int(scored.sum()) + first
         wanted = np.clip((stood_in * share).astype(np.int64) - spread, 0, first)
         from_sequence = np.diff(wanted, prepend=0) > 0
-        self.following = by_score(offered, n)
+        self.following = by_margin(offered, n)
         self.following[from_sequence] = sequence[begun : begun + int(from_sequence.sum())]
         anywhere |= scored
         said = np.array([np.nan if one is None else one.p_fail for one in predictions])

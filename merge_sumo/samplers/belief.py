@@ -1,14 +1,14 @@
 """The surrogate of `coverage`: P(fail) of a case, from the outcomes so far.
 
-Failing means that the signed gap dx at M is within a limit: failures lie where the gap changes its
-sign: where another car goes first. There the gap often jumps, and no test between the two sides
-ever fails. Three experts give P(fail):
+Failing means that the signed gap at M, in units of the scenario's limit, is within 1: failures lie
+where the gap changes its sign: where another car goes first. There the gap often jumps, and no test
+between the two sides ever fails. Three experts give P(fail):
 
 - a smooth process on the gap, and a rough one, which believe that it passes through 0;
 - a process for the gap of either side, and who goes first: the gap may come down to a failure on
   one side and jump to the other from there, or jump over the failures.
 
-A VUT that gives no trajectory has its score learned instead, by the first two. Every expert is
+A VUT that gives no trajectory has its margin learned instead, by the first two. Every expert is
 judged by how well it predicted each case from all the others. Two things that no process knows are
 learned with it. First, the odds of a case that is bracketed, the nearest safe case on either side
 being nearer than any failure, are lowered by h / (h + w): h is the width of the bracket, w the
@@ -36,10 +36,8 @@ from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chanc
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.score import FAILURE_SCORE
+from merge_sumo.values.prediction import NO_GAP
 
-NO_GAP_M: Final = 200.0
-"""Gap of a VUT that never arrives: the POV goes first, at the largest possible distance."""
 MAX_LEARNED: Final = 500
 """Cases that a process learns from; bounds the time per batch in a long campaign. The FMC
 after 1,100 cases of design2 at level 2 is .0207 and .0209 (seeds 1, 2); with 1000 .0208, .0214."""
@@ -74,13 +72,13 @@ class Belief:
     """
 
     def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
-        """Learn from a history; with a `limit`, all cases up to that gap in m (score) failed."""
+        """Learn from a history; with a `limit`, all cases up to that gap (margin) failed."""
         if limit is not None:
             history = _as_if(history, limit)
         learned = most_telling(history, MAX_LEARNED)
         self.groups = _groups(history)
         self.history = history
-        values, low, high = margin_of(learned, limit)
+        values, low, high = what_is_learned(learned, limit)
         self._smooth, self._rough = (
             Margin(learned.points, values, low, high, rough=rough, noisy=history.varies)
             for rough in (False, True)
@@ -195,34 +193,37 @@ def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | 
     return Belief(history).of
 
 
-def margin_of(history: LevelHistory, limit: float | None = None) -> tuple[FloatArray, float, float]:
+def what_is_learned(
+    history: LevelHistory, limit: float | None = None
+) -> tuple[FloatArray, float, float]:
     """Return what is learned, (N,), and the interval of it that means failure.
 
     The signed gap in units of the limit, compressed like a logarithm where it is large: a
-    gap of 100 m says little more about failures than one of 50 m. Without gaps, the score in
-    units of the limit (lambda).
+    gap of 100 m says little more about failures than one of 50 m. Without gaps, the badness in
+    units of that at the limit.
     """
     if not has_gaps(history):
-        return np.minimum(history.score / (limit or FAILURE_SCORE) - 1.0, 1.0), 0.0, np.inf
-    gap = np.nan_to_num(history.dx_m, nan=NO_GAP_M) / (limit or history.limit_m)
+        return np.minimum(history.badness / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
+    gap = np.nan_to_num(history.gap, nan=NO_GAP) / (limit or 1.0)
     return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
 
 
 def _as_if(history: LevelHistory, limit: float) -> LevelHistory:
     """Return the history as if all cases up to a limit had failed."""
-    nearness = gap_m(history) if has_gaps(history) else history.score
-    failed = nearness <= limit
+    failed = nearness(history) <= limit
     return replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
 
 
-def gap_m(history: LevelHistory) -> FloatArray:
-    """Return |dx| at M, (N,); that of a VUT that never arrives is large."""
-    return np.abs(np.nan_to_num(history.dx_m, nan=NO_GAP_M))
+def nearness(history: LevelHistory) -> FloatArray:
+    """Return the size of the gap, or else the margin, (N,): the less, the nearer to a failure."""
+    if not has_gaps(history):
+        return history.margin
+    return np.abs(np.nan_to_num(history.gap, nan=NO_GAP))
 
 
 def has_gaps(history: LevelHistory) -> bool:
     """Return whether the VUT gives trajectories."""
-    return not np.isnan(history.dx_m).all()
+    return not np.isnan(history.gap).all()
 
 
 def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
@@ -234,7 +235,7 @@ def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
     safe = ~failed
     if not has_gaps(history):
         return [failed, safe, safe]
-    pov_first = np.nan_to_num(history.dx_m, nan=NO_GAP_M) >= 0.0
+    pov_first = np.nan_to_num(history.gap, nan=NO_GAP) >= 0.0
     return [failed, safe & ~pov_first, safe & pov_first]
 
 

@@ -30,7 +30,7 @@ def of_belief(
     history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
 ) -> FloatArray:
     """Return more than `n` candidates, (m, d), of the surrogate alone."""
-    worst = history.points[np.argsort(history.score, kind="stable")[:20]]
+    worst = history.points[np.argsort(history.margin, kind="stable")[:20]]
     failing = history.points[history.failed]
     local_reach = LOCAL_REACH * radius_for(history.dims)
     along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))

@@ -17,7 +17,7 @@ import numpy as np
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
-from merge_sumo.samplers.belief import Belief, Calibration, gap_m, has_gaps
+from merge_sumo.samplers.belief import Belief, Calibration, nearness
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.gpr import exploiting
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
@@ -107,10 +107,10 @@ class CoverageSampler(Sampler):
             answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
             while answers:
                 queries = {}
-                for level, gaps_m in answers.items():
+                for level, answer in answers.items():
                     try:
                         # A generator is begun by sending None.
-                        queries[level] = searches[level].send(gaps_m)  # type: ignore[arg-type]
+                        queries[level] = searches[level].send(answer)  # type: ignore[arg-type]
                     except StopIteration as ended:
                         proposals[level] = ended.value
                 answers = {}
@@ -136,8 +136,8 @@ class CoverageSampler(Sampler):
             base_rate = self._base_rate(level, history, pending, n)
         if skill.is_worthless and not few:
             batch = _Search(history, pending, rng, n).batch(n, base_rate)
-            gaps_m = yield Query(level, batch.points)
-            return skill.annotated(batch, gaps_m)
+            gaps = yield Query(level, batch.points)
+            return skill.annotated(batch, gaps)
         return (yield from twin_guided_batch(history, pending, n, rng, level, skill, base_rate))
 
     def _base_rate(
@@ -149,12 +149,12 @@ class CoverageSampler(Sampler):
         errors = [
             outcome.case
             for outcome in self._outcomes.values()
-            if outcome.score is None and outcome.case.level == level
+            if outcome.margin is None and outcome.case.level == level
         ]
         unknown = np.concatenate([pending, to_unit(errors, level, self.pool.scenario)])
         begins = np.random.default_rng([self.seed, 0, level])
-        by_score = partial(exploiting, history, pending)
-        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins, by_score)
+        by_margin = partial(exploiting, history, pending)
+        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins, by_margin)
 
     def _skill(self, level: int) -> Asking[PredictionSkill]:
         """Return the skill of the predictions so far, of all levels."""
@@ -163,9 +163,9 @@ class CoverageSampler(Sampler):
         if last:
             indices = [outcome.index for outcome in last]
             points = to_unit((outcome.case for outcome in last), level, self.pool.scenario)
-            gaps_m = yield Query(level, points, held_out=indices)
-            replayed = dict(zip(indices, gaps_m.T, strict=True))
-        return PredictionSkill(self.observed(), level, self.gap_limit_m, replayed)
+            gaps = yield Query(level, points, held_out=indices)
+            replayed = dict(zip(indices, gaps.T, strict=True))
+        return PredictionSkill(self.observed(), level, self.pool.scenario.dx_crash_m, replayed)
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
@@ -228,11 +228,10 @@ class _Search:
 
 
 def _limit(history: LevelHistory) -> float | None:
-    """Return the gap in m, or the score, that the search aims at; None for that of a failure.
+    """Return the gap, or the margin, that the search aims at; None for that of a failure.
 
     With few failures, the nearest misses guide the search, as in subset simulation.
     """
-    if history.ever_failed.sum() >= NEAREST or len(history.score) < PATIENCE:
+    if history.ever_failed.sum() >= NEAREST or len(history.points) < PATIENCE:
         return None
-    nearness = gap_m(history) if has_gaps(history) else history.score
-    return float(np.partition(nearness, NEAREST - 1)[NEAREST - 1])
+    return float(np.partition(nearness(history), NEAREST - 1)[NEAREST - 1])

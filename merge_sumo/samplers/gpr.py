@@ -14,7 +14,6 @@ from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.surrogate import most_telling
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.score import FAILURE_SCORE
 
 QUERIES: Final = 4000
 """p, the uniform queries among which a batch is chosen."""
@@ -29,7 +28,7 @@ FLOOR: Final = 1e-3
 XI: Final = 3.0
 """Greediness of the shares of the levels."""
 NOISE: Final = 1e-2
-"""Variance of the observation noise, in units of lambda^2: P has a jump, which a smooth
+"""Variance of the observation noise: the badness has a jump, which a smooth
 surrogate can only take as noise."""
 MAX_LEARNED: Final = 600
 """Cases that the process learns from; what bounds the time per batch in a long campaign."""
@@ -39,10 +38,10 @@ explains a jump by forgetting its neighbours."""
 
 
 class GprSampler(LevelwiseSampler):
-    """Zero-mean Gaussian process with a squared-exponential kernel on the score, epsilon-greedy.
+    """Zero-mean Gaussian process with a squared-exponential kernel on the badness, epsilon-greedy.
 
-    The surrogate learns the badness -P / 500, because the powers of q = mu^z1 Var^z2 need
-    positive numbers: P itself is never positive. Within a batch the picks are made one after the
+    The badness of a margin m is 1 - m, which is P / lambda under the paper's criterion: the powers
+    of q = mu^z1 Var^z2 need positive numbers. Within a batch the picks are made one after the
     other, and the variance is conditioned on the earlier ones (it does not depend on their
     results), so that a batch is spread out instead of piled up on one maximum. A query is worth
     only the share of its ball (radius rho of the FMC) that no failure and no pick covers yet.
@@ -61,7 +60,7 @@ class GprSampler(LevelwiseSampler):
     ===========================  =====  =====  ===========================  =====  =====
     """
 
-    about = "chooses by a Gaussian process on the score: the paper's Algorithm 1"
+    about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"
     colour = "#0072B2"
     overlaps = True
 
@@ -91,7 +90,7 @@ class GprSampler(LevelwiseSampler):
 def exploiting(
     history: LevelHistory, pending: FloatArray, queries: FloatArray, n: int
 ) -> FloatArray:
-    """Return `n` of some queries, (n, d), where the process on the score expects most."""
+    """Return `n` of some queries, (n, d), where the process on the badness expects most."""
     posterior = _Posterior(history, queries, pending)
     return queries[[posterior.pick(*Z_EXPLOIT) for _ in range(n)]]
 
@@ -159,21 +158,21 @@ def _fit(history: LevelHistory) -> Any:
     with threadpool_limits(1), warnings.catch_warnings():
         # A length scale at its bound is expected where P hardly depends on a coordinate.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return process.fit(history.points, history.score / FAILURE_SCORE)
+        return process.fit(history.points, history.badness)
 
 
 def _noise(history: LevelHistory) -> FloatArray | float:
-    """Return the variance of the noise of each case, (N,), in units of lambda^2.
+    """Return the variance of the noise of each case, (N,).
 
     Where runs of a case differ, the variance that cases with several runs have in the mean is that
     of a single run; more runs lower it.
     """
     if not history.varies or np.isnan(history.variance).all():
         return NOISE
-    of_a_run = float(np.nanmean(history.variance)) / FAILURE_SCORE**2
+    of_a_run = float(np.nanmean(history.variance))
     return np.asarray(NOISE + of_a_run / history.runs, dtype=np.float64)
 
 
-def predicted_score(history: LevelHistory, points: FloatArray) -> FloatArray:
-    """Return the score P that the surrogate predicts at points, (m, d), as (m,)."""
-    return np.asarray(FAILURE_SCORE * _fit(history).predict(points), dtype=np.float64)
+def predicted_margin(history: LevelHistory, points: FloatArray) -> FloatArray:
+    """Return the margin that the surrogate predicts at points, (m, d), as (m,)."""
+    return np.asarray(1.0 - _fit(history).predict(points), dtype=np.float64)

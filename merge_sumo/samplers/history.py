@@ -3,13 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DX_CRASH_M
+
+LINEAR: Final = 1.25
+"""Size up to which a margin is learned as it is; the paper's are all within."""
+
+
+def bounded(margin: FloatArray) -> FloatArray:
+    """Return margins, (...), with the large ones drawn in: what a process on them can learn.
+
+    In the same order and with the same signs, continuous with its slope, and within 2.5.
+    """
+    size = np.maximum(np.abs(margin), LINEAR)
+    drawn_in = np.sign(margin) * (2.0 * LINEAR - LINEAR**2 / size)
+    return np.asarray(np.where(size > LINEAR, drawn_in, margin), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,31 +33,28 @@ class LevelHistory:
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        score: P of the worst run, or its stand-in under another criterion than the paper's, (N,).
-        failed: whether more than the tolerated share of the runs failed, (N,); for a single run,
-            score < lambda.
-        dx_m: signed gap at M in the worst run, (N,), or its stand-in under another criterion: a run
-            fails within `limit_m`; NaN where the VUT never arrived or there is no trajectory.
+        margin: bounded margin of the worst run, below 0 for a failure, (N,): see `bounded`.
+        failed: whether more than the tolerated share of the runs failed, (N,).
+        gap: signed gap of the worst run, (N,), which fails within 1: see `Outcome.signed_gap`; NaN
+            where the VUT never arrived or there is no trajectory.
         batch: batch of the campaign in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
         failures: number of those that failed, (N,).
-        variance: variance of the score over the runs of a case, (N,); NaN for a single run.
+        variance: variance of the margin over the runs of a case, (N,); NaN for a single run.
         varies: whether runs of a case have differed, at this level or another.
         tolerated: share of the runs of a case that may fail.
-        limit_m: gap within which a run fails.
     """
 
     points: FloatArray
-    score: FloatArray
+    margin: FloatArray
     failed: NDArray[np.bool_]
-    dx_m: FloatArray
+    gap: FloatArray
     batch: NDArray[np.int64]
     runs: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     failures: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     variance: FloatArray = field(default_factory=lambda: np.empty(0, dtype=np.float64))
     varies: bool = False
     tolerated: float = 0.0
-    limit_m: float = DX_CRASH_M
 
     def __post_init__(self) -> None:
         """Give each case a single run where nothing else is said."""
@@ -62,6 +71,11 @@ class LevelHistory:
     def dims(self) -> int:
         """Return d, the number of coordinates."""
         return int(self.points.shape[1])
+
+    @property
+    def badness(self) -> FloatArray:
+        """Return how bad each case is, (N,): above 1 for a failure; P / lambda in the paper."""
+        return np.asarray(1.0 - self.margin, dtype=np.float64)
 
     @property
     def share(self) -> FloatArray:

@@ -1,7 +1,7 @@
 """P(fail) from the predictions of a twin, weighted by the skill of its predictions so far.
 
 A *predictor*, which knows the POVs and has observed the VUT, rolls cases out and predicts the gap
-at M. It has experts of several kinds, and of each several members who know
+at M, in units of the limit. It has experts of several kinds, and of each several members who know
 different things, so that they disagree where they guess. How much is to be made of what they say is
 in the record: what they had said of the cases that have run since.
 """
@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
-from merge_sumo.samplers.belief import NO_GAP_M
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import Prediction
+from merge_sumo.values.prediction import NO_GAP, Prediction
 from merge_sumo.values.score import Outcome
 
 Known = Sequence[tuple[Outcome, Prediction]]
@@ -91,15 +90,15 @@ class Predictor(Protocol):
         """Return whether the outcomes so far suffice to predict cases of a level."""
 
     def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
-        """Return the gaps at M in m of each query; NaN where the VUT never arrives.
+        """Return the signed gaps of each query (`Outcome.signed_gap`); NaN where none is reached.
 
         They are (E, G, n), (1, 1, n) where one member screens, and (E, n) of cases held out.
         """
 
 
-def compressed(gap_m: FloatArray, limit_m: float) -> FloatArray:
-    """Return gaps in units of the limit, on a scale that is logarithmic where they are large."""
-    return np.asarray(np.arcsinh(np.nan_to_num(gap_m, nan=NO_GAP_M) / limit_m))
+def compressed(gap: FloatArray) -> FloatArray:
+    """Return gaps on a scale that is logarithmic where they are large."""
+    return np.asarray(np.arcsinh(np.nan_to_num(gap, nan=NO_GAP)))
 
 
 class PredictionSkill:
@@ -121,9 +120,10 @@ class PredictionSkill:
         limit_m: float,
         replayed: Mapping[int, FloatArray] | None = None,
     ) -> None:
-        """Learn from outcomes in the order of their index; a failure is a gap below the limit.
+        """Learn from outcomes in the order of their index; predictions are recorded in m.
 
-        `replayed` are gaps, (E,), by the index of a case, of members that did not learn from it.
+        `limit_m` is the limit of the scenario, the unit of gaps. `replayed` are gaps, (E,), by the
+        index of a case, of members that did not learn from it.
         """
         outcomes = outcomes[-FORGOTTEN:]
         known = [(o, o.prediction) for o in outcomes if o.prediction is not None]
@@ -163,9 +163,9 @@ class PredictionSkill:
         """Return an expert drawn by weight."""
         return int(rng.choice(len(self.experts), p=self.experts))
 
-    def chance(self, gaps_m: FloatArray, expert: int | None = None) -> FloatArray:
+    def chance(self, gaps: FloatArray, expert: int | None = None) -> FloatArray:
         """Return P(fail), (n,), of cases with predicted gaps, (E, G, n), of one expert or all."""
-        said = compressed(gaps_m, self._limit_m)[..., None]
+        said = compressed(gaps)[..., None]
         failing = ndtr((EDGE - said) / WIDTHS) - ndtr((-EDGE - said) / WIDTHS)
         experts, _, n, _ = said.shape
         anywhere = np.full((experts, n, 1), 2.0 * EDGE / REACH)
@@ -176,34 +176,40 @@ class PredictionSkill:
         by_expert = np.einsum("enw,ew->en", by_width, mixture)
         return np.asarray(np.average(by_expert, axis=0, weights=weights), dtype=np.float64)
 
-    def mixed(self, gaps_m: FloatArray, p_twin: FloatArray, p_surrogate: FloatArray) -> FloatArray:
+    def mixed(self, gaps: FloatArray, p_twin: FloatArray, p_surrogate: FloatArray) -> FloatArray:
         """Return P(fail), (n,), of twin and surrogate together."""
-        weight = self.twin[self._agreed(gaps_m).astype(np.int64)]
+        weight = self.twin[self._agreed(gaps).astype(np.int64)]
         mixed: FloatArray = weight * p_twin + (1.0 - weight) * p_surrogate
         return mixed
 
-    def disagreement(self, gaps_m: FloatArray) -> FloatArray:
+    def disagreement(self, gaps: FloatArray) -> FloatArray:
         """Return the information in cases, (n,), by gaps, (E, G, n).
 
         Large where members disagree on a gap that may be small.
         """
-        said = compressed(gaps_m, self._limit_m).reshape(-1, gaps_m.shape[-1])
+        said = compressed(gaps).reshape(-1, gaps.shape[-1])
         return np.asarray(said.std(axis=0) * np.exp(-0.25 * np.square(np.median(said, axis=0))))
 
-    def annotated(self, proposal: Proposal, gaps_m: FloatArray) -> Proposal:
+    def prediction(
+        self, gaps: FloatArray, p_twin: float, p_surrogate: float, p_fail: float
+    ) -> Prediction:
+        """Return the prediction of a case by its gaps, (E, G), as it is recorded."""
+        return Prediction.of(self._limit_m * gaps, p_twin, p_surrogate, p_fail)
+
+    def annotated(self, proposal: Proposal, gaps: FloatArray) -> Proposal:
         """Return a proposal of the surrogate's with what rollouts say of it, which may change."""
         said = tuple(
-            Prediction.of(gaps_m[..., i], float(p), float(chance), float(chance))
+            self.prediction(gaps[..., i], float(p), float(chance), float(chance))
             for i, (p, chance) in enumerate(
-                zip(self.chance(gaps_m), proposal.probability, strict=True)
+                zip(self.chance(gaps), proposal.probability, strict=True)
             )
         )
         return replace(proposal, predictions=said)
 
-    def _agreed(self, gaps_m: FloatArray) -> NDArray[np.bool_]:
+    def _agreed(self, gaps: FloatArray) -> NDArray[np.bool_]:
         """Return where all members predict the same verdict, (n,), by gaps, (E, G, n)."""
-        gaps = np.abs(np.nan_to_num(gaps_m, nan=NO_GAP_M)).reshape(-1, gaps_m.shape[-1])
-        failing = gaps < self._limit_m
+        gaps = np.abs(np.nan_to_num(gaps, nan=NO_GAP)).reshape(-1, gaps.shape[-1])
+        failing = gaps < 1.0
         return np.asarray(failing.all(axis=0) | ~failing.any(axis=0))
 
     def _kept(self, known: Known, level: int) -> float:
@@ -227,7 +233,7 @@ class PredictionSkill:
         for outcome in outcomes:
             said = replayed.get(outcome.index)
             if outcome.prediction is not None:
-                off.append((outcome, outcome.prediction.gaps_m))
+                off.append((outcome, outcome.prediction.gaps_m / self._limit_m))
             elif said is not None:
                 off.append((outcome, said[:, None]))
             if said is not None:
@@ -248,15 +254,14 @@ class PredictionSkill:
 
         By predicted gaps, (E, G) of each case: a member of an expert is as good as any other.
         """
-        true_m = np.array([o.signed_gap_m for o, _ in predicted], dtype=np.float64)
-        true = compressed(true_m, self._limit_m)
+        true = compressed(np.array([o.signed_gap for o, _ in predicted], dtype=np.float64))
         experts = len(predicted[0][1])
         densities = np.full((experts, len(predicted), len(WIDTHS) + 1), 1.0 / REACH)
-        members = np.array([gaps_m.shape[1] for _, gaps_m in predicted])
+        members = np.array([gaps.shape[1] for _, gaps in predicted])
         for count in np.unique(members).tolist():
             places = np.flatnonzero(members == count)
-            gaps_m = np.array([predicted[place][1] for place in places.tolist()])
-            off = (true[places, None, None] - compressed(gaps_m, self._limit_m))[..., None]
+            gaps = np.array([predicted[place][1] for place in places.tolist()])
+            off = (true[places, None, None] - compressed(gaps))[..., None]
             density = np.exp(-0.5 * np.square(off / WIDTHS)) / (WIDTHS * np.sqrt(2.0 * np.pi))
             densities[:, places, :-1] = density.mean(axis=2).transpose(1, 0, 2)
         return densities
@@ -271,7 +276,7 @@ class PredictionSkill:
     def _learn_weights(self, known: Known, weight: FloatArray) -> None:
         """Learn where the rollouts, and where the surrogate, predicted the verdicts better."""
         failed = np.array([o.failed for o, _ in known])
-        same = self._agreed(np.stack([told.gaps_m for _, told in known], axis=-1))
+        same = self._agreed(np.stack([told.gaps_m / self._limit_m for _, told in known], axis=-1))
         chances = np.array([(told.p_twin, told.p_surrogate) for _, told in known])
         right = np.where(failed[:, None], chances, 1.0 - chances)
         evidence = weight[:, None] * np.log(np.clip(right, SURE, 1.0 - SURE))

@@ -1,8 +1,8 @@
 """Subset simulation, a baseline of the paper (Au and Beck, 2001).
 
 A small probability is a product of larger ones: P(F) = P(F1) P(F2 | F1) ... with regions F1, F2,
-... of ever lower scores that end at the failures. The cases of a region are drawn by Markov chains
-that start from the lowest scores of the region before (modified Metropolis).
+... of ever lower margins that end at the failures. The cases of a region are drawn by Markov chains
+that start from the lowest margins of the region before (modified Metropolis).
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 from merge_sumo.samplers.base import LevelwiseSampler, reflect
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.score import FAILURE_SCORE
 
 STAGE_SIZE: Final = 100
 """Samples of a stage, that is of one conditional region."""
@@ -33,7 +32,7 @@ class Stage:
     Attributes:
         probability: P(F_i), the estimated probability of the present region.
         number: i; 0 is the whole cube, sampled uniformly.
-        threshold: the region is where the score is at or below this; infinite for the cube.
+        threshold: the region is where the margin is at or below this; infinite for the cube.
         chains: present state of each chain, (c, d); none for the cube.
         moved: moves made in this region so far.
         failing_share: share of failures among the samples of the region so far.
@@ -70,10 +69,10 @@ def replay(history: LevelHistory) -> Stage:
     probability, number, threshold, moved = 1.0, 0, np.inf, 0
     chains, levels = np.empty((0, dims)), np.empty(0)
     # The samples of the stage: states of the chains, so that a rejected move repeats its state.
-    samples, scores = [np.empty((0, dims))], [np.empty(0)]
+    samples, margins = [np.empty((0, dims))], [np.empty(0)]
     for batch in np.unique(history.batch).tolist():
         points = history.points[history.batch == batch]
-        values = history.score[history.batch == batch]
+        values = history.margin[history.batch == batch]
         if number:
             chain = (moved + np.arange(len(points))) % len(chains)
             moved += len(points)
@@ -82,25 +81,25 @@ def replay(history: LevelHistory) -> Stage:
             values = np.where(rejected, levels[chain], values)
             # Where a chain made several moves in a batch, the last one counts.
             chains[chain], levels[chain] = points, values
-        if threshold < FAILURE_SCORE:
+        if threshold < 0.0:
             continue
         samples.append(points)
-        scores.append(values)
-        population, of_population = np.concatenate(samples), np.concatenate(scores)
+        margins.append(values)
+        population, of_population = np.concatenate(samples), np.concatenate(margins)
         if len(population) < STAGE_SIZE:
             continue
         seeds = np.argsort(of_population, kind="stable")[: round(SEED_SHARE * len(population))]
         threshold = float(of_population[seeds[-1]])
-        if threshold < FAILURE_SCORE:
-            seeds = np.flatnonzero(of_population < FAILURE_SCORE)
-            threshold = np.nextafter(FAILURE_SCORE, -np.inf)
+        if threshold < 0.0:
+            seeds = np.flatnonzero(of_population < 0.0)
+            threshold = np.nextafter(0.0, -np.inf)
         probability *= len(seeds) / len(population)
         chains, levels = population[seeds], of_population[seeds]
         # The seeds are samples of the new region too.
-        samples, scores = [chains.copy()], [levels.copy()]
+        samples, margins = [chains.copy()], [levels.copy()]
         number, moved = number + 1, 0
-    seen = np.concatenate(scores)
-    share = float(np.mean(seen < FAILURE_SCORE)) if len(seen) else 0.0
+    seen = np.concatenate(margins)
+    share = float(np.mean(seen < 0.0)) if len(seen) else 0.0
     return Stage(probability, number, threshold, chains, moved, share)
 
 
@@ -111,7 +110,7 @@ class SubsetSampler(LevelwiseSampler):
     distribution each is accepted exactly where it stays in the region.
     """
 
-    about = "draws from ever smaller regions of low scores by Markov chains"
+    about = "draws from ever smaller regions of low margins by Markov chains"
     colour = "#009E73"
 
     def propose(

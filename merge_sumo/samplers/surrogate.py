@@ -216,7 +216,7 @@ def most_telling(history: LevelHistory, most: int) -> LevelHistory:
     """Return at most `most` cases: half of them the worst ones, half spread over the rest."""
     if len(history.points) <= most:
         return history
-    order = np.argsort(history.score, kind="stable")
+    order = np.argsort(history.margin, kind="stable")
     half = most // 2
     rest = np.sort(order[half:])
     evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)

@@ -23,7 +23,6 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import Prediction
 
 ANYWHERE: Final = 1000
 ANYWHERE_ABOVE_3D: Final = 5000
@@ -87,7 +86,7 @@ def twin_guided_batch(
         yield from candidates.add(spread)
         candidates.grid.cover(candidates.grid.balls(spread), PICKED)
     explores = n >= EXPLORES_FROM and not skill.is_doubted
-    information = skill.disagreement(candidates.gaps_m) if explores else None
+    information = skill.disagreement(candidates.gaps) if explores else None
     above = candidates.above
     picks, gain = greedy(
         candidates.grid, candidates.points, above, above, n - len(first), information
@@ -109,7 +108,7 @@ class _Candidates:
         grid: coverage by the failures so far, and by the pending cases.
         surrogate: None without outcomes at the level.
         points: candidates, (m, d).
-        gaps_m: predicted gaps at M, (E, G, m).
+        gaps: predicted gaps at M, (E, G, m).
         p_fail: P(fail) by twin and surrogate together, (m,).
         above: probability of failing in more runs than are tolerated, (m,).
     """
@@ -125,7 +124,7 @@ class _Candidates:
         self._predictions: tuple[FloatArray, ...] = ()
 
     @property
-    def gaps_m(self) -> FloatArray:
+    def gaps(self) -> FloatArray:
         return self._predictions[0]
 
     @property
@@ -138,16 +137,16 @@ class _Candidates:
 
     def add(self, points: FloatArray) -> Asking[None]:
         """Add candidates, (k, d), with the predictions of all members."""
-        gaps_m = yield Query(self.level, points)
-        p_twin = self.skill.chance(gaps_m)
+        gaps = yield Query(self.level, points)
+        p_twin = self.skill.chance(gaps)
         p_surrogate = (
             p_twin if self.surrogate is None else self._corrected(self.surrogate.of, points)
         )
-        p_fail = self.skill.mixed(gaps_m, p_twin, p_surrogate)
+        p_fail = self.skill.mixed(gaps, p_twin, p_surrogate)
         above = p_fail
         if self.surrogate is not None and self.surrogate.tolerates:
-            above = self.skill.mixed(gaps_m, p_twin, self.surrogate_above(self.surrogate, points))
-        fresh = gaps_m, p_twin, p_surrogate, p_fail, above
+            above = self.skill.mixed(gaps, p_twin, self.surrogate_above(self.surrogate, points))
+        fresh = gaps, p_twin, p_surrogate, p_fail, above
         self._predictions = (
             tuple(
                 np.concatenate(pair, axis=-1) for pair in zip(self._predictions, fresh, strict=True)
@@ -179,9 +178,9 @@ class _Candidates:
 
     def proposal(self, picks: list[int], gain: FloatArray) -> Proposal:
         """Return the batch of some candidates, by index, with their gains."""
-        gaps_m, p_twin, p_surrogate, p_fail, _ = self._predictions
+        gaps, p_twin, p_surrogate, p_fail, _ = self._predictions
         predictions = tuple(
-            Prediction.of(gaps_m[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
+            self.skill.prediction(gaps[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
         )
         return Proposal(self.points[picks], gain, p_fail[picks], predictions)
 
@@ -207,7 +206,7 @@ def _first_candidates(
         screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))
     points = np.concatenate(screened)
     expert = skill.expert(rng)
-    gaps_m = yield Query(candidates.level, points, screening=expert)
-    chance = skill.chance(gaps_m, expert)
+    gaps = yield Query(candidates.level, points, screening=expert)
+    chance = skill.chance(gaps, expert)
     chosen.append(candidates.best(points, chance, SCREENED))
     return np.concatenate(chosen)

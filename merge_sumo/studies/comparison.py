@@ -142,7 +142,7 @@ class ComparedCase:
         sides = (("before", self.a, self.runs_a), ("after", self.b, self.runs_b))
         for name, outcome, runs in sides:
             found = outcome.measures
-            record[f"index_{name}"], record[f"score_{name}"] = outcome.index, outcome.score
+            record[f"index_{name}"], record[f"margin_{name}"] = outcome.index, outcome.margin
             record[f"end_{name}"], record[f"severity_{name}"] = found.end, found.severity
             if runs is not None:
                 record |= {f"runs_{name}": runs.runs, f"failed_runs_{name}": runs.failures}
@@ -166,7 +166,7 @@ def paired(
         (a, runs_a), (b, runs_b) = first[key], second[key]
         cases.append(ComparedCase(a, b, runs_a, runs_b))
     order = list(Change)
-    return sorted(cases, key=lambda c: (order.index(c.change), c.b.score or 0.0, c.b.index))
+    return sorted(cases, key=lambda c: (order.index(c.change), c.b.margin or 0.0, c.b.index))
 
 
 def _by_case(
@@ -582,7 +582,7 @@ class _Tested:
                     change=Change.NEITHER if failed else change,
                     version=number,
                     failures=len(own),
-                    worst=min(own, key=lambda o: (o.score, o.index)).index,
+                    worst=min(own, key=lambda o: (o.margin, o.index)).index,
                     where=_box_in_words([o.case for o in own]),
                     fmc=volume,
                     cases=len(inside),

@@ -339,7 +339,7 @@ def run_fresh(
 def _judged(results: CaseResults) -> list[tuple[bool, bool, bool]]:
     """Return of each case whether it failed, had a verdict, and ran in SUMO."""
     return [
-        (verdict.failed, verdict.score is not None, place in results.in_sumo)
+        (verdict.failed, verdict.margin is not None, place in results.in_sumo)
         for place, verdict in enumerate(results.verdicts())
     ]
 

@@ -555,7 +555,7 @@ class Search:
         """Return the cases of a trial: what does not pass, near misses, and a share of the rest."""
         failing = [i for i, before in enumerate(self._before) if not passes(before)]
         passing = [i for i, before in enumerate(self._before) if passes(before)]
-        passing.sort(key=lambda i: (self._before[i].score or 0.0, i))
+        passing.sort(key=lambda i: (self._before[i].margin or 0.0, i))
         near, rest = passing[: len(failing)], passing[len(failing) :]
         rng = np.random.default_rng([self._settings.seed, self._round])
         drawn = rng.choice(len(rest), math.ceil(SHARE * len(rest)), replace=False)

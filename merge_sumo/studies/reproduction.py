@@ -22,7 +22,7 @@ from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import versions
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.gpr import predicted_score
+from merge_sumo.samplers.gpr import predicted_margin
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.sampler_study import OnPart, SamplerStudy, Search, Study
 from merge_sumo.studies.truth import TRUTH_CASES
@@ -31,7 +31,7 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import LEVELS, US23
-from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.score import Outcome
 
 SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
 ADAPTIVE: Final = ("gpr", "coverage")
@@ -115,15 +115,15 @@ class Panel:
 
 
 @dataclass(frozen=True, slots=True)
-class PredictedScores:
+class PredictedMargins:
     """What a surrogate predicts after a number of batches.
 
     Attributes:
-        score: P on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
+        margin: on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
         learned: the cases that it has learned from.
     """
 
-    score: FloatArray
+    margin: FloatArray
     learned: Panel
 
 
@@ -133,11 +133,11 @@ class LevelBatches:
 
     Attributes:
         cases: cases at the level in each batch.
-        score: mean score P of them; NaN where there was none.
+        margin: mean margin of them; NaN where there was none.
     """
 
     cases: Mapping[int, FloatArray]
-    score: Mapping[int, FloatArray]
+    margin: Mapping[int, FloatArray]
 
 
 @dataclass(frozen=True)
@@ -157,11 +157,11 @@ class ColumnResult:
         """Cases of the truth, and of each sampler with the seed whose coverage is its median."""
         level = self.column.level
         truth, searches = self.study.truths[level], reversed(self.study.searches.items())
-        shown = Panel(truth.points, truth.score < FAILURE_SCORE, fmc(truth.failures))
+        shown = Panel(truth.points, truth.margin < 0.0, fmc(truth.failures))
         found = {name: of_name[_median_seed(of_name)].outcomes for name, of_name in searches}
         return {"truth": shown, **{name: _panel(one, level) for name, one in found.items()}}
 
-    def predicted(self) -> dict[int, PredictedScores]:
+    def predicted(self) -> dict[int, PredictedMargins]:
         """Return what the surrogate of `gpr` predicts after some batches of its median search."""
         searches, level = self.study.searches["gpr"], self.column.level
         seed = _median_seed(searches)
@@ -172,9 +172,9 @@ class ColumnResult:
             known = [outcome for outcome in searches[seed].outcomes if outcome.batch < batch]
             sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
             sampler.tell(known)
-            score = predicted_score(sampler.history(level), grid)
-            square = score.reshape(SURFACE_POINTS, SURFACE_POINTS)
-            result[batch] = PredictedScores(square, _panel(known, level))
+            margin = predicted_margin(sampler.history(level), grid)
+            square = margin.reshape(SURFACE_POINTS, SURFACE_POINTS)
+            result[batch] = PredictedMargins(square, _panel(known, level))
         return result
 
 
@@ -334,10 +334,10 @@ def _level_batches(searches: Sequence[Search]) -> LevelBatches:
         for outcome in one.outcomes:
             place = LEVELS.index(outcome.case.level), seed, outcome.batch
             cases[place] += 1
-            if outcome.measures.score is not None:
+            if outcome.margin is not None:
                 judged[place] += 1
-                total[place] += outcome.measures.score
-    score = np.divide(total, judged, out=np.full(shape, np.nan), where=judged > 0)
+                total[place] += outcome.margin
+    margin = np.divide(total, judged, out=np.full(shape, np.nan), where=judged > 0)
     return LevelBatches(
-        dict(zip(LEVELS, cases, strict=True)), dict(zip(LEVELS, score, strict=True))
+        dict(zip(LEVELS, cases, strict=True)), dict(zip(LEVELS, margin, strict=True))
     )

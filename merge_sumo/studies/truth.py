@@ -28,13 +28,12 @@ from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.chance import MOST_RUNS, check_tolerated, is_decided
 from merge_sumo.values.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
 from merge_sumo.values.scenario import OWN, Scenario
-from merge_sumo.values.score import FAILURE_SCORE
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 DENSE_CASES: Final = 1_000_000
 """Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
-COLUMNS: Final = ("points", "score", "in_sumo")
+COLUMNS: Final = ("points", "margin", "in_sumo")
 """Arrays of a truth in the cache,"""
 COUNTS: Final = ("runs", "failed_runs")
 """and those of one whose cases ran several times."""
@@ -59,15 +58,15 @@ class Truth:
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        score: that of the criterion, P for the paper's, (n,), NaN without a verdict; of cases that
-            ran several times that of the deciding run (`RunsOfCase.deciding`).
+        margin: below 0 for a failure, (n,), NaN without a verdict; of cases that ran several times
+            that of the deciding run (`RunsOfCase.deciding`).
         in_sumo: number of runs in SUMO; by default all.
         runs: runs with a verdict of each case, (n,), where chance was looked for.
         failed_runs: those of them that failed, (n,).
     """
 
     points: FloatArray
-    score: FloatArray
+    margin: FloatArray
     in_sumo: int = -1
     runs: IntArray | None = None
     failed_runs: IntArray | None = None
@@ -80,12 +79,12 @@ class Truth:
     @property
     def all_runs(self) -> int:
         """Number of runs of all cases."""
-        return len(self.score) if self.runs is None else int(self.runs.sum())
+        return len(self.margin) if self.runs is None else int(self.runs.sum())
 
     @property
     def failures(self) -> FloatArray:
         """Points of the failing cases, (m, d)."""
-        return self.points[self.score < FAILURE_SCORE]
+        return self.points[self.margin < 0.0]
 
     def __repr__(self) -> str:
         """Return in a line what was found."""
@@ -258,19 +257,19 @@ def _run(
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
     pool, count = Pool(levels=(level,), scenario=plan.scenario), len(points)
-    scores = np.full(count, np.nan)
+    margins = np.full(count, np.nan)
     plan = plan.at_level(level)
     files = (plan.vut.files or {}) | plan.povs.files
-    scored = evaluate(plan, CasesAt(pool, level, points, draw), workers, _scores)
+    scored = evaluate(plan, CasesAt(pool, level, points, draw), workers, _margins)
     in_sumo = 0
-    for place, (score, by_sumo, loaded) in scored:
-        scores[place] = score
+    for place, (margin, by_sumo, loaded) in scored:
+        margins[place] = margin
         in_sumo += by_sumo
         for name, sha256 in loaded.items():
             files.setdefault(name, sha256)
         if told is not None:
             told.ended()
-    return Truth(points, scores, in_sumo), files
+    return Truth(points, margins, in_sumo), files
 
 
 def _run_repeatedly(
@@ -282,15 +281,15 @@ def _run_repeatedly(
     told: _Told,
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), draw by draw, each until it is decided whether it fails."""
-    scores = np.full((repeats.most, len(points)), np.nan)
+    margins = np.full((repeats.most, len(points)), np.nan)
     runs, failed = np.zeros((2, len(points)), dtype=np.int64)
     open_, in_sumo, files = np.arange(len(points)), 0, Files()
     for draw in range(repeats.most):
         ran, loaded = _run(plan, level, points[open_], workers, None, draw)
         files, in_sumo = {**loaded, **files}, in_sumo + ran.in_sumo
-        scores[draw, open_] = ran.score
-        runs[open_] += ~np.isnan(ran.score)
-        failed[open_] += ran.score < FAILURE_SCORE
+        margins[draw, open_] = ran.margin
+        runs[open_] += ~np.isnan(ran.margin)
+        failed[open_] += ran.margin < 0.0
         pairs = zip(failed[open_].tolist(), runs[open_].tolist(), strict=True)
         decided = [n > 0 and is_decided(k, n, repeats.tolerated) for k, n in pairs]
         told.ended(sum(decided))
@@ -299,8 +298,8 @@ def _run_repeatedly(
             break
     # NaN, of what did not run or has no verdict, comes last.
     spared = _spared(runs, repeats.tolerated)
-    score = np.sort(scores, axis=0)[spared, np.arange(len(points))]
-    return Truth(points, score, in_sumo, runs, failed), files
+    margin = np.sort(margins, axis=0)[spared, np.arange(len(points))]
+    return Truth(points, margin, in_sumo, runs, failed), files
 
 
 def _spared(runs: IntArray, tolerated: float) -> IntArray:
@@ -369,22 +368,22 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         if regular(path).stat().st_size > numbers_bytes + MOST_FILES_BYTES:
             return None
         data = read_arrays(path)
-        points, score, in_sumo = (data[name] for name in COLUMNS)
+        points, margin, in_sumo = (data[name] for name in COLUMNS)
         counts = [data[name] for name in COUNTS if name in data]
         files = decode(str(data["files"]), dict[str, str | None])
         if str(data["of"]) != path.stem or changed(files):
             return None
     except (*UNREADABLE_NPZ, UserError):
         return None
-    if points.shape != (cases, dims) or {len(score), *map(len, counts)} != {cases}:
+    if points.shape != (cases, dims) or {len(margin), *map(len, counts)} != {cases}:
         return None
-    return Truth(points, score, int(in_sumo), *counts)
+    return Truth(points, margin, int(in_sumo), *counts)
 
 
-def _scores(results: CaseResults) -> list[tuple[float, bool, Files]]:
-    """Return of each case the score, NaN without a verdict, whether SUMO ran it, and the files."""
+def _margins(results: CaseResults) -> list[tuple[float, bool, Files]]:
+    """Return of each case the margin, NaN without a verdict, whether SUMO ran it, and the files."""
     files = results.files | results.pov_files
     return [
-        (np.nan if verdict.score is None else verdict.score, place in results.in_sumo, files)
+        (np.nan if verdict.margin is None else verdict.margin, place in results.in_sumo, files)
         for place, verdict in enumerate(results.verdicts())
     ]

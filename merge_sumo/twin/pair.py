@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.regression import regression_gaps_m
+from merge_sumo.values.regression import regression_gaps
 from merge_sumo.values.score import Outcome
 
 
@@ -20,9 +18,9 @@ class TwinPair:
     learned from the same cases.
     """
 
-    def __init__(self, new: Twin, old: Twin, limit_m: float) -> None:
-        """Take a twin of each version; a predicted gap below `limit_m` is a failure."""
-        self._new, self._old, self._limit_m = new, old, limit_m
+    def __init__(self, new: Twin, old: Twin) -> None:
+        """Take a twin of each version."""
+        self._new, self._old = new, old
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes of the new version and their motions, (T + 1, A, 3), by index."""
@@ -39,8 +37,6 @@ class TwinPair:
     def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
         """Return what stands for the gap of a regression in each query; see `Predictor`."""
         return [
-            np.asarray(regression_gaps_m(new_m, old_m, self._limit_m))
-            for new_m, old_m in zip(
-                self._new.predict(queries), self._old.predict(queries), strict=True
-            )
+            regression_gaps(new, old)
+            for new, old in zip(self._new.predict(queries), self._old.predict(queries), strict=True)
         ]

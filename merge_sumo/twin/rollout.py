@@ -88,19 +88,18 @@ class TwinRollout:
         return x_m, v_mps, values.get("svo_rad", np.zeros(n))
 
     def play(self, starts: Sequence[Starts], answer: Answer) -> list[FloatArray]:
-        """Return the gaps at M to the cars that are nearest there, (n,) for each of the starts.
+        """Return the signed gaps of the starts, (n,) for each of them: see `Outcome.signed_gap`.
 
-        All step together, as arrays. NaN where the VUT never arrives. Under another criterion than
-        the paper's it is what stands for the gap: see `Outcome.signed_gap_m`.
+        All step together, as arrays. NaN where the VUT never arrives.
         """
         if self._criterion.is_papers:
-            gap_m = self._play(starts, answer)
+            gap = self._play(starts, answer) / self._scenario.dx_crash_m
         else:
-            gap_m = self._judged(starts, answer)
-        return np.split(gap_m, np.cumsum([len(some.points) for some in starts])[:-1])
+            gap = self._judged(starts, answer)
+        return np.split(gap, np.cumsum([len(some.points) for some in starts])[:-1])
 
     def _judged(self, starts: Sequence[Starts], answer: Answer) -> FloatArray:
-        """Return what stands for the gaps at M, (R,)."""
+        """Return what stands for the gaps, (R,)."""
         played: list[FloatArray] = []
         gap_m = self._play(starts, answer, played)
         motion = np.array(played)
@@ -113,7 +112,7 @@ class TwinRollout:
             of_row[-1, :, 2] = 0.0
             end = End.TIMEOUT if np.isnan(gap_m[row]) else End.MERGED
             judged = self._criterion.judged(Trajectory(case, of_row, end), self._lines)
-            found[row] = judged.signed_gap_m
+            found[row] = judged.signed_gap
         return found
 
     def _play(

@@ -8,6 +8,7 @@ does.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -74,7 +75,7 @@ class RunsOfCase:
         it fails exactly where the case does.
         """
         spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
-        ordered = sorted(self.outcomes, key=lambda outcome: (outcome.score or 0.0, outcome.index))
+        ordered = sorted(self.outcomes, key=lambda outcome: (_margin(outcome), outcome.index))
         return ordered[spared]
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -85,6 +86,10 @@ class RunsOfCase:
         return clopper_pearson(self.failures, self.runs, confidence)
 
 
+def _margin(outcome: Outcome) -> float:
+    return math.inf if outcome.margin is None else outcome.margin
+
+
 def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
     """Return outcomes with a verdict by their case, in the order of the first run of each.
 
@@ -93,7 +98,7 @@ def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
     cases: list[tuple[Case, list[Outcome]]] = []
     place: dict[Case, int] = {}
     for outcome in outcomes:
-        if outcome.score is None:
+        if outcome.margin is None:
             continue
         start = outcome.case.start
         if outcome.case.draw == 0 or start not in place:
@@ -117,7 +122,7 @@ def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Ou
     if not any(outcome.case.draw for outcome in known):
         return known
     shown = [(one.outcomes[0].index, one.deciding(tolerated)) for one in by_case(known)]
-    errors = [(outcome.index, outcome) for outcome in known if outcome.score is None]
+    errors = [(outcome.index, outcome) for outcome in known if outcome.margin is None]
     return [outcome for _, outcome in sorted(shown + errors, key=itemgetter(0))]
 
 

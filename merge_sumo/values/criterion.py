@@ -1,9 +1,8 @@
 """What counts as a failure: a criterion that is named, or a condition on the measures of a case.
 
 A criterion gives every case a margin: below 0 it fails, above 0 it does not, and how far from 0
-is said in units of the thresholds (`expression.py`). Samplers, truths and reports know scores:
-a margin m is the score lambda (1 - m / (1 + |m|)), which is below lambda exactly where m is below
-0. The criterion of the paper has its own score, P, and needs no margin.
+is said in units of the thresholds (`expression.py`), or, under the criterion of the paper, in
+units of lambda.
 """
 
 from __future__ import annotations
@@ -22,7 +21,15 @@ from merge_sumo.values.criteria import CRITERIA, PAPER
 from merge_sumo.values.expression import Condition, Value, Vocabulary, names_of, parse_condition
 from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
-from merge_sumo.values.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, Verdict, measure
+from merge_sumo.values.score import (
+    FOLLOWED_UP,
+    ON_LANE,
+    Measures,
+    Outcome,
+    Verdict,
+    margin_of,
+    measure,
+)
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.temporal import check_formula, robustness, try_formula
 from merge_sumo.values.trajectory import End, Trajectory
@@ -96,8 +103,13 @@ class Criterion:
 
     @property
     def is_papers(self) -> bool:
-        """Whether it is that of the paper, which needs no margin."""
+        """Whether it is that of the paper, whose margin is that of the score."""
         return self.fail_when == PAPER and self.require is None
+
+    @property
+    def speaks_of_score(self) -> bool:
+        """Whether it is a condition on the score, whose margin may be that of the score."""
+        return self.require is None and "score" in _names(self.words)
 
     @property
     def text(self) -> str:
@@ -110,9 +122,11 @@ class Criterion:
         return CRITERIA[self.text].condition if self.text in CRITERIA else self.text
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
-        """Return the margin of an episode; None under the paper's criterion and after an error."""
-        if self.is_papers or measures.end.is_error:
+        """Return the margin of an episode; None after an error."""
+        if measures.end.is_error:
             return None
+        if self.is_papers:
+            return margin_of(measures.score)
         if self.require is not None:
             return robustness(self.require, trajectory)
         return condition_of(self.words).margin(values_of(measures, _names(self.words)))
@@ -140,7 +154,7 @@ class Criterion:
         """Return the verdict on an episode, the same as that of its outcome."""
         score = trajectory.case.scenario.score
         if self.is_papers and score is not None:
-            found = Verdict(score(trajectory), trajectory.end.is_tested)
+            found = Verdict(margin_of(score(trajectory)), trajectory.end.is_tested)
             return found._replace(is_tested=found.is_tested or found.failed)
         return self.judged(trajectory, lines).verdict
 

@@ -69,7 +69,6 @@ OURS: Final = (
         "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR), and where a kind of "
         "scenario has none",
         label="score P",
-        column="score",
         digits=0,
         missing=0.0,
         worse="low",

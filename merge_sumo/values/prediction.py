@@ -12,6 +12,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.records import Record
 from merge_sumo.values.case import FloatArray
 
+NO_GAP: Final = 100.0 / 3.0
+"""Gap of a VUT that never arrives, in units of the limit: another car goes first, far away."""
 DIGITS: Final = 4
 """Decimals that are kept: what is decided by must be what is on disk."""
 

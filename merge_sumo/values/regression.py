@@ -13,21 +13,20 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import DX_CRASH_M
+from merge_sumo.values.prediction import NO_GAP, Prediction
 from merge_sumo.values.score import Outcome
 
-FARTHEST: Final = 200.0 / DX_CRASH_M - 1.0
-"""Margin of a VUT that never arrives, and the largest one: that of a gap of 200 m."""
+FARTHEST: Final = NO_GAP - 1.0
+"""Margin of a VUT that never arrives, and the largest one."""
 
 
 def regression(new: Outcome, old: Outcome, prediction: Prediction | None = None) -> Outcome:
     """Return the outcome of a case whose failure is a regression, with its prediction.
 
-    It has the measures of the new version, and a margin under every criterion. Without a verdict on
-    both versions it has none.
+    It has the measures of the new version, and its margin is not that of the score. Without a
+    verdict on both versions it has none.
     """
-    silent = next((outcome for outcome in (new, old) if outcome.score is None), None)
+    silent = next((outcome for outcome in (new, old) if outcome.margin is None), None)
     if silent is not None:
         return replace(new, measures=silent.measures, margin=None, prediction=prediction)
     margin = max(_margin(new), -_margin(old))
@@ -35,30 +34,29 @@ def regression(new: Outcome, old: Outcome, prediction: Prediction | None = None)
 
 
 def _margin(outcome: Outcome) -> float:
-    """Return the margin of an outcome with a verdict; the paper's criterion gives it by the gap."""
-    if outcome.margin is not None:
+    """Return the margin of an outcome with a verdict; that of the score says less than the gap."""
+    if outcome.margin is not None and not outcome.is_by_score:
         return outcome.margin
-    gap_m = np.array([outcome.signed_gap_m], dtype=np.float64)
-    return float(margins(gap_m, outcome.gap_limit_m)[0])
+    return float(margins(np.array([outcome.signed_gap], dtype=np.float64))[0])
 
 
-def margins(gap_m: FloatArray, limit_m: float) -> FloatArray:
-    """Return the margins, (...), that signed gaps at M stand for; a case fails below the limit.
+def margins(gap: FloatArray) -> FloatArray:
+    """Return the margins, (...), that signed gaps at M stand for, in units of the limit.
 
-    The inverse of `Outcome.signed_gap_m`; NaN is the gap of a VUT that never arrives.
+    The inverse of `Outcome.signed_gap`; NaN is the gap of a VUT that never arrives.
     """
-    share = np.abs(gap_m) / limit_m
+    share = np.abs(gap)
     with np.errstate(divide="ignore"):
         margin = np.where(share >= 1.0, share - 1.0, 1.0 - 1.0 / share)
     return np.nan_to_num(margin, nan=FARTHEST, posinf=FARTHEST, neginf=-FARTHEST)
 
 
-def regression_gaps_m(new_m: FloatArray, old_m: FloatArray, limit_m: float) -> FloatArray:
+def regression_gaps(new: FloatArray, old: FloatArray) -> FloatArray:
     """Return what stands for the gap of a regression, (...), by the signed gaps of both versions.
 
-    It is `Outcome.signed_gap_m` of `regression`: within 6 m for a regression, with the sign of the
-    new version's gap.
+    It is `Outcome.signed_gap` of `regression`: within 1 for a regression, with the sign of the new
+    version's gap.
     """
-    margin = np.minimum(np.maximum(margins(new_m, limit_m), -margins(old_m, limit_m)), FARTHEST)
+    margin = np.minimum(np.maximum(margins(new), -margins(old)), FARTHEST)
     size = np.where(margin >= 0.0, 1.0 + margin, 1.0 / (1.0 - np.minimum(margin, 0.0)))
-    return np.asarray(DX_CRASH_M * np.where(new_m < 0.0, -size, size), dtype=np.float64)
+    return np.asarray(np.where(new < 0.0, -size, size), dtype=np.float64)

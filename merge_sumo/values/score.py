@@ -41,7 +41,6 @@ from merge_sumo.values.merge import (
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import (
     DT_S,
-    DX_CRASH_M,
     POV,
     VEHICLES,
     VUT,
@@ -54,7 +53,7 @@ from merge_sumo.values.severity import Severity, severity_of
 from merge_sumo.values.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
-"""lambda: a case fails when its score is below."""
+"""lambda: a case fails by the paper's criterion when its score is below."""
 
 # The bounds that make "P < -500" and the paper's crash the same: without one P_safety and
 # P_task are at least -1, so P >= -495; with one P_safety is at most -1, so P <= -560.
@@ -163,17 +162,17 @@ class Verdict(NamedTuple):
     """The verdict on an episode, without its measures.
 
     Attributes:
-        score: the score under the criterion; None after an error.
+        margin: how far it is from failing, below 0 where it fails; None after an error.
         is_tested: whether the episode says something of the VUT: see `Outcome.is_tested`.
     """
 
-    score: float | None
+    margin: float | None
     is_tested: bool
 
     @property
     def failed(self) -> bool:
-        """Whether the score is below lambda."""
-        return self.score is not None and self.score < FAILURE_SCORE
+        """Whether the margin is below 0."""
+        return self.margin is not None and self.margin < 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,8 +185,8 @@ class Outcome:
         case: the case.
         measures: what was measured.
         prediction: what was predicted of it; None without a prediction.
-        margin: how far it is from failing under the campaign's criterion, below 0 where it fails;
-            None under the paper's, which has the score P, and after an error.
+        margin: how far it is from failing under the campaign's criterion, below 0 where it fails,
+            without a unit; by default that of the score P; None after an error.
     """
 
     index: int
@@ -197,15 +196,20 @@ class Outcome:
     prediction: Prediction | None = None
     margin: float | None = None
 
-    @property
-    def score(self) -> float | None:
-        """The score under the campaign's criterion: it fails below lambda; None after an error."""
-        return self.measures.score if self.margin is None else score_of(self.margin)
+    def __post_init__(self) -> None:
+        """Take the margin of the score where no other is given."""
+        if self.margin is None:
+            object.__setattr__(self, "margin", margin_of(self.measures.score))
 
     @property
     def failed(self) -> bool:
-        """Whether this case is a failure of the VUT: its score is below lambda."""
-        return self.score is not None and self.score < FAILURE_SCORE
+        """Whether this case is a failure of the VUT: its margin is below 0."""
+        return self.margin is not None and self.margin < 0.0
+
+    @property
+    def is_by_score(self) -> bool:
+        """Whether the margin is that of the score."""
+        return self.margin == margin_of(self.measures.score)
 
     @property
     def is_tested(self) -> bool:
@@ -215,25 +219,28 @@ class Outcome:
     @property
     def verdict(self) -> Verdict:
         """The verdict alone."""
-        return Verdict(self.score, self.is_tested)
+        return Verdict(self.margin, self.is_tested)
 
     @property
-    def signed_gap_m(self) -> float | None:
-        """The gap dx at M that a sampler learns; a case fails within `gap_limit_m`.
+    def signed_gap(self) -> float | None:
+        """The gap at M in units of the scenario's limit: within 1 the case fails.
 
-        Under another criterion than the paper's it is what stands for it: 6 m times 1 + m at a
-        margin m of 0 or more, and 6 m / (1 - m) below; negative where the VUT goes first.
+        Under another criterion than the paper's it is what stands for it: 1 + m at a margin m of 0
+        or more, and 1 / (1 - m) below. Negative where the VUT goes first; None after an error, and
+        where the paper's criterion has no gap.
         """
-        dx, margin = self.measures.dx_m, self.margin
-        if margin is None:
-            return dx
-        gap = DX_CRASH_M * (1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin))
-        return -gap if dx is not None and dx < 0.0 else gap
+        dx_m, margin = self.measures.dx_m, self.margin
+        if margin is None or self.is_by_score:
+            return None if dx_m is None else dx_m / self.case.scenario.dx_crash_m
+        gap = 1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin)
+        return -gap if dx_m is not None and dx_m < 0.0 else gap
 
     @property
-    def gap_limit_m(self) -> float:
-        """The limit of `signed_gap_m` within which this case would fail."""
-        return gap_limit_m(self.case.scenario, stands_in=self.margin is not None)
+    def predicted_gaps(self) -> FloatArray | None:
+        """The gaps that were predicted, (E, G), in the unit of `signed_gap`; None without any."""
+        if self.prediction is None:
+            return None
+        return self.prediction.gaps_m / self.case.scenario.dx_crash_m
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""
@@ -244,7 +251,7 @@ class Outcome:
             record["draw"] = self.case.draw
         record |= {name: getattr(self.measures, name) for name in measure_names}
         record |= {name: self.measures.value(name) for name in further_measures()}
-        if self.margin is not None:
+        if not self.is_by_score:
             record["margin"] = self.margin
         if self.prediction is not None:
             record["foretold"] = to_plain(self.prediction)
@@ -309,18 +316,9 @@ def _record_fields(
     return case_names, measure_names, record_type("outcome", [*required, *optional])
 
 
-def gap_limit_m(scenario: Scenario, *, stands_in: bool) -> float:
-    """Return the limit of gaps within which a case fails, in m.
-
-    It is that of the scenario, or of what stands for a gap under another criterion than the
-    paper's: see `Outcome.signed_gap_m`.
-    """
-    return DX_CRASH_M if stands_in else scenario.dx_crash_m
-
-
-def score_of(margin: float) -> float:
-    """Return the score that a margin stands for, in the same order; lambda at a margin of 0."""
-    return FAILURE_SCORE * (1.0 - margin / (1.0 + abs(margin)))
+def margin_of(score: float | None) -> float | None:
+    """Return the margin of a score P: how far it is above lambda, in units of that."""
+    return None if score is None else 1.0 - score / FAILURE_SCORE
 
 
 def is_close(trajectory: Trajectory) -> bool:

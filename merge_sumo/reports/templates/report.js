@@ -72,7 +72,7 @@ function words(i) {
   }
   if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push(`Bodies overlap before ${PLACE}, where the lanes run together.`);
   if (LANE && cases.stood_s[i] > 0) parts.push(`The VUT stood on the lane for ${fixed(cases.stood_s[i], 1)} s.`);
-  if (cases.margin && cases.margin[i] !== null) {
+  if (cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
   }
   if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
@@ -540,11 +540,11 @@ function allCases() { // gives what shows the cases that the filters let through
       { name: "runs", exact: true, value: (i) => runsOf(i)?.number ?? 1, text: String },
       { name: "share of runs that fail", exact: true, value: (i) => { const runs = runsOf(i); return runs ? runs.failed / runs.number : tested(i) ? Number(failed(i)) : null; }, text: (value) => fixed(value, 2) },
     ] : []),
-    ...(cases.margin ? [number("margin", "margin", 2)] : []),
+    number("margin", "margin", 2),
     ...data.measures.map((measure) => number(measure.name, measure.title, measure.digits)),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
-  let by = columns.find(({ name }) => name === "score"), way = 1, found = all, rows = 0;
+  let by = columns.find(({ name }) => name === "margin"), way = 1, found = all, rows = 0;
 
   const option = (select, value, text = value) => select.add(new Option(text, value));
   const count = (value) => {
