@@ -49,7 +49,7 @@ def main() -> None:
         study = RunStudy(run_campaign(CAMPAIGN, plan, Path(folder) / "run"), CAMPAIGN, plan)
         cells = expected_cells(study, read_distribution(None, (0,), US23))
     truth = truth_of("design1", 0, cases=given.truth_cases).truths[0]
-    failing = truth.score < -500.0
+    failing = truth.margin < 0.0
     shape = cells_of(US23, 0)
     number = np.ravel_multi_index(tuple((truth.points * shape).astype(np.int64).T), shape)
     banks = [failing[np.isin(number, one.numbers)] for one in cells]

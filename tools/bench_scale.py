@@ -55,7 +55,7 @@ from merge_sumo.engine.evaluate import CaseResult, CaseResults, CasesAt, evaluat
 from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.studies.truth import _scores, ground_truth
+from merge_sumo.studies.truth import _margins, ground_truth
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
 from merge_sumo.values.fmc import fmc, regions
@@ -91,9 +91,9 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def scores_and_memory(results: CaseResults) -> list[tuple[Any, ...]]:
+def margins_and_memory(results: CaseResults) -> list[tuple[Any, ...]]:
     """Return what `truth` keeps of cases, which process ran them, and how large it is."""
-    return [(score, os.getpid(), memory_mb()) for score, _, _ in _scores(results)]
+    return [(margin, os.getpid(), memory_mb()) for margin, _, _ in _margins(results)]
 
 
 def compute(seconds: Sequence[float]) -> list[int]:
@@ -125,13 +125,13 @@ def truth(most: int) -> Iterator[dict[str, float]]:
     with local(1) as workers:
         pool = Pool(levels=(0,), scenario=US23)
         warm = CasesAt(pool, 0, rng.random((32, 2)))
-        list(evaluate(plan, warm, workers, scores_and_memory))
+        list(evaluate(plan, warm, workers, margins_and_memory))
         cases = 100
         while cases <= most:
             points: Any = rng.random((cases, 2))
             start, memory = time.perf_counter(), 0.0
             for _, (_, _, now) in evaluate(
-                plan, CasesAt(pool, 0, points), workers, scores_and_memory
+                plan, CasesAt(pool, 0, points), workers, margins_and_memory
             ):
                 memory = max(memory, now)
             spent = time.perf_counter() - start
@@ -155,7 +155,7 @@ def two_workers() -> dict[str, list[float]]:
             start = time.perf_counter()
             for first in range(0, PAIR_CASES, 500):  # chunks of 250 on two workers
                 some = CasesAt(Pool(levels=(0,), scenario=US23), 0, points[first : first + 500])
-                list(evaluate(plan, some, workers, scores_and_memory))
+                list(evaluate(plan, some, workers, margins_and_memory))
             return time.perf_counter() - start
 
         def rate(workers: Workers, count: int) -> float:

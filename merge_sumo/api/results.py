@@ -401,9 +401,7 @@ class TruthResult(Result):
                 lines.append(
                     f"  {truth.all_runs} runs; a case fails where {said or 'any of its runs does'}"
                 )
-        if not self.criterion.is_papers:
-            lines.append(f"  a case fails when {self.criterion.words}")
-        return lines
+        return [*lines, f"  a case fails when {self.criterion.words}"]
 
 
 def _regions_of(truth: Truth) -> str:

@@ -23,12 +23,14 @@ from merge_sumo.system.printable import printable
 from merge_sumo.values.chance import MOST_RUNS, by_case, is_decided
 from merge_sumo.values.fmc import radius_for
 from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import FAILURE_SCORE, Outcome
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 
 PERCENT: Final = "%"
 TABLE: Final = ("cases", "without a verdict", "failures", "regions", "FMC")
 """Facts of levels that stand in the table of a terminal."""
+FAILING: Final = "margin < 0"
+"""By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,11 +109,6 @@ def table_lines(facts: Sequence[Fact]) -> list[str]:
     ]
 
 
-def _failing(run: Run) -> str:
-    """Return by what a failing line of `outcomes.jsonl` is known."""
-    return f"score < {FAILURE_SCORE:g}" if run.criterion.is_papers else "margin < 0"
-
-
 def _tested(run: Run) -> Iterator[Fact]:
     settings, criterion = run.settings, run.criterion
     yield Fact("VUT", run.vut, "", SETTINGS, "vut")
@@ -127,8 +124,6 @@ def _tested(run: Run) -> Iterator[Fact]:
 
 
 def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
-    failing = _failing(run)
-
     def counted(name: str, number: int, key: str) -> Fact:
         return Fact(name, number, "", OUTCOMES, key)
 
@@ -137,9 +132,9 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
         yield counted("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
     if verdict.timeouts:
         yield counted("timeouts", verdict.timeouts, "end: TIMEOUT")
-    yield counted("failures", summary.failures, failing)
+    yield counted("failures", summary.failures, FAILING)
     if summary.failures:
-        yield counted("failures with contact", verdict.contacts, f"{failing}, severity: contact")
+        yield counted("failures with contact", verdict.contacts, f"{FAILING}, severity: contact")
     for severity, about in (
         (Severity.CONTACT, "cases with contact that are no failures"),
         (Severity.CONFLICT, "cases with a conflict that are no failures"),
@@ -147,7 +142,7 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
     ):
         number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
         if number:
-            yield counted(about, number, f"severity: {severity}, not {failing}")
+            yield counted(about, number, f"severity: {severity}, not {FAILING}")
     before = sum(map(_overlaps_before, run.cases))
     if before:
         key = "before_clearance_m < 0, severity not contact"
@@ -161,8 +156,6 @@ def _overlaps_before(outcome: Outcome) -> bool:
 
 
 def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> Iterator[Fact]:
-    failing = _failing(run)
-
     def fact(name: str, value: float, key: str, unit: str = "") -> Fact:
         return Fact(name, value, unit, OUTCOMES, key, level)
 
@@ -170,10 +163,10 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
     if untested:
         yield fact("without a verdict", found.cases - found.tested, "end")
     if found.tested or not found.cases:
-        yield fact("failures", found.failures, failing)
-        yield fact("regions", found.regions, f"{failing}: starts")
+        yield fact("failures", found.failures, FAILING)
+        yield fact("regions", found.regions, f"{FAILING}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
+        yield fact("FMC", found.fmc, f"{FAILING}: starts within {radius:.2g}")
     merging = merging_of(o for o in run.cases if o.case.level == level)
     if merging is not None:
         yield fact("merges where the lane ends", merging.forced, "lane_share >= 1")
@@ -216,7 +209,6 @@ def _repeats(run: Run) -> Iterator[Fact]:
 
 def _motion(run: Run) -> Iterator[Fact]:
     worst = failures(run.cases)
-    failing = _failing(run)
     driven_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
     yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
     if not worst:
@@ -225,14 +217,14 @@ def _motion(run: Run) -> Iterator[Fact]:
     known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     if known:
         name = "failures that full braking or full acceleration of the VUT avoids"
-        yield Fact(name, sum(known), "", OUTCOMES, f"{failing}, avoidable")
+        yield Fact(name, sum(known), "", OUTCOMES, f"{FAILING}, avoidable")
     for name, measure, unit in (
         ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
         ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
     ):
         values = [v for o in worst if (v := o.measures.value(measure)) is not None]
         if values:
-            yield Fact(name, max(values), unit, OUTCOMES, f"{failing}: {measure}")
+            yield Fact(name, max(values), unit, OUTCOMES, f"{FAILING}: {measure}")
 
 
 def _avoided(run: Run) -> Iterator[Fact]:

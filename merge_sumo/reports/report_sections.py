@@ -216,13 +216,11 @@ def _cases(model: ReportModel) -> dict[str, Any]:
 
 def _about(model: ReportModel) -> dict[str, Any]:
     """Return what the search knows of itself, and what it ran with."""
-    criterion = model.run.criterion
     return {
         "surprises": model.surprises,
         "printed": end_of(model.run.folder / LOG),
         "recorded": _recorded(model.run),
         "flat_settings": list(_flat(model.run.settings)),
-        "criterion": None if criterion.is_papers else criterion.words,
     }
 
 

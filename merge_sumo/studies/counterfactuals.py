@@ -51,7 +51,7 @@ from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, EpisodeTime, Scenario
-from merge_sumo.values.score import Outcome, is_close
+from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.output import LOG
 from merge_sumo.vuts.registry import VutFactory
@@ -314,10 +314,7 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
     """
     if brake_after_mps2(trajectory) > -trajectory.case.scenario.a_min_mps2:
         return False
-    if criterion.is_papers:  # which needs no measures
-        return trajectory.end is End.MERGED and not is_close(trajectory)
-    outcome = criterion.judged(trajectory, lines)
-    return outcome.measures.end.is_tested and not outcome.failed
+    return trajectory.end.is_tested and not criterion.verdict(trajectory, lines).failed
 
 
 class _Substitutes(Driver):

@@ -440,8 +440,7 @@ class ProbabilityResult(Result):
                 f"  level {level_name(level)}: P(fail) {_interval(one)}"
                 for level, one in found.levels.items()
             ]
-        if not self.criterion.is_papers:
-            lines.append(f"  a case fails when {self.criterion.words}")
+        lines.append(f"  a case fails when {self.criterion.words}")
         if errors := sum(s.without_verdict for e in found.levels.values() for s in e.strata):
             lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
         if found.in_sumo < found.cases:

@@ -63,8 +63,7 @@ def _message(run: CampaignRun, seed: int) -> str | None:
     if run.verdict.tested and not wrong:
         return None
     lines = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
-    if not run.run.criterion.is_papers:
-        lines.append(f"  a case fails when {run.run.criterion.words}")
+    lines.append(f"  a case fails when {run.run.criterion.words}")
     lines += run.verdict.trouble_lines()
     if not run.verdict.tested:
         lines.append(f"  {run.verdict.nothing_tested}")

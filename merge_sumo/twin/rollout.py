@@ -54,6 +54,7 @@ class TwinRollout:
         """Take the pool, the POVs, what counts as a failure, and the road's centre lines."""
         self._pool, self._scenario = pool, pool.scenario
         self._criterion, self._lines = criterion, lines
+        self._by_gap = criterion.is_papers
         self._networks = {
             level: load_network(POLICIES[level], povs.policies)
             for level in set(povs.levels) & set(POLICIES)
@@ -67,7 +68,7 @@ class TwinRollout:
         """
         known = level == 0 or level in self._networks
         at_m = isinstance(self._scenario, MergeScenario) and self._scenario.lane_m is None
-        return known and at_m and (self._criterion.is_papers or not self._scenario.follow_up_s)
+        return known and at_m and (self._by_gap or not self._scenario.follow_up_s)
 
     def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
@@ -92,7 +93,7 @@ class TwinRollout:
 
         All step together, as arrays. NaN where the VUT never arrives.
         """
-        if self._criterion.is_papers:
+        if self._by_gap:
             gap = self._play(starts, answer) / self._scenario.dx_crash_m
         else:
             gap = self._judged(starts, answer)

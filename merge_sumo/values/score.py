@@ -318,7 +318,7 @@ def _record_fields(
 
 def margin_of(score: float | None) -> float | None:
     """Return the margin of a score P: how far it is above lambda, in units of that."""
-    return None if score is None else 1.0 - score / FAILURE_SCORE
+    return None if score is None else (score - FAILURE_SCORE) / abs(FAILURE_SCORE)
 
 
 def is_close(trajectory: Trajectory) -> bool:

@@ -215,7 +215,7 @@ class TestACache:
         counted: list[int] = []
         again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path, on_cases=counted.append)
         assert sum(counted) == CASES
-        assert np.array_equal(again.score, true[0].score)
+        assert np.array_equal(again.margin, true[0].margin)
         assert KEPT.path(tmp_path).read_bytes() == true[1]
 
     @pytest.mark.parametrize("kind", ["pipe", "folder", "link", "loop", "device"])

@@ -234,7 +234,7 @@ class TestAFolderThatVanishes:
         gone = Vanishing(tmp_path / "cache", at=1)
         truth = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache", on_cases=gone)
         again = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache")
-        assert again.score.tobytes() == truth.score.tobytes()
+        assert again.margin.tobytes() == truth.margin.tobytes()
         assert len(list((tmp_path / "cache").iterdir())) == 1
 
     def test_with_temporary_files_is_not_missed(self, tmp_path, monkeypatch):

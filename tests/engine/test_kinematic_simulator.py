@@ -21,7 +21,6 @@ from merge_sumo.studies.truth import ground_truth, known_truth
 from merge_sumo.values.case import Case, MergeCase, Pool, from_unit
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import OWN, US23, VUT, Scenario
-from merge_sumo.values.score import FAILURE_SCORE
 from merge_sumo.vuts.base import VutOptions
 
 
@@ -41,7 +40,7 @@ def assert_alike(sumo: CaseResults, kinematic: CaseResults) -> None:
         np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
     for verdict, ours in zip(sumo.verdicts(), kinematic.verdicts(), strict=True):
         assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
-        assert verdict.score == pytest.approx(ours.score, abs=1e-7)
+        assert verdict.margin == pytest.approx(ours.margin, abs=1e-9)
 
 
 class TestACase:
@@ -140,8 +139,8 @@ class TestATruth:
     def test_is_that_of_sumo(self, tmp_path):
         ours = ground_truth(self.PLAN, 1, 3000, cache=tmp_path)
         sumos = ground_truth(plan_for("design2"), 1, 3000, cache=tmp_path)
-        assert (ours.score < FAILURE_SCORE).tolist() == (sumos.score < FAILURE_SCORE).tolist()
-        np.testing.assert_allclose(ours.score, sumos.score, rtol=0.0, atol=1e-7)
+        assert (ours.margin < 0.0).tolist() == (sumos.margin < 0.0).tolist()
+        np.testing.assert_allclose(ours.margin, sumos.margin, rtol=0.0, atol=1e-9)
         assert (ours.in_sumo, sumos.in_sumo) == (30, 3000)
 
     def test_of_sumo_is_taken_and_not_the_other_way_round(self, tmp_path):

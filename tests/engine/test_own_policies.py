@@ -246,7 +246,7 @@ class TestAFolder:
         asked = dataclasses.replace(settings(folder), vut=vut)
         ran = run_campaign(asked, tmp_path / "run")
         assert {outcome.measures.end for outcome in ran.outcomes} == {end}
-        assert {outcome.score for outcome in ran.outcomes} == {None}
+        assert {outcome.margin for outcome in ran.outcomes} == {None}
         assert "action values that are not finite" in str(ran.outcomes[0].measures.error)
 
     @pytest.mark.parametrize("manifest", [b"", b"{", b"[]", b'{"networks": 3}', b"\xff\xfe\xfd"])

@@ -284,9 +284,9 @@ def test_the_address_keeps_the_filters_through_reload_back_and_forward(browser, 
         page.go_forward()
         page.go_forward()
         assert all_rows(page) == bright(page) == of_level
-        filters.locator("[name=measure]").select_option(label="score")
-        filters.locator("[name=to]").press_sequentially("-1000")
-        assert "measure=score&to=-1000" in page.evaluate("location.hash")
+        filters.locator("[name=measure]").select_option(label="margin")
+        filters.locator("[name=to]").press_sequentially("-12")
+        assert "measure=margin&to=-12" in page.evaluate("location.hash")
         page.go_back()  # one step back is the whole number
         assert all_rows(page) == of_level
 
@@ -326,9 +326,9 @@ def test_the_table_is_downloaded_as_it_is_filtered_and_no_text_in_it_is_a_formul
         by_case = {int(row["case"]): row for row in table}
         for outcome in run.outcomes:
             row = by_case[outcome.index]
-            score = outcome.score
-            assert row["score"] == ("" if score is None else f"{round(score, 1):g}") or (
-                float(row["score"]) == pytest.approx(score, abs=0.06)
+            margin = outcome.margin
+            assert row["margin"] == ("" if margin is None else f"{round(margin, 3):g}") or (
+                float(row["margin"]) == pytest.approx(margin, abs=0.0006)
             )
             assert float(row["x_POV0 m"]) == pytest.approx(outcome.case.x_pov0_m, abs=1e-3)
         assert by_case[4]["verdict"] == "VUT_ERROR: =1+1"

@@ -14,7 +14,7 @@ from PIL import Image
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedScores
+from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
 from merge_sumo.values.fmc import RADIUS
 
 
@@ -78,16 +78,16 @@ class TestTheMaps:
 
 @pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])
 def test_surfaces_of_any_number_of_batches_are_drawn(batches):
-    flat = PredictedScores(np.full((5, 5), -10.0), panel(20, 2))
-    figure = figures.predicted_scores("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
+    flat = PredictedMargins(np.full((5, 5), 0.9), panel(20, 2))
+    figure = figures.predicted_margins("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
     assert sum(axes.get_visible() for axes in figure.axes) == len(batches) + 1
 
 
 def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_path):
     cases = {level: np.full((3, 4), 10.0) for level in (0, 1, 2)}
-    score = {level: np.full((3, 4), -50.0) for level in (0, 1, 2)}
-    score[0][:, 1] = np.nan
-    figure = figures.allocation("t", {"gpr": LevelBatches(cases, score)})
+    margin = {level: np.full((3, 4), 0.9) for level in (0, 1, 2)}
+    margin[0][:, 1] = np.nan
+    figure = figures.allocation("t", {"gpr": LevelBatches(cases, margin)})
     above, below = figure.axes
     assert [line.get_label() for line in above.lines] == ["0", "1", "2"]
     assert np.isnan(below.lines[0].get_ydata()).tolist() == [False, True, False, False]

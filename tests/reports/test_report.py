@@ -120,12 +120,12 @@ class TestThePage:
         assert 1 < different < len(own)
         assert len(set(own[:different])) == different
         firsts = spread[:different]
-        assert [o.score for o in firsts] == sorted(o.score for o in firsts)
+        assert [o.margin for o in firsts] == sorted(o.margin for o in firsts)
         for o in firsts:
             same = [
-                f.score for f in found if (f.case.level, region[f.index]) == own[firsts.index(o)]
+                f.margin for f in found if (f.case.level, region[f.index]) == own[firsts.index(o)]
             ]
-            assert o.score == min(same)
+            assert o.margin == min(same)
 
     @pytest.mark.parametrize("name", ["us23", "us23-traffic"])
     def test_has_no_column_of_a_coordinate_that_no_level_of_it_has(self, tmp_path, name):
@@ -240,7 +240,7 @@ class TestTheTruth:
 
         def truth(path: object, level: int, cases: int, scenario: Scenario = US23) -> Truth:
             points = np.random.default_rng(1).random((2000, len(scenario.dimensions(level))))
-            return Truth(points, np.where(points[:, 0] < 0.5, -900.0, -10.0))
+            return Truth(points, np.where(points[:, 0] < 0.5, -0.8, 0.9))
 
         monkeypatch.setattr("merge_sumo.studies.truth.read_truth", truth)
         return truth

@@ -103,7 +103,7 @@ class TestAMap:
 
     def test_of_a_pair_has_the_truth_in_its_own_coordinates(self):
         points = np.random.default_rng(1).random((4000, 4))
-        truth = Truth(points, np.where(points[:, 2] < 0.5, -900.0, -10.0))
+        truth = Truth(points, np.where(points[:, 2] < 0.5, -0.8, 0.9))
         found = maps_of(TRAFFIC, 1, [], None, truth)
         place = [tuple(pair["axes"]) for pair in found["pairs"]].index((1, 2))
         shown = values(found["grids"][place]["truth"])

@@ -75,7 +75,7 @@ class TestATinyReproduction:
 
     def test_shows_a_dense_truth_where_there_is_one(self, tiny):
         (title, one), *_ = tiny.columns.items()
-        dense = Truth(np.full((1, 2), 0.5), np.full(1, -600.0))
+        dense = Truth(np.full((1, 2), 0.5), np.full(1, -0.2))
         found = replace(one, study=replace(one.study, dense={0: dense}))
         table = replace(tiny, columns={title: found}).lines()
         assert "| dense truth | 0.0079 |" in table

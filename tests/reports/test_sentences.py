@@ -196,6 +196,10 @@ def check_arrival(told: Told, at: str, first: str, ahead: str) -> None:
     assert first == ("VUT" if told.dx < 0.0 else "POV")
 
 
+def check_margin(told: Told, fails: str, margin: str) -> None:
+    assert (fails == "Fails") == (abs(told.dx) < NEAR_M) == (float(margin) < 0.0)
+
+
 def check_merge(told: Told, at: str, where: str, first: str, ahead: str) -> None:
     assert told.lane_m is not None
     check_arrival(told, at, first, ahead)
@@ -266,6 +270,7 @@ CHECKS: dict[str, Callable[..., None]] = {
         check_arrival,
     rf"The car behind has to brake at {NUMBER} m/s² after {PLACE}\.": check_braking_after,
     rf"The car behind has to brake at less than 0\.1 m/s² after {PLACE}\.": check_hardly_braking,
+    r"(Fails|Does not fail): margin (-?[\d.]+)\.": check_margin,
     r"The VUT (.+), the POV (.+)\.": check_conduct,
     rf"Full braking or full acceleration of the VUT would have kept 6 m at (?:M|this place) until "
     rf"{NUMBER} s\.": check_way_out,

@@ -60,10 +60,6 @@ class TestByHand:
         # exp(1.5) = 4.48, so the quotas are 7.30 and 32.70.
         assert softmax_shares({0: 0.0, 1: 0.5}, {0: 20, 1: 20}, 40, xi=3.0) == {0: 7, 1: 33}
 
-    def test_a_level_without_failures_keeps_one_case(self):
-        shares = softmax_shares({0: 0.0, 1: 1.0, 2: 1.0}, {0: 0, 1: 0, 2: 0}, 9, xi=20.0)
-        assert shares == {0: 1, 1: 4, 2: 4}
-
 
 class TestShares:
     @examples
@@ -91,17 +87,6 @@ class TestShares:
         weights, told = levels
         backwards = dict(reversed(weights.items()))
         assert whole_shares(backwards, told, n) == whole_shares(weights, told, n)
-
-    @examples
-    @given(shares_of_failures(), st.integers(3, 300), st.floats(0.1, 10.0))
-    def test_grow_with_the_share_of_failures(self, levels, n, xi):
-        failure_share, told = levels
-        shares = softmax_shares(failure_share, told, n, xi)
-        assert sum(shares.values()) == n
-        for one, u_one in failure_share.items():
-            for other, u_other in failure_share.items():
-                if math.exp(xi * u_one) > math.exp(xi * u_other):
-                    assert shares[one] >= shares[other]
 
 
 class TestTheLastFailureShare:

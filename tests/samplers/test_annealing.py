@@ -15,14 +15,14 @@ FloatArray = np.ndarray
 
 
 def two_valleys(points: FloatArray) -> FloatArray:
-    """Return a score with two equal minima, far apart."""
+    """Return a margin with two equal minima, far apart."""
     left = np.square(points - [0.2, 0.3]).sum(axis=1)
     right = np.square(points - [0.8, 0.7]).sum(axis=1)
-    return -900.0 * np.exp(-np.minimum(left, right) / 0.05)
+    return 1.0 - 1.8 * np.exp(-np.minimum(left, right) / 0.05)
 
 
-def history_of(points: FloatArray, score: FloatArray, batch: FloatArray) -> LevelHistory:
-    return LevelHistory(points, score, score < -500.0, np.full(len(score), np.nan), batch)
+def history_of(points: FloatArray, margin: FloatArray, batch: FloatArray) -> LevelHistory:
+    return LevelHistory(points, margin, margin < 0.0, np.full(len(margin), np.nan), batch)
 
 
 def anneal(seed: int, batches: int, n: int = 20) -> LevelHistory:

@@ -36,7 +36,7 @@ def shell_m(points: FloatArray) -> FloatArray:
 
 
 class Confident:
-    """Predicts the band, whatever it is told; its members agree within .2 m."""
+    """Predicts the band, whatever it is told; its members agree within .04 of the limit."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Learn nothing."""
@@ -50,13 +50,13 @@ class Confident:
         return [self._answer(query) for query in queries]
 
     def _answer(self, query: Query) -> FloatArray:
-        gap_m = band_m(query.points)
+        gap = band_m(query.points) / US23.dx_crash_m
         if query.held_out:
-            return np.tile(gap_m, (EXPERTS, 1))
+            return np.tile(gap, (EXPERTS, 1))
         if query.screening is not None:
-            return gap_m[None, None]
-        off = np.linspace(-0.1, 0.1, EXPERTS * GROUPS).reshape(EXPERTS, GROUPS, 1)
-        return gap_m + off
+            return gap[None, None]
+        off = np.linspace(-0.02, 0.02, EXPERTS * GROUPS).reshape(EXPERTS, GROUPS, 1)
+        return gap + off
 
 
 def search(true_m, cases: int, seed: int) -> tuple[FloatArray, NDArray[np.bool_]]:
@@ -97,8 +97,8 @@ def test_changes_nothing_where_predictions_come_true(monkeypatch):
 
 def known(points: FloatArray, failed: Sequence[bool], batch: Sequence[int]) -> LevelHistory:
     verdicts = np.array(failed)
-    score, gap_m = np.where(verdicts, -600.0, -50.0), np.where(verdicts, 0.0, 50.0)
-    return LevelHistory(points, score, verdicts, gap_m, np.array(batch))
+    margin, gap = np.where(verdicts, -0.2, 0.9), np.where(verdicts, 0.0, 8.0)
+    return LevelHistory(points, margin, verdicts, gap, np.array(batch))
 
 
 def said(p_fail: float) -> Prediction:
@@ -117,10 +117,10 @@ class TestTheBaseRate:
         predictions = [None] * 4 + [said(0.5)] * 2
         rng = np.random.default_rng(3)
 
-        def by_score(points: FloatArray, n: int) -> FloatArray:
+        def by_margin(points: FloatArray, n: int) -> FloatArray:
             return points[:n]
 
-        made = BaseRate(history, predictions, np.empty((0, 2)), n, 6, rng, by_score)
+        made = BaseRate(history, predictions, np.empty((0, 2)), n, 6, rng, by_margin)
         return made, sequence
 
     def test_is_the_share_of_the_sequence_that_failed(self):
@@ -129,13 +129,13 @@ class TestTheBaseRate:
 
     def test_goes_on_with_both_arms_by_what_each_has_found(self):
         base_rate, sequence = self.made()
-        # The sequence found 1 of 4, the score nothing of 0: shares of .107 and .05.
+        # The sequence found 1 of 4, the margin nothing of 0: shares of .107 and .05.
         offered = spread_out(4000, 2, np.random.default_rng([4000, 2]))
         wanted = np.array([offered[0], sequence[4], sequence[5]])
         assert base_rate.following == pytest.approx(wanted)
 
     @pytest.mark.parametrize("seed", range(100, 124))
-    def test_comes_everywhere_also_where_the_score_leads_astray(self, seed):
+    def test_comes_everywhere_also_where_the_margin_leads_astray(self, seed):
         assert search(shell_m, 60, seed)[1].any()
 
     def test_stands_in_for_the_picks_that_are_worth_less(self):

@@ -6,13 +6,19 @@ from __future__ import annotations
 
 import math
 import statistics
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import some
 
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.belief import CALIBRATION, Calibration, _as_if, _calibrated, margin_of
+from merge_sumo.samplers.belief import (
+    CALIBRATION,
+    Calibration,
+    _calibrated,
+    what_is_learned,
+)
 from merge_sumo.samplers.coverage import NEAREST, PATIENCE, _limit, _Search
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
@@ -93,7 +99,7 @@ class TestTheGround:
             free[pick] = 0.0
 
 
-@pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
+@pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "margin alone"])
 def test_covers_more_than_twice_of_what_uniform_covers(blind):
     level = 2
     uniform, ours = (
@@ -114,12 +120,12 @@ def test_covers_more_than_twice_of_what_uniform_covers(blind):
 
 def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
     points = np.random.default_rng(0).random((30, 2))
-    gap_m = 60.0 * (points[:, 0] - 0.5)
-    missing = np.where(points[:, 0] > 0.9, np.nan, gap_m)
-    score, batch = np.full(30, -5.0), np.zeros(30, dtype=np.int64)
-    history = LevelHistory(points, score, np.abs(gap_m) < 6.0, missing, batch)
-    values, low, high = margin_of(history)
-    assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(200.0 / 6.0) / np.arcsinh(1.0))
+    gap = 10.0 * (points[:, 0] - 0.5)
+    missing = np.where(points[:, 0] > 0.9, np.nan, gap)
+    margin, batch = np.full(30, 0.99), np.zeros(30, dtype=np.int64)
+    history = LevelHistory(points, margin, np.abs(gap) < 1.0, missing, batch)
+    values, low, high = what_is_learned(history)
+    assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(100.0 / 3.0) / np.arcsinh(1.0))
     sure = Margin(points, values, low, high, rough=False).at(np.array([[0.5, 0.5], [0.97, 0.5]]))
     assert sure[0] > 0.5 > sure[1]
 
@@ -180,38 +186,17 @@ class TestTheCalibration:
         assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
 
 
-class TestWhatIsAimedAt:
-    """Where failures are rare, the nearest cases stand in for them."""
-
-    @staticmethod
-    def history(n: int, failures: int, *, blind: bool = False) -> LevelHistory:
-        rng = np.random.default_rng(6)
-        gap_m = rng.permutation(np.arange(n) + 10.0) * rng.choice([-1.0, 1.0], n)
-        gap_m[:failures] = 1.0
-        score = np.where(np.abs(gap_m) < 6.0, -600.0, -450.0 * np.exp((6.0 - np.abs(gap_m)) / 15))
-        failed = score < -500.0
-        gap_m = np.full(n, np.nan) if blind else gap_m
-        return LevelHistory(rng.random((n, 2)), score, failed, gap_m, np.arange(n) // 20)
-
-    @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "score alone"])
-    def test_are_the_nearest_cases_where_nothing_failed(self, blind):
-        history = self.history(PATIENCE, 0, blind=blind)
-        near = _as_if(history, _limit(history)).failed
-        assert near.sum() == NEAREST
-        assert set(np.flatnonzero(near)) == set(np.argsort(history.score)[:NEAREST])
-
-    def test_are_failures_alone_once_enough_are_known(self):
-        assert _limit(self.history(PATIENCE, NEAREST)) is None
-
-
-def test_looks_where_cases_come_near_but_counts_on_failures_alone():
+@pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "margin alone"])
+def test_looks_where_cases_come_near_but_counts_on_failures_alone(blind):
     rng = np.random.default_rng(2)
     points = rng.random((2 * PATIENCE, 2))
-    gap_m = 8.0 + 60.0 * points[:, 0]
-    score = -450.0 * np.exp((6.0 - gap_m) / 15.0)
+    gap = 1.3 + 10.0 * points[:, 0]
+    margin = 1.0 - 0.9 * np.exp(0.4 * (1.0 - gap))
     nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
-    history = LevelHistory(points, score, nothing, gap_m, batch)
+    history = LevelHistory(points, margin, nothing, np.where(blind, np.nan, gap), batch)
     assert _limit(history) is not None
+    enough = replace(history, failures=(np.arange(len(points)) < NEAREST).astype(np.int64))
+    assert _limit(enough) is None
     proposal = _Search(history, np.empty((0, 2)), rng, 20).batch(20)
     assert np.median(proposal.points[:, 0]) < 0.1
     assert proposal.gain.sum() < 2.0
@@ -227,9 +212,9 @@ class TestTheTrust:
         points[100:, 0] = 0.5 + 0.04 * (rng.random(100) - 0.5)
         in_band = np.abs(points[:, 0] - 0.5) < 0.05
         failed = in_band & ((np.arange(200) < 100) | failing_late)
-        gap_m = np.where(failed, 0.0, np.where(points[:, 0] < 0.5, -20.0, 20.0))
-        score = np.where(failed, -600.0, -50.0)
-        return LevelHistory(points, score, failed, gap_m, np.arange(200) // 20)
+        gap = np.where(failed, 0.0, np.where(points[:, 0] < 0.5, -3.0, 3.0))
+        margin = np.where(failed, -0.2, 0.9)
+        return LevelHistory(points, margin, failed, gap, np.arange(200) // 20)
 
     def test_is_whole_where_the_picks_came_true(self):
         assert Calibration(self.history(failing_late=True)).factors[0] == 1.0

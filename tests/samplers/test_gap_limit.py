@@ -1,4 +1,4 @@
-"""The limit of the gap within which a case fails is that of the scenario that is searched."""
+"""The gap within which a case fails is that of the scenario that is searched, in units of it."""
 
 from __future__ import annotations
 
@@ -7,30 +7,73 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from merge_sumo.campaigns.campaign import twin_of, twins_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.samplers.belief import learn_chance
+from merge_sumo.samplers.history import bounded
+from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.values.criteria import PAPER
+from merge_sumo.values.regression import regression
 from merge_sumo.values.scenario import US23
 
+HARSH = "brake_after_mps2 > 3"
+LIMITS = [(limit_m, fail_when) for limit_m in (3.0, 12.0) for fail_when in (PAPER, HARSH)]
 
-@pytest.mark.parametrize("limit_m", [3.0, 6.0, 12.0])
-def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m):
+
+def test_large_margins_are_drawn_in():
+    margins = np.array([0.0, 0.5, -1.25, 1.25, 2.5, -2.5, 100.0, -np.inf, np.inf, np.nan])
+    expected = [0.0, 0.5, -1.25, 1.25, 1.875, -1.875, 2.484375, -2.5, 2.5, np.nan]
+    assert bounded(margins).tolist() == pytest.approx(expected, abs=0.0, nan_ok=True)
+
+
+def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
+    """Return settings, plan, points, (n, d), outcomes and motions of a scenario with a limit."""
     scenario = replace(US23, dx_crash_m=limit_m, dx_critical_m=max(limit_m, US23.dx_critical_m))
-    settings = CampaignSettings(vut="level0", levels=(0,), cases=400, scenario=scenario)
-    points = np.random.default_rng(7).random((400, 2))
+    settings = CampaignSettings(
+        vut=vut, levels=(0,), cases=cases, scenario=scenario, fail_when=fail_when
+    )
+    points = np.random.default_rng(7).random((cases, 2))
     plan = resolve(settings).with_engine("kinematic")
     ran = sorted(evaluate(plan, settings.pool.cases(points, 0)))
     outcomes = [result.outcome(place) for place, result in ran]
-    assert {outcome.gap_limit_m for outcome in outcomes} == {limit_m}
+    return settings, plan, points, outcomes, {place: one.trajectory.motion for place, one in ran}
+
+
+@pytest.mark.parametrize(("limit_m", "fail_when"), [*LIMITS, (6.0, PAPER)])
+def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m, fail_when):
+    settings, _, points, outcomes, _ = searched(limit_m, fail_when, 400)
     sampler = make_sampler("uniform", settings.pool, 0)
     sampler.tell(outcomes[:200])
-    assert sampler.history(0).limit_m == limit_m
-    chance = learn_chance(sampler.history(0))
+    history = sampler.history(0)
+    assert ((np.abs(history.gap) < 1.0) == history.failed).all()
+    chance = learn_chance(history)
     assert chance is not None
     failed = np.array([outcome.failed for outcome in outcomes[200:]])
     expected = chance(points[200:]) > 0.5
     assert failed.sum() > 5
     assert np.mean(expected[failed]) > 0.8
     assert np.mean(expected[~failed]) < 0.05
+
+
+@pytest.mark.parametrize(("limit_m", "fail_when"), LIMITS)
+def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
+    settings, plan, points, outcomes, motions = searched(limit_m, fail_when, 160)
+    _, old_plan, _, old, old_motions = searched(limit_m, fail_when, 160, "design1")
+    twin, pair = twin_of(settings, plan), twins_of(settings, plan, old_plan)
+    twin.tell(outcomes[:80], motions)
+    pair.tell(outcomes[:80], motions)
+    pair.tell_old(old[:80], old_motions)
+    regressions = [regression(*versions) for versions in zip(outcomes, old, strict=True)]
+    for predictor, ran in ((twin, outcomes), (pair, regressions)):
+        (gaps,) = predictor.predict([Query(0, points[80:])])
+        said = np.abs(np.median(gaps, axis=(0, 1))) < 1.0
+        failed = np.array([outcome.failed for outcome in ran[80:]])
+        assert failed.any()
+        assert np.mean(said == failed) > 0.9
+        # What is recorded in m is read in units of the limit again.
+        skill = PredictionSkill([], 0, limit_m)
+        one = replace(ran[80], prediction=skill.prediction(gaps[..., 0], 0.5, 0.5, 0.5))
+        assert one.predicted_gaps == pytest.approx(gaps[..., 0], abs=1e-4)

@@ -62,8 +62,9 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert history.failures.tolist() == [2, 0]
     assert history.share.tolist() == [0.5, 0.0]
     assert history.batch.tolist() == [0, 1]
-    assert (history.score[0], history.dx_m[0], history.failed[0]) == (-700.0, 2.0, failed)
-    assert history.variance[0] == pytest.approx(np.var([-20.0, -700.0, -25.0, -600.0], ddof=1))
+    assert history.margin[0] == pytest.approx(-0.4)
+    assert (history.gap[0], history.failed[0]) == (2.0 / 6.0, failed)
+    assert history.variance[0] == pytest.approx(np.var([0.96, -0.4, 0.95, -0.2], ddof=1))
     assert np.isnan(history.variance[1])
     assert history.varies
 
@@ -116,11 +117,11 @@ class TestTheBelief:
         inside = np.abs(points[:, 0] - 0.5) < 0.15
         failures = np.where(inside, rng.binomial(self.RUNS, 0.3, 150), 0)
         decides = failures > tolerated * self.RUNS
-        score = np.where(failures > 0, -600.0, -20.0)
-        gap_m = np.where(failures > 0, 0.0, np.where(inside, 30.0, 200.0 * (points[:, 0] - 0.5)))
+        margin = np.where(failures > 0, -0.2, 0.96)
+        gap = np.where(failures > 0, 0.0, np.where(inside, 5.0, 33.0 * (points[:, 0] - 0.5)))
         runs = np.full(150, self.RUNS)
-        variance = np.where((failures > 0) & (failures < self.RUNS), 1e5, 0.0)
-        rows = points, score, decides, gap_m, np.arange(150) // 10, runs, failures, variance
+        variance = np.where((failures > 0) & (failures < self.RUNS), 0.4, 0.0)
+        rows = points, margin, decides, gap, np.arange(150) // 10, runs, failures, variance
         return LevelHistory(*rows, varies=True, tolerated=tolerated), inside
 
     def test_is_the_share_of_runs_that_fail(self):

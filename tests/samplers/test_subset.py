@@ -17,14 +17,14 @@ CORNER = 0.1
 PROBABILITY = CORNER**2 / 2.0
 
 
-def score_of(points: FloatArray) -> FloatArray:
-    """Return a score that falls towards a corner of the square and passes -500 at the line."""
-    return -500.0 - 400.0 * (CORNER - points.sum(axis=1))
+def margin_at(points: FloatArray) -> FloatArray:
+    """Return a margin that falls towards a corner of the square and passes 0 at the line."""
+    return 0.8 * (points.sum(axis=1) - CORNER)
 
 
 def history_of(points: FloatArray, batch: FloatArray) -> LevelHistory:
-    score = score_of(points)
-    return LevelHistory(points, score, score < -500.0, np.full(len(score), np.nan), batch)
+    margin = margin_at(points)
+    return LevelHistory(points, margin, margin < 0.0, np.full(len(margin), np.nan), batch)
 
 
 def simulate(seed: int, batches: int, n: int = 20) -> LevelHistory:
@@ -69,12 +69,12 @@ def test_goes_through_ever_lower_and_rarer_regions_to_the_failures():
     assert seen[STAGE_SIZE // 20 - 1].number == 1
     assert np.all(np.diff([stage.threshold for stage in seen[4:]]) <= 0.0)
     assert np.all(np.diff([stage.probability for stage in seen]) <= 0.0)
-    assert seen[-1].threshold < -500.0
+    assert seen[-1].threshold < 0.0
 
 
 def test_no_chain_ever_leaves_its_region():
     for stage in stages():
-        assert np.all(score_of(stage.chains) <= stage.threshold)
+        assert np.all(margin_at(stage.chains) <= stage.threshold)
 
 
 def test_a_rejected_move_leaves_its_chain_where_it_is():

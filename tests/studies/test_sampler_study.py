@@ -46,11 +46,11 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     (path,) = cache.glob("truth-*.npz")
     counted: list[int] = []
     again = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
-    assert np.array_equal(again.score, truth.score)
+    assert np.array_equal(again.margin, truth.margin)
     assert counted == []
     path.write_bytes(path.read_bytes()[:100])
     remade = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
-    assert np.array_equal(remade.score, truth.score)
+    assert np.array_equal(remade.margin, truth.margin)
     assert sum(counted) == 300
 
 
@@ -168,7 +168,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
 def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
     """Return a truth with some failures at each of some points: two of them are large enough."""
     at = np.array(points * failures or [(0.5, 0.5)])
-    return Truth(at, np.full(len(at), -600.0 if failures else -1.0))
+    return Truth(at, np.full(len(at), -0.2 if failures else 0.9))
 
 
 TWO = truth_with((0.2, 0.2), (0.8, 0.8))
@@ -224,20 +224,20 @@ def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path
     assert known_truth(plan_for("design1"), 0, 301, cache=cache) is None
     known = known_truth(plan_for("design1"), 0, 300, cache=cache)
     assert known is not None
-    assert np.array_equal(known.score, truth.score)
+    assert np.array_equal(known.margin, truth.margin)
 
 
 def test_the_cases_of_a_truth_are_the_first_of_a_denser_one(truth, tmp_path):
     few = ground_truth(plan_for("design1"), 0, 40, cache=tmp_path)
     assert np.array_equal(few.points, truth.points[:40])
-    assert np.array_equal(few.score, truth.score[:40])
+    assert np.array_equal(few.margin, truth.margin[:40])
 
 
 class TestTheOracle:
     def test_takes_the_most_useful_failure_first(self):
         # Two that overlap and one apart: one of the two, the one apart, then the rest.
         points = np.array([[0.2, 0.2], [0.22, 0.2], [0.8, 0.8]])
-        truth = Truth(points, np.full(3, -600.0))
+        truth = Truth(points, np.full(3, -0.2))
         curve = oracle({0: truth}, 10, 5)
         one = fmc(points[:1])
         assert curve[0] == 0.0
@@ -247,8 +247,8 @@ class TestTheOracle:
         assert curve[10] == curve[3]
 
     def test_of_two_levels_takes_volume_where_there_is_most(self):
-        flat = Truth(np.array([[0.5, 0.5]]), np.array([-600.0]))
-        solid = Truth(np.array([[0.5, 0.5, 0.5]]), np.array([-600.0]))
+        flat = Truth(np.array([[0.5, 0.5]]), np.array([-0.2]))
+        solid = Truth(np.array([[0.5, 0.5, 0.5]]), np.array([-0.2]))
         curve = oracle({2: solid, 1: flat}, 2, 2)
         assert curve[1] == pytest.approx(fmc(flat.failures))
         assert curve[2] == pytest.approx(fmc(flat.failures) + fmc(solid.failures))

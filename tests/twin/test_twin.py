@@ -49,7 +49,7 @@ def ran(vut: str, level: int, points, scenario=US23, povs=None):
 
 
 def gaps_of(outcomes) -> np.ndarray:
-    return np.array([outcome.measures.dx_m for outcome in outcomes], dtype=np.float64)
+    return np.array([outcome.signed_gap for outcome in outcomes], dtype=np.float64)
 
 
 @pytest.fixture(scope="module")
@@ -106,12 +106,12 @@ class TestGames:
         plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
         done = run_cases(plan, pool.cases(points, 0))
         lines = centre_lines(road)
-        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap_m for one in done]
+        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
         found = TwinRollout(pool, POVS, criterion, lines).play(
             [Starts(0, points)], lambda inputs: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
         )[0]
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
-        assert (np.abs(found) < 6.0).any()
+        assert (np.abs(found) < 1.0).any()
 
     def test_cannot_be_played_against_a_program(self):
         assert not TwinRollout(Pool(levels=(0,), scenario=US23), POVS).can_predict(3)
@@ -160,16 +160,6 @@ class TestForest:
 
 
 class TestTwin:
-    def test_predicts_cases_that_it_has_not_seen(self, seen):
-        outcomes, motions = seen
-        twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
-        twin.tell(outcomes[:40], motions)
-        points = np.random.default_rng(3).random((60, 2))[40:]
-        found = twin.predict([Query(0, points)])[0]
-        assert found.shape == (2, 4, 20)
-        off = np.abs(np.median(found, axis=(0, 1)) - gaps_of(outcomes[40:]))
-        assert np.median(off) < 1.0
-
     def test_says_the_same_however_it_was_told(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
@@ -197,7 +187,11 @@ class TestTwin:
         twin = Twin(Pool(levels=(0,), scenario=US23), POVS, 0)
         twin.tell(
             [
-                replace(o, measures=replace(o.measures, end=End.VUT_ERROR, score=None))
+                replace(
+                    o,
+                    measures=replace(o.measures, end=End.VUT_ERROR, score=None),
+                    margin=None,
+                )
                 for o in outcomes
             ],
             motions,
@@ -230,8 +224,8 @@ class TestTheRecord:
         record = PredictionSkill(right, 0, 6.0)
         assert record.twin[1] > 0.99
         assert not record.is_worthless
-        near = record.chance(np.full((2, 4, 1), 2.0))
-        assert near[0] > PredictionSkill([], 0, 6.0).chance(np.full((2, 4, 1), 2.0))[0]
+        near = record.chance(np.full((2, 4, 1), 0.3))
+        assert near[0] > PredictionSkill([], 0, 6.0).chance(np.full((2, 4, 1), 0.3))[0]
 
     def test_gives_up_who_predicts_nothing(self):
         rng = np.random.default_rng(0)

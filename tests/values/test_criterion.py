@@ -13,14 +13,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_score import CASE, ending
 
+from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
-from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion, vocabulary
 from merge_sumo.values.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import FAILURE_SCORE, Outcome, measure, score_of
+from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
 WORDS = {"x": None, "y": None, "who": frozenset({"A", "B"})}
@@ -105,13 +104,6 @@ class TestMargins:
     ):
         values = {"x": float(x), "y": float(y), "who": who}
         assert (margin(condition, **values) < 0.0) is eval(condition, {}, values)  # noqa: S307
-
-    @given(st.floats(-MOST_MARGIN, MOST_MARGIN), st.floats(-MOST_MARGIN, MOST_MARGIN))
-    def test_become_scores_in_the_same_order(self, a, b):
-        assert (score_of(a) <= score_of(b)) or a > b
-        assert -1000.0 < score_of(a) < 0.0
-        assert score_of(0.0) == FAILURE_SCORE
-        assert score_of(-1e-9) < FAILURE_SCORE < score_of(1e-9)
 
 
 class TestRefused:
@@ -224,7 +216,6 @@ class TestMeasures:
         error = Trajectory(CASE, ending(0.0).motion, End.VUT_ERROR, "gone")
         outcome = Criterion("t_end_s > 0").outcome(0, 0, error)
         assert outcome.margin is None
-        assert outcome.score is None
         assert not outcome.failed
 
 
@@ -328,13 +319,13 @@ class TestOutcomes:
         with pytest.raises(UserError, match=r"margin|JSON"):
             Outcome.from_json(json.dumps(record | {"margin": margin}), scenario=US23)
 
-    def test_have_a_gap_of_6_m_where_the_criterion_turns(self):
+    def test_have_a_gap_of_1_where_the_criterion_turns(self):
         # A TTC of 4.2 s, against 4: 1 + 0.05; then 2 s, against 4: 1 / (1 + 0.5).
         safe = Criterion("ttc_s < 4").outcome(0, 0, ending(-21.0, v_pov=31.0))
         fails = Criterion("ttc_s < 4").outcome(0, 0, ending(20.0, v_pov=16.0))
-        assert safe.signed_gap_m == pytest.approx(-6.0 * 1.05)
-        assert fails.signed_gap_m == pytest.approx(6.0 / 1.5)
-        assert PAPER_CRITERION.outcome(0, 0, ending(-21.0)).signed_gap_m == pytest.approx(-21.0)
+        assert safe.signed_gap == pytest.approx(-1.05)
+        assert fails.signed_gap == pytest.approx(1.0 / 1.5)
+        assert PAPER_CRITERION.outcome(0, 0, ending(-21.0)).signed_gap == pytest.approx(-3.5)
 
 
 def settings(**other):
@@ -368,15 +359,14 @@ class TestCampaigns:
                    == o.margin for o in harsh.outcomes)  # fmt: skip
         assert any(o.measures.end is End.MERGED for o in failing)
 
-
-class TestSamplers:
-    def test_learn_the_gap_of_the_papers_criterion_and_else_what_stands_for_it(self):
-        outcomes = [ending(9.0), ending(-21.0, v_pov=31.0)]
-        for criterion in (PAPER_CRITERION, Criterion("ttc_s < 4")):
-            sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
-            told = [criterion.outcome(n, 0, t) for n, t in enumerate(outcomes)]
-            sampler.tell(told)
-            history = sampler.history(0)
-            assert history.dx_m.tolist() == [o.signed_gap_m for o in told]
-            assert history.score.tolist() == [o.score for o in told]
-            assert history.failed.tolist() == [o.failed for o in told]
+    def test_by_a_condition_on_the_score_are_those_of_the_paper_and_read_back(self, tmp_path):
+        for name, fail_when in (
+            ("paper", "paper"),
+            ("mine", "score < -500"),
+            ("near", "score < -300"),
+        ):
+            run_campaign(settings(vut="design1", fail_when=fail_when), tmp_path / name)
+        paper, mine, near = (Run(tmp_path / name).outcomes for name in ("paper", "mine", "near"))
+        assert mine == paper
+        assert all(o.is_by_score for o in paper)
+        assert not all(o.is_by_score for o in near)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from handmade import cases_of, drive
 
-from merge_sumo.values.regression import FARTHEST, margins, regression, regression_gaps_m
+from merge_sumo.values.regression import FARTHEST, margins, regression, regression_gaps
 from merge_sumo.values.score import Outcome, measure
 
 NAN = float("nan")
@@ -23,33 +23,32 @@ def outcome(dx_m: float | None, margin: float | None = None) -> Outcome:
 
 
 def test_margins_are_those_that_gaps_stand_for():
-    gaps_m = np.array([12.0, -12.0, 6.0, 3.0, -1.0, 0.0, NAN])
-    expected = [1.0, 1.0, 0.0, -1.0, -5.0, -FARTHEST, FARTHEST]
-    assert margins(gaps_m, 6.0) == pytest.approx(expected)
-    assert margins(np.array([12.0]), 4.0) == pytest.approx([2.0])
+    gaps = np.array([2.0, -2.0, 1.0, 0.5, -1.0 / 6.0, 0.0, NAN])
+    expected = [1.0, 1.0, 0.0, -1.0, -5.0, -97.0 / 3.0, 97.0 / 3.0]
+    assert margins(gaps) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
-    ("new_m", "old_m", "margin", "gap_m"),
+    ("new_m", "old_m", "margin", "gap"),
     [
-        (3.0, 12.0, -1.0, 3.0),  # broke: the old one passes with a margin of 1
-        (3.0, 6.6, -0.1, 6.0 / 1.1),  # broke, but the old one has little margin
-        (-3.0, 6.6, -0.1, -6.0 / 1.1),
-        (12.0, 18.0, 1.0, 12.0),  # both pass
-        (3.0, 3.0, 1.0, 12.0),  # both fail
-        (9.0, 3.0, 1.0, 12.0),  # fixed
-        (3.0, None, -1.0, 3.0),  # the old one never arrives
-        (None, 12.0, FARTHEST, 200.0),  # the new one never arrives: that is no failure
-        (3.0, 0.0, FARTHEST, 200.0),
+        (3.0, 12.0, -1.0, 0.5),  # broke: the old one passes with a margin of 1
+        (3.0, 6.6, -0.1, 1.0 / 1.1),  # broke, but the old one has little margin
+        (-3.0, 6.6, -0.1, -1.0 / 1.1),
+        (12.0, 18.0, 1.0, 2.0),  # both pass
+        (3.0, 3.0, 1.0, 2.0),  # both fail
+        (9.0, 3.0, 1.0, 2.0),  # fixed
+        (3.0, None, -1.0, 0.5),  # the old one never arrives
+        (None, 12.0, FARTHEST, 100.0 / 3.0),  # the new one never arrives: that is no failure
+        (3.0, 0.0, FARTHEST, 100.0 / 3.0),
     ],
 )
-def test_is_the_larger_of_new_and_minus_old(new_m, old_m, margin, gap_m):
+def test_is_the_larger_of_new_and_minus_old(new_m, old_m, margin, gap):
     found = regression(outcome(new_m), outcome(old_m))
     assert found.margin == pytest.approx(margin)
     assert found.failed == (margin < 0.0)
-    assert found.signed_gap_m == pytest.approx(gap_m)
-    new, old = (np.array([NAN if gap is None else gap]) for gap in (new_m, old_m))
-    assert regression_gaps_m(new, old, 6.0) == pytest.approx([gap_m])
+    assert found.signed_gap == pytest.approx(gap)
+    new, old = (np.array([NAN if m is None else m / 6.0]) for m in (new_m, old_m))
+    assert regression_gaps(new, old) == pytest.approx([gap])
 
 
 def test_takes_the_margins_of_another_criterion_as_they_are():
@@ -60,9 +59,8 @@ def test_takes_the_margins_of_another_criterion_as_they_are():
 @pytest.mark.parametrize("which", ["new", "old"])
 def test_has_no_verdict_without_one_on_both(which):
     passing, silent = outcome(30.0), outcome(30.0)
-    silent = replace(silent, measures=measure(drive(silent.case, "answered nan")))
+    silent = replace(silent, measures=measure(drive(silent.case, "answered nan")), margin=None)
     pair = (silent, passing) if which == "new" else (passing, silent)
     found = regression(*pair)
-    assert found.score is None
     assert found.margin is None
     assert not found.failed

@@ -18,6 +18,7 @@ from merge_sumo.values.score import (
     FAILURE_SCORE,
     Outcome,
     is_close,
+    margin_of,
     measure,
     sustained_brake_mps2,
     time_to_collision,
@@ -106,6 +107,11 @@ class TestScore:
         assert measures.score <= 0.0
         assert (measures.score < FAILURE_SCORE) == (abs(last[POV, 0] - last[VUT, 0]) < 6.0)
         assert is_close(trajectory) == (measures.score < FAILURE_SCORE)
+        assert Outcome(0, 0, CASE, measures).failed == is_close(trajectory)
+
+    def test_gives_a_margin_in_units_of_lambda(self):
+        scores = (0.0, -250.0, -500.0, -1000.0, None)
+        assert [margin_of(score) for score in scores] == [1.0, 0.5, 0.0, -1.0, None]
 
     def test_no_verdict_on_what_did_not_run_properly(self):
         for end in (End.VUT_ERROR, End.SIM_ERROR):

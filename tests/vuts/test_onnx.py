@@ -99,12 +99,12 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     assert [Path(f).name for f in in_process(f"onnx:{path}").files] == ["here.onnx"]
     vut = f"onnx:{tmp_path / 'a.onnx'}"
     assert sorted(Path(f).name for f in in_process(vut).files) == ["a.onnx", "weights.bin"]
-    truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score]
+    truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").margin]
     weights = tmp_path / "weights.bin"
     half, one = np.float64(0.5).tobytes(), np.float64(1.0).tobytes()
     assert weights.read_bytes().count(half) == 1
     weights.write_bytes(weights.read_bytes().replace(half, one))
-    truth.append(ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").score)
+    truth.append(ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").margin)
     before, after = truth
     assert not np.array_equal(before, after)
 

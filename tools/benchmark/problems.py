@@ -36,7 +36,6 @@ from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.fmc import fmc, growth_bound, radius_for
 from merge_sumo.values.imperfection import Actuation, Sensing
-from merge_sumo.values.score import FAILURE_SCORE
 
 TRUTHS: Final = Path(__file__).parent / "truths"
 """The folder of the truths."""
@@ -314,8 +313,8 @@ def changed_verdicts(problem: Problem, plan: SimulationPlan, truth: ProblemTruth
     """
     changed = 0
     for level, probes in truth.probes.items():
-        score = _scores_at(problem, plan, level, probes.points)
-        changed += int(((score < FAILURE_SCORE) != probes.failed).sum())
+        margin = _margins_at(problem, plan, level, probes.points)
+        changed += int(((margin < 0.0) != probes.failed).sum())
     return changed
 
 
@@ -331,19 +330,19 @@ def check_truth(problem: Problem, plan: SimulationPlan, truth: ProblemTruth) -> 
         )
 
 
-def _scores_at(
+def _margins_at(
     problem: Problem, plan: SimulationPlan, level: int, points: FloatArray
 ) -> FloatArray:
-    """Return the score of the cases at points, (n, d), of a level, (n,); NaN without a verdict."""
-    score = np.full(len(points), np.nan)
+    """Return the margin of the cases at points, (n, d), of a level, (n,); NaN without a verdict."""
+    margin = np.full(len(points), np.nan)
     cases = CasesAt(Pool(levels=problem.levels, scenario=plan.scenario), level, points)
     for place, value in evaluate(plan, cases, THIS_PROCESS, _verdicts):
-        score[place] = value
-    return score
+        margin[place] = value
+    return margin
 
 
 def _verdicts(results: CaseResults) -> list[float]:
-    return [np.nan if one.score is None else one.score for one in results.verdicts()]
+    return [np.nan if one.margin is None else one.margin for one in results.verdicts()]
 
 
 def make_truth(problem: Problem, folder: Path, cases: int | None = None) -> KnownTruth:
@@ -383,9 +382,9 @@ def make_truth(problem: Problem, folder: Path, cases: int | None = None) -> Know
 
 def probes_of(truth: Truth) -> ProbeCases:
     """Return probe cases of a truth: failures, and cases that pass near one that fails."""
-    fails = truth.score < FAILURE_SCORE
+    fails = truth.margin < 0.0
     failing = truth.points[fails]
-    passing = truth.points[~fails & ~np.isnan(truth.score)]
+    passing = truth.points[~fails & ~np.isnan(truth.margin)]
     distance, _ = cKDTree(failing).query(passing)
     near = passing[distance <= radius_for(passing.shape[1])]
     # Evenly over all, which are in random order.

@@ -10,7 +10,6 @@ import numpy as np
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DX_CRASH_M
 
 DESIGN: Final = 12
 """Cases of a level before the first process is fitted: those of the paper."""
@@ -19,7 +18,7 @@ NEAREST: Final = 200
 """Points of the population with the least U, among which a batch is chosen."""
 CERTAIN: Final = 2.0
 """Where U is at least this, the class of a point is wrong with a chance below .023."""
-FAR_M: Final = 60.0
+FAR: Final = 10.0
 """Gaps beyond this one are all the same: safe, and far from the limit."""
 NUGGET: Final = 1e-4
 """Share of the variance that is added to the diagonal, so that near points do no harm."""
@@ -85,8 +84,8 @@ def _rank(mean: FloatArray, deviation: FloatArray, *, certain: bool) -> FloatArr
 
 def _limit_state(history: LevelHistory) -> FloatArray:
     """Return a number that is negative where a case fails, (N,), with a scale of 1."""
-    gap_m = np.minimum(np.nan_to_num(np.abs(history.dx_m), nan=FAR_M), FAR_M)
-    limit_state = np.sqrt(gap_m) - np.sqrt(DX_CRASH_M)
+    gap = np.minimum(np.nan_to_num(np.abs(history.gap), nan=FAR), FAR)
+    limit_state = np.sqrt(gap) - 1.0
     return np.asarray(limit_state / max(float(limit_state.std()), 1e-6), dtype=np.float64)
 
 

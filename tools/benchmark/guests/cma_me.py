@@ -19,12 +19,12 @@ CELL: Final = 0.05
 """Width of a cell of the archive: the radius of the balls whose volume is the coverage."""
 SIGMA0: Final = 0.1
 """First step size, in the unit cube."""
-SAFEST: Final = 0.0
+SAFEST: Final = -1.0
 """Objective of a case without a verdict: no case has less."""
 
 
 class CmaMeSampler(LevelwiseSampler):
-    """Ranks solutions by what they add to an archive; the objective is -score.
+    """Ranks solutions by what they add to an archive; the objective is -margin.
 
     Source: Fontaine et al., "Covariance Matrix Adaptation for the Rapid Illumination of Behavior
     Space" (2020). The measures of the archive are the coordinates of the start, so that it keeps
@@ -71,7 +71,7 @@ class CmaMeSampler(LevelwiseSampler):
         batches: dict[int, list[float]] = {}
         for _, outcome in sorted(self._told.items()):
             if outcome.case.level == level:
-                objective = SAFEST if outcome.score is None else -outcome.score
+                objective = SAFEST if outcome.margin is None else -outcome.margin
                 batches.setdefault(outcome.batch, []).append(objective)
         return batches
 

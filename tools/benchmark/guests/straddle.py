@@ -10,7 +10,6 @@ import numpy as np
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.score import FAILURE_SCORE
 
 if TYPE_CHECKING:
     from botorch.acquisition import AcquisitionFunction
@@ -24,7 +23,7 @@ KAPPA: Final = 1.96
 
 
 class StraddleSampler(LevelwiseSampler):
-    """Chooses where a Gaussian process on the score is uncertain, and near the limit of failing.
+    """Chooses where a Gaussian process on the margin is uncertain, and near the limit of failing.
 
     Source: Bryan et al., "Active Learning for Identifying Function Threshold Boundaries" (2005):
     kappa sigma - |mu - limit|, which is the ambiguity of GP-UCB level sets (Gotovos et al., 2013)
@@ -34,7 +33,7 @@ class StraddleSampler(LevelwiseSampler):
     long length scales, found fewer failures of the VUTs on which this was chosen.
     """
 
-    about = "estimates the level set of the score by the straddle criterion (botorch)"
+    about = "estimates the level set of the margin by the straddle criterion (botorch)"
     colour = "#CC79A7"
 
     def batch_size(self) -> int:
@@ -89,9 +88,9 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
     from botorch.acquisition import AcquisitionFunction
     from torch import Tensor
 
-    mean, deviation = history.score.mean(), max(float(history.score.std()), 1e-6)
-    limit = float((FAILURE_SCORE - mean) / deviation)
-    told = _fitted(history.points, (history.score - mean) / deviation)
+    mean, deviation = history.margin.mean(), max(float(history.margin.std()), 1e-6)
+    limit = float(-mean / deviation)
+    told = _fitted(history.points, (history.margin - mean) / deviation)
 
     # The classes of botorch have no types for the checker.
     class Straddle(AcquisitionFunction):  # type: ignore[misc]
