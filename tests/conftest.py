@@ -18,7 +18,7 @@ from foreign_nets import corridor_of
 from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
 

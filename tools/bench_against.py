@@ -17,8 +17,10 @@ from __future__ import annotations
 
 import argparse
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
@@ -27,17 +29,19 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.against import PairedSearch
-from merge_sumo.campaigns.campaign import conduct, twin_of, twins_of
+from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
+from merge_sumo.campaigns.campaign import twin_of, twins_of
 from merge_sumo.campaigns.plan import resolve, resolve_earlier
+from merge_sumo.campaigns.scheduler import Scheduler, groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import CaseResult, CasesAt, evaluate
+from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.values.case import Case, FloatArray, to_unit
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import radius_for
 
 TRIALS = Path(__file__).parent / "trial_vuts.py"
@@ -108,14 +112,14 @@ class Versions:
         settings = self.pair.settings(cases, seed)
         twins = twins_of(settings, self.new, self.old)
         sampler = make_sampler(settings.sampler, settings.pool, seed, twins)
-        both = PairedSearch(sampler, twins).batches(
-            *(_running(plan) for plan in (self.new, self.old)), cases=cases, batch=None
-        )
+        young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
+        scheduler = Scheduler(sampler, cases, first=young, tell=partial(tell_both, sampler))
+        both = partial(evaluate_both, self.new, self.old, THIS_PROCESS)
         broke = [
-            n.case
-            for new, old in both
-            for (n, _), (o, _) in zip(new, old, strict=True)
-            if n.failed and o.is_tested and not o.failed
+            one.outcome.case
+            for groups in scheduler.run(both, THIS_PROCESS, whole=True)
+            for one in chain.from_iterable(groups)
+            if one.outcome.failed and one.earlier and _passes(one.earlier)
         ]
         return self._points(broke)
 
@@ -127,11 +131,11 @@ class Versions:
         settings = replace(self.pair.settings(cases, seed), against=None)
         twin = twin_of(settings, self.new)
         sampler = make_sampler(settings.sampler, settings.pool, seed, twin)
-        ran = conduct(sampler, _running(self.new), cases, None)
-        failing = [outcome.case for batch in ran for outcome, _ in batch if outcome.failed]
+        ran = chain.from_iterable(groups_here(self.new, sampler, cases))
+        failing = [one.outcome.case for one in ran if one.outcome.failed]
         passes = [
-            result.outcome(place).is_tested and not result.outcome(place).failed
-            for place, result in sorted(evaluate(self.old, failing), key=itemgetter(0))
+            _passes(episode)
+            for _, episode in sorted(evaluate(self.old, failing), key=itemgetter(0))
         ]
         return self._points(case for case, broke in zip(failing, passes, strict=True) if broke)
 
@@ -150,10 +154,8 @@ def _verdicts(results: Any) -> list[bool]:
     return [verdict.failed for verdict in results.verdicts()]
 
 
-def _running(
-    plan: SimulationPlan,
-) -> Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]]:
-    return lambda cases: evaluate(plan, cases)
+def _passes(episode: Episode) -> bool:
+    return episode.outcome.is_tested and not episode.outcome.failed
 
 
 def measured(pair: Pair, arguments: argparse.Namespace) -> dict[str, Any]:

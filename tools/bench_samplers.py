@@ -29,7 +29,7 @@ import math
 import pickle
 import time
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -37,17 +37,17 @@ from typing import Any
 import numpy as np
 from bench_record import add_record_option, append_record
 
-from merge_sumo.campaigns.campaign import conduct
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import CaseResult, run_cases
+from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.studies.truth import DENSE_CASES, Truth, ground_truth
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import Case, Pool, to_unit
+from merge_sumo.values.case import Pool, to_unit
 from merge_sumo.values.fmc import RADIUS, fmc
 from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import LEVELS, US23
@@ -116,16 +116,13 @@ def search(
 
         return wrapper
 
-    def run(cases: Sequence[Case]) -> Iterable[tuple[int, CaseResult]]:
-        return enumerate(run_cases(plan, cases))
-
     sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
     found: list[Any] = []
     curve, ended = {}, 0
-    for ran in conduct(sampler, run, CASES, batch):
-        found += [outcome.case for outcome, _ in ran if outcome.failed]
-        ended += len(ran)
+    for group in groups_here(plan, sampler, CASES, batch):
+        found += [one.outcome.case for one in group if one.outcome.failed]
+        ended += len(group)
         if ended in SHOWN:
             curve[ended] = fmc(to_unit(found, level, scenario=US23))
     points, whole = to_unit(found, level, scenario=US23), fmc(truth.failures)
@@ -187,8 +184,8 @@ def _failures(
     pool = Pool(levels=(level,), scenario=US23)
     sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
     batch = batch or (None if sampler.predictor else BATCH)
-    batches = conduct(sampler, lambda asked: enumerate(run_cases(plan, asked)), cases, batch)
-    failed = [outcome for ran in batches for outcome, _ in ran if outcome.failed]
+    groups = groups_here(plan, sampler, cases, batch)
+    failed = [one.outcome for group in groups for one in group if one.outcome.failed]
     points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
     return points, np.array([outcome.index for outcome in failed], dtype=np.int64)
 
@@ -260,10 +257,10 @@ def print_cost_per_case() -> dict[str, dict[int, float]]:
     order, rng = np.random.default_rng(1).permutation(len(cases)), np.random.default_rng(2)
     outcomes, motions = [], {}
     for index, result in enumerate(run_cases(plan, [cases[place] for place in order.tolist()])):
-        gap_m = np.nan if result.measures.dx_m is None else result.measures.dx_m
+        gap_m = np.nan if result.outcome.measures.dx_m is None else result.outcome.measures.dx_m
         chance = 0.9 if abs(gap_m) < US23.dx_crash_m else 0.1
         told = Prediction.of(gap_m + rng.normal(0.0, 0.5, (2, 4)), chance, chance, chance)
-        outcomes.append(result.outcome(index, index // BATCH, told))
+        outcomes.append(result.at(index, index // BATCH, told).outcome)
         motions[index] = result.trajectory.motion
     figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the twin": {}}
     for size in sizes:

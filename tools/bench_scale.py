@@ -46,18 +46,20 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.campaigns.campaign import conduct, run_campaign
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.prefetch import Prefetch, proposals
+from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
+from merge_sumo.campaigns.scheduler import Scheduler
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_outcomes, to_line
-from merge_sumo.engine.evaluate import CaseResult, CaseResults, CasesAt, evaluate, run_cases
+from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate, run_cases
 from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.studies.truth import _margins, ground_truth
 from merge_sumo.system.workers import LocalProcesses, Workers
 from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Outcome
@@ -91,7 +93,7 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def margins_and_memory(results: CaseResults) -> list[tuple[Any, ...]]:
+def margins_and_memory(results: Episodes) -> list[tuple[Any, ...]]:
     """Return what `truth` keeps of cases, which process ran them, and how large it is."""
     return [(margin, os.getpid(), memory_mb()) for margin, _, _ in _margins(results)]
 
@@ -287,13 +289,13 @@ def cases_in_flight() -> dict[str, list[float]]:
 class Served:
     """Gives what became of cases as it comes from a worker process, with no work done for it."""
 
-    def __init__(self, ran: Sequence[CaseResult]) -> None:
+    def __init__(self, ran: Sequence[Episode]) -> None:
         """Serve what became of `MAX_CHUNK` cases."""
         self._sent = pickle.dumps(list(ran))
 
     def chunks(
         self, chunks: Iterable[Sequence[Case]]
-    ) -> Generator[tuple[int, Sequence[CaseResult]], None, None]:
+    ) -> Generator[tuple[int, Sequence[Episode]], None, None]:
         """Yield (place of the first case, what became of the chunk)."""
         first = 0
         for chunk in chunks:
@@ -306,15 +308,14 @@ def parent(cases: int) -> float:
     plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
     pool = Pool(levels=(0,), scenario=US23)
     served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
-    sampler, scout = (make_sampler("uniform", pool, 0) for _ in range(2))
+    scheduler = Scheduler(make_sampler("uniform", pool, 0), cases, batch=BATCH)
     with (
         tempfile.TemporaryDirectory() as scratch,
         Journal.create(Path(scratch) / "run", {}) as journal,
-        Prefetch(served.chunks, 1, proposals(scout, (), cases, BATCH)) as ahead,
     ):
         start = time.perf_counter()
-        for batches in ahead.together(conduct(sampler, ahead.run, cases, BATCH)):
-            journal.append(*batches)
+        for groups in scheduler.run(served.chunks, THIS_PROCESS):
+            journal.append(*groups)
         return cases / (time.perf_counter() - start)
 
 

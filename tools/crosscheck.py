@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan

@@ -25,12 +25,12 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns import store
+from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.settings import settings_of as settings_in
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
@@ -99,7 +99,7 @@ def kill_at_sync(nth: int) -> None:
 
 def kill_at_write(nth: int, share: float) -> None:
     """Have this process killed when a share of its nth write is done."""
-    write_all, count = store._write_all, 0
+    write_all, count = journal._write_all, 0
 
     def counting(file: FileIO, content: bytes) -> None:
         nonlocal count
@@ -109,7 +109,7 @@ def kill_at_write(nth: int, share: float) -> None:
             kill_me()
         write_all(file, content)
 
-    store._write_all = counting
+    journal._write_all = counting
 
 
 def workers_of(pid: int) -> list[int]:

@@ -58,8 +58,9 @@ from merge_sumo.campaigns.campaign import (
     resume_campaign,
     run_campaign,
 )
-from merge_sumo.campaigns.one_case import ONE, Ended, case_of, run_one
+from merge_sumo.campaigns.one_case import ONE, case_of, run_one
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
     kind_of_merge,
@@ -69,7 +70,6 @@ from merge_sumo.campaigns.scenario_suggestion import (
     unseen,
 )
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.campaigns.store import SETTINGS, Run, read_settings
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_in, policies_of, read_manifest
 from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
@@ -127,6 +127,7 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers, workers_or_cores
 from merge_sumo.values.chance import MOST_RUNS
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import Car, Seen
@@ -401,7 +402,7 @@ def run(
     if recorded is not None:
         notice_changes(_opened(recorded[0]).run, plan)
 
-    def ended(result: Ended) -> None:
+    def ended(result: Episode) -> None:
         if out is not None:
             write_scenario(Path(out), plan.road, result.outcome, result.trajectory)
         if on_end is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Literal, TypedDict
 
-from merge_sumo.campaigns.campaign import OnCase
+from merge_sumo.campaigns.scheduler import OnCase
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import SimulationPlan

@@ -24,13 +24,11 @@ from merge_sumo.analysis.verdict import (
     parse_gates,
     shortened,
 )
-from merge_sumo.campaigns.against import AGAINST
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.one_case import Ended
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
+from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.stopping import LITTLE, WINDOW
-from merge_sumo.campaigns.store import NAME_CHARACTERS, Run, failures
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
@@ -39,6 +37,7 @@ from merge_sumo.studies.truth import REAL_REGION, Truth
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.criterion import Criterion
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23, level_name
 from merge_sumo.values.score import Measures, Outcome
@@ -278,8 +277,8 @@ class CampaignRun(Result):
 class CaseRun(Result):
     """One case that was run."""
 
-    def __init__(self, ended: Ended) -> None:
-        self.outcome, self.trajectory = ended.outcome, ended.trajectory
+    def __init__(self, episode: Episode) -> None:
+        self.outcome, self.trajectory = episode.outcome, episode.trajectory
 
     @property
     def measures(self) -> Measures:

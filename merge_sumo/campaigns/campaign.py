@@ -1,23 +1,23 @@
-"""A campaign: a sampler proposes cases, the simulator runs them, the journal keeps them."""
+"""A campaign: a sampler proposes cases, the engine runs them, the journal keeps them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.against import AGAINST, PairedSearch, by_batch
-from merge_sumo.campaigns.in_flight import Flight, by_rounds, conduct_in_flight
+from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
+from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve_earlier
-from merge_sumo.campaigns.prefetch import ChunkResults, Prefetch, RunChunks, proposals
 from merge_sumo.campaigns.repeats import repeat, write_repeats
+from merge_sumo.campaigns.run import AGAINST, FILES, RAN_AGAIN, Run, spread_failures
+from merge_sumo.campaigns.scheduler import OnCase, Scheduler
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
-from merge_sumo.campaigns.store import FILES, RAN_AGAIN, Batch, Journal, Run, spread_failures
 from merge_sumo.engine.evaluate import (
-    CaseResult,
     evaluate,
     evaluate_anew,
     evaluate_chunks,
@@ -29,71 +29,64 @@ from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import TakenError, check_new, check_own
-from merge_sumo.system.hashing import Files, files_now
+from merge_sumo.system.hashing import files_now
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import Case, FloatArray
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.output import LOG
 
 EXPORTED_FAILURES: Final = 10
 SCENARIOS: Final = "scenarios"
 
-OnCase = Callable[[Outcome], None]
-"""Called with every case as it ends, in the order in which cases end."""
-RunCases = Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]]
-"""Runs cases; gives (place, result) in any order."""
 
+@dataclass(slots=True)
+class _Version:
+    """A version of the VUT in a campaign: what runs, and the folder that keeps it.
 
-def conduct(
-    sampler: Sampler,
-    run: RunCases,
-    cases: int,
-    batch: int | None,
-    on_case: OnCase | None = None,
-    history: Sequence[Outcome] = (),
-    motions: Mapping[int, FloatArray] | None = None,
-    stop: Callable[[Sequence[Outcome]], bool] | None = None,
-) -> Iterator[list[tuple[Outcome, Trajectory]]]:
-    """Ask, run and tell, batch by batch; yield the cases of each batch in order.
-
-    Args:
-        sampler: proposes the cases, and is told the outcomes.
-        run: runs them.
-        cases: number of cases after which the search ends.
-        batch: cases of a batch; by default as many as the sampler wants.
-        on_case: called with every outcome.
-        history: outcomes of whole batches that ran before; as a sampler is pure in what it was
-            told, it goes on as if it had just run them.
-        motions: their motions, (T + 1, A, 3), by index, for a sampler that uses predictions.
-        stop: says of the outcomes so far whether the search is over.
+    Attributes:
+        folder: the folder.
+        settings: what to run.
+        plan: how its cases run.
+        journal: writes the folder, once that is open.
+        before: what the folder had; None for a new one.
+        outcomes: of all cases that have run.
     """
-    sampler.tell(history, motions)
-    number, first = (history[-1].batch + 1 if history else 0), len(history)
-    while first < cases and not (stop is not None and stop(sampler.observed())):
-        ran: list[tuple[Outcome, Trajectory]] = []
-        for place, result in run(sampler.ask(min(batch or sampler.batch_size(), cases - first))):
-            outcome = result.outcome(first + place, number, sampler.prediction(place))
-            ran.append((outcome, result.trajectory))
-            if on_case is not None:
-                on_case(outcome)
-        ran.sort(key=lambda pair: pair[0].index)
-        sampler.tell([o for o, _ in ran], {o.index: t.motion for o, t in ran})
-        yield ran
-        number, first = number + 1, first + len(ran)
+
+    folder: Path
+    settings: CampaignSettings
+    plan: SimulationPlan
+    journal: Journal = field(init=False)
+    before: Run | None = None
+    outcomes: list[Outcome] = field(default_factory=list)
+
+    def history(self, *, motion: bool) -> list[Episode]:
+        """Return the cases that ran before; see `Run.episodes`."""
+        return [] if self.before is None else self.before.episodes(motion=motion)
+
+    def append(self, groups: Sequence[Sequence[Episode]]) -> None:
+        """Write groups."""
+        self.journal.append(*groups)
+        self.outcomes += [episode.outcome for group in groups for episode in group]
+
+    def ended(self, workers: Workers) -> Run:
+        """Run some of all cases a second time; return the campaign."""
+        done = Run(self.folder, self.outcomes)
+        again = partial(evaluate, self.plan, workers=workers)
+        if repeats := repeat(done, self.settings, again, partial(evaluate_anew, self.plan)):
+            write_repeats(done, repeats)
+        return done
 
 
 def run_campaign(
     settings: CampaignSettings,
     plan: SimulationPlan,
     folder: Path,
-    on_case: OnCase | None = None,
+    on_case: OnCase = lambda _: None,
     *,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
@@ -115,23 +108,21 @@ def run_campaign(
     """
     check_new(folder)
     check_new(folder / SCENARIOS / case_name(settings.cases))
-    both = _with_earlier(folder, settings, plan, workers)
-    with workers_or_here(workers) as available, ExitStack() as journals:
-        for _, of_version, planned in both:
-            open_simulators(planned, available, first=of_version.in_flight is not None)
-        opened = []
-        for at, of_version, planned in both:
-            record = record_of(of_version, planned)
-            journal = journals.enter_context(Journal.create(at, record))
-            opened.append(_Open(of_version, planned, record, journal))
-        return _run(*opened, workers=available, on_case=on_case, check=check, begin=begin)
+    versions = _versions(folder, settings, plan, workers)
+    with workers_or_here(workers) as available, ExitStack() as opened:
+        for one in versions:
+            open_simulators(one.plan, available, first=settings.in_flight is not None)
+        for one in versions:
+            journal = Journal.create(one.folder, record_of(one.settings, one.plan))
+            one.journal = opened.enter_context(journal)
+        return _run(*versions, workers=available, on_case=on_case, check=check, begin=begin)
 
 
 def resume_campaign(
     settings: CampaignSettings,
     plan: SimulationPlan,
     folder: Path,
-    on_case: OnCase | None = None,
+    on_case: OnCase = lambda _: None,
     *,
     on_before: OnCase | None = None,
     workers: Workers | None = None,
@@ -147,7 +138,7 @@ def resume_campaign(
 
     Args:
         settings: those of the folder, and what a person named again (`settings_of`).
-        plan: as of `run_campaign`, and so are `on_case`, `workers` and `check`.
+        plan: as of `run_campaign`, and so are `on_case`, `workers`, `check` and `begin`.
         folder: where the campaign is.
         on_case: called with the cases that ran before, too, without `on_before`.
         on_before: called with the outcomes of cases that ran before.
@@ -157,53 +148,60 @@ def resume_campaign(
         warn: called with a sentence on what was dropped.
     """
     check_own(folder / SCENARIOS, folder / AGAINST)
-    with workers_or_here(workers) as available, ExitStack() as journals:
-        opened: list[_Open] = []
-        rewrites = []
-        for at, of_version, planned in _with_earlier(folder, settings, plan, workers):
-            if opened and not opened[0].history:
+    versions = _versions(folder, settings, plan, workers)
+    campaign = versions[0]
+    with workers_or_here(workers) as available, ExitStack() as opened:
+        for one in versions:
+            if one is not campaign and not campaign.outcomes:
                 # It may have been stopped before its second folder was whole.
-                with suppress(TakenError), Journal.create(at, record_of(of_version, planned)):
+                record = record_of(one.settings, one.plan)
+                with suppress(TakenError), Journal.create(one.folder, record):
                     pass
-            journal, before, dropped = Journal.reopen(at)
-            journals.enter_context(journal)
-            record, rewrite = _compared(before, of_version, planned)
-            opened.append(_Open(of_version, planned, record, journal, before))
-            rewrites.append(rewrite)
+            journal, one.before, dropped = Journal.reopen(one.folder)
+            one.journal, one.outcomes = opened.enter_context(journal), one.before.outcomes
             if dropped:
-                warn(f"{at}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-        for earlier in opened[1:]:
-            earlier.keep_cases_of(opened[0])
-        for one, rewrite in zip(opened, rewrites, strict=True):
-            open_simulators(one.plan, available, first=one.settings.in_flight is not None)
-            one.go_on(rewrite=rewrite)
-        if (on_outcome := on_before or on_case) is not None:
-            for outcome in opened[0].history:
-                on_outcome(outcome)
-        return _run(*opened, workers=available, on_case=on_case, check=check, begin=begin)
+                warn(
+                    f"{one.folder}: dropped {dropped} outcomes of a batch that was stopped; it "
+                    "runs again"
+                )
+        records = [_compared(one, one.before) for one in versions if one.before is not None]
+        for one in versions[1:]:
+            _keep_cases_of(campaign, one)
+        for one, rewritten in zip(versions, records, strict=True):
+            open_simulators(one.plan, available, first=settings.in_flight is not None)
+            if rewritten is not None:
+                one.journal.rewrite_settings(rewritten)
+        for outcome in campaign.outcomes:
+            (on_before or on_case)(outcome)
+        return _run(*versions, workers=available, on_case=on_case, check=check, begin=begin)
 
 
-def _with_earlier(
+def _versions(
     folder: Path, settings: CampaignSettings, plan: SimulationPlan, workers: Workers | None
-) -> list[tuple[Path, CampaignSettings, SimulationPlan]]:
-    """Return folder, settings and plan of a campaign, then of the version that it is against."""
-    both = [(folder, settings, plan)]
+) -> list[_Version]:
+    """Return the version of a campaign, then the one that it is against, if any."""
+    versions = [_Version(folder, settings, plan)]
     earlier = resolve_earlier(settings, plan)
     if earlier is not None:
-        both.append((folder / AGAINST, settings.earlier, earlier))
-    return [(at, of, _plan_in(at, of, planned, workers)) for at, of, planned in both]
+        versions.append(_Version(folder / AGAINST, settings.earlier, earlier))
+    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
+    if settings.in_flight is not None:
+        at_once = math.ceil(settings.in_flight / (1 if workers is None else workers.count))
+    for one in versions:
+        few = one.plan.for_cases(at_once or settings.cases)
+        one.plan = few.with_log(one.folder.resolve() / LOG)
+    return versions
 
 
-def _compared(
-    before: Run, settings: CampaignSettings, plan: SimulationPlan
-) -> tuple[dict[str, Any], bool]:
-    """Return the record of a campaign that goes on, and whether to write it.
+def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
+    """Return the record of a campaign that goes on, where it is to be written anew.
 
     Raises `UserError` where something differs that decides outcomes: cases of two controllers make
     no campaign.
     """
+    settings = version.settings
     recorded = {k: v for k, v in before.settings.items() if k != RAN_AGAIN}
-    record = record_of(settings, plan)
+    record = record_of(settings, version.plan)
     # Where policies are decides nothing: what is in them does.
     moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
     recorded["policies"] = record["policies"]
@@ -228,102 +226,51 @@ def _compared(
             f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
             "same, or begin a new campaign"
         )
-    return record, moved or grown
+    if before.ran_again:
+        record[RAN_AGAIN] = before.ran_again
+    return record if moved or grown else None
 
 
-class _Open:
-    """A campaign whose folder is open: what runs, and what the folder has.
+def _keep_cases_of(campaign: _Version, earlier: _Version) -> None:
+    """Drop the cases of the earlier version that a campaign does not have.
 
-    Attributes:
-        settings: what to run.
-        plan: how its cases run.
-        journal: writes the folder.
-        before: what the folder had; None for a new one.
-        history: the outcomes of that.
+    Raises `UserError` where cases are missing.
     """
-
-    def __init__(
-        self,
-        settings: CampaignSettings,
-        plan: SimulationPlan,
-        record: dict[str, Any],
-        journal: Journal,
-        before: Run | None = None,
-    ) -> None:
-        """Take settings, plan, what `campaign.json` holds, and the folder."""
-        self.settings, self.plan, self.journal, self.before = settings, plan, journal, before
-        self.history: list[Outcome] = [] if before is None else before.outcomes
-        self._record, self._noted = record, _Noted(record)
-
-    def go_on(self, *, rewrite: bool) -> None:
-        """Write the record of a campaign that goes on, where it is another; see `_compared`."""
-        before, record = self.before, self._record
-        assert before is not None, "it goes on"  # noqa: S101
-        if before.ran_again:
-            record[RAN_AGAIN] = before.ran_again
-        if rewrite:
-            self.journal.rewrite_settings(record)
-        self._noted = _Noted(record)
-
-    def run_chunks(self, workers: Workers) -> RunChunks:
-        """Return what runs chunks of cases, and notes what the results say."""
-        return self._noted.noting(partial(evaluate_chunks, self.plan, workers=workers))
-
-    def append(self, *batches: Batch) -> None:
-        """Write batches, and what their results said."""
-        self.journal.append(*batches)
-        if self._noted.update(self._record):
-            self.journal.rewrite_settings(self._record)
-
-    def recorded(self) -> Batch:
-        """Return the outcomes before with their trajectories."""
-        before = self.before
-        return [] if before is None else [(o, before.trajectory(o.index)) for o in self.history]
-
-    def keep_cases_of(self, other: _Open) -> None:
-        """Drop the cases that another campaign of the same cases does not have.
-
-        Raises `UserError` where cases are missing.
-        """
-        count = len(other.history)
-        if self.before is None or [o.case for o in self.history[:count]] != [
-            o.case for o in other.history
-        ]:
-            raise UserError(
-                f"{self.journal.folder} has other cases than {other.journal.folder}: take both "
-                "from a copy"
-            )
-        if len(self.history) > count:
-            self.journal.keep(self.before, count)
-
-    def ended(self, outcomes: list[Outcome], workers: Workers) -> Run:
-        """Run some of all cases a second time; return the campaign."""
-        done = Run(self.journal.folder, outcomes)
-        run_cases = partial(evaluate, self.plan, workers=workers)
-        repeats = repeat(done, self.settings, run_cases, partial(evaluate_anew, self.plan))
-        if repeats:
-            write_repeats(done, repeats)
-        return done
+    count = len(campaign.outcomes)
+    if [o.case for o in earlier.outcomes[:count]] != [o.case for o in campaign.outcomes]:
+        raise UserError(
+            f"{earlier.folder} has other cases than {campaign.folder}: take both from a copy"
+        )
+    if earlier.before is not None and len(earlier.outcomes) > count:
+        earlier.journal.keep(earlier.before, count)
 
 
 def _run(
-    campaign: _Open,
-    against: _Open | None = None,
+    campaign: _Version,
+    earlier: _Version | None = None,
     *,
     workers: Workers,
-    on_case: OnCase | None,
+    on_case: OnCase,
     check: Callable[[], None],
     begin: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
-    ended = list(campaign.history)
-    with closing(_search(campaign, against, workers, on_case)) as search:
+    scheduler = _scheduler(campaign, earlier, on_case)
+    if earlier is None:
+        run = scheduler.run(partial(evaluate_chunks, campaign.plan, workers=workers), workers)
+    else:
+        both = partial(evaluate_both, campaign.plan, earlier.plan, workers)
+        run = scheduler.run(both, workers, whole=True)
+    with closing(run):
         begin()
-        for together in search:
-            campaign.append(*together)
-            ended += [outcome for batch in together for outcome, _ in batch]
+        for groups in run:
+            if earlier is not None:
+                earlier.append([[e.earlier for e in group if e.earlier] for group in groups])
+            campaign.append(groups)
             check()
-    done = campaign.ended(ended, workers)
+    if earlier is not None:
+        earlier.ended(workers)
+    done = campaign.ended(workers)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         folder = done.folder / SCENARIOS / case_name(outcome.index)
         with suppress(TakenError):  # whatever it is, the campaign has ended
@@ -331,112 +278,29 @@ def _run(
     return done
 
 
-def _search(
-    campaign: _Open, against: _Open | None, workers: Workers, on_case: OnCase | None
-) -> Generator[list[Batch], None, None]:
-    """Return what runs the missing cases; it yields batches that ended together."""
-    if against is not None:
-        return _against(campaign, against, workers, on_case)
-    settings, plan, history = campaign.settings, campaign.plan, campaign.history
-    sampler = settings.with_repeats(settings.new_sampler(twin_of(settings, plan)))
-    motions = None
-    if campaign.before is not None and sampler.uses_predictions:
-        motions = {o.index: t.motion for o, t in campaign.recorded()}
-    run_all = campaign.run_chunks(workers)
-    if settings.in_flight is None:
-        return _in_batches(settings, sampler, workers, run_all, on_case, history, motions)
-    flight = Flight(
-        *(sampler, settings.cases, settings.in_flight, history, motions),
-        by_rounds(settings.stopping_rule(), settings.in_flight),
-    )
-    return conduct_in_flight(flight, run_all, workers.chunk_size, on_case)
-
-
-def _against(
-    campaign: _Open, against: _Open, workers: Workers, on_case: OnCase | None
-) -> Generator[list[Batch], None, None]:
-    """Run the missing cases with both versions; yield the batches of the new one.
-
-    A batch of the earlier version is written before.
-    """
-    settings = campaign.settings
-    twins = twins_of(settings, campaign.plan, against.plan)
-    sampler = settings.new_sampler(twins)
-    search = PairedSearch(
-        sampler, twins if sampler.uses_predictions else None, settings.stopping_rule()
-    )
-    search.tell(campaign.recorded(), against.recorded())
-    both = search.batches(
-        *(by_batch(one.run_chunks(workers), workers.chunk_size) for one in (campaign, against)),
-        cases=settings.cases,
+def _scheduler(campaign: _Version, earlier: _Version | None, on_case: OnCase) -> Scheduler:
+    """Return the scheduler of a campaign, which knows what ran before."""
+    settings, twin = campaign.settings, twin_of(campaign.settings, campaign.plan)
+    predictor = twin if earlier is None else twins_of(settings, campaign.plan, earlier.plan)
+    sampler = settings.with_repeats(settings.new_sampler(predictor))
+    motion = sampler.uses_predictions
+    history = campaign.history(motion=motion)
+    if earlier is not None:
+        old = earlier.history(motion=motion)
+        pairs = zip(history, old, strict=True)
+        history = [replace(new, earlier=before) for new, before in pairs]
+    young = FIRST_BATCH * len(settings.levels) if motion and earlier is not None else None
+    return Scheduler(
+        sampler,
+        settings.cases,
         batch=settings.batch,
-        last=campaign.history[-1] if campaign.history else None,
+        first=young,
+        in_flight=settings.in_flight,
+        stop=settings.stopping_rule(),
+        tell=None if earlier is None else partial(tell_both, sampler),
         on_case=on_case,
+        history=history,
     )
-    ran = list(against.history)
-    for of_new, of_old in both:
-        against.append(of_old)
-        ran += [outcome for outcome, _ in of_old]
-        yield [of_new]
-    against.ended(ran, workers)
-
-
-def _in_batches(
-    settings: CampaignSettings,
-    sampler: Sampler,
-    workers: Workers,
-    run_chunks: RunChunks,
-    on_case: OnCase | None,
-    history: Sequence[Outcome],
-    motions: Mapping[int, FloatArray] | None,
-) -> Generator[list[Batch], None, None]:
-    """Run batch by batch what is missing of a campaign; yield batches that ended together."""
-    proposed = proposals(
-        settings.with_repeats(settings.new_sampler()),
-        *(history, settings.cases, settings.batch),
-    )
-    missing = settings.cases - len(history)
-    with Prefetch(run_chunks, workers.count, proposed, missing, workers.chunk_size) as prefetch:
-        batches = conduct(
-            *(sampler, prefetch.run, settings.cases, settings.batch),
-            *(on_case, history, motions, settings.stopping_rule()),
-        )
-        yield from prefetch.together(batches)
-
-
-class _Noted:
-    """What the record of a campaign says of its cases: files that were loaded, runs again."""
-
-    def __init__(self, record: Mapping[str, Any]) -> None:
-        self._files: dict[str, Files] = {name: dict(record[name] or {}) for name in FILES}
-        self._ran_again = record.get(RAN_AGAIN, 0)
-
-    def noting(self, run_chunks: RunChunks) -> RunChunks:
-        """Return what runs chunks as `run_chunks` does, and notes what the results say."""
-
-        def run(chunks: Iterable[Sequence[Case]]) -> ChunkResults:
-            with closing(run_chunks(chunks)) as ran:
-                for first, results in ran:
-                    for result in results:
-                        self._note(result)
-                    yield first, results
-
-        return run
-
-    def _note(self, result: CaseResult) -> None:
-        self._ran_again += result.again
-        for name, loaded in zip(FILES, (result.files, result.pov_files), strict=True):
-            self._files[name] = loaded | self._files[name]  # what was known stays
-
-    def update(self, record: dict[str, Any]) -> bool:
-        """Bring a record up to date; return whether it was not."""
-        noted: dict[str, object] = {name: known or None for name, known in self._files.items()}
-        if self._ran_again:
-            noted[RAN_AGAIN] = self._ran_again
-        if noted == {name: record.get(name) for name in noted}:
-            return False
-        record |= noted
-        return True
 
 
 def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
@@ -448,16 +312,6 @@ def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
 def twins_of(settings: CampaignSettings, new: SimulationPlan, old: SimulationPlan) -> TwinPair:
     """Return the twins of both versions of a campaign against an earlier one."""
     return TwinPair(twin_of(settings, new), twin_of(settings, old))
-
-
-def _plan_in(
-    folder: Path, settings: CampaignSettings, plan: SimulationPlan, workers: Workers | None
-) -> SimulationPlan:
-    """Return the plan of a campaign in its folder, where the log of its drivers is."""
-    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
-    if settings.in_flight is not None:
-        at_once = math.ceil(settings.in_flight / (1 if workers is None else workers.count))
-    return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
 
 
 def case_name(index: int) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
 from typing import Any, Final
 
 from merge_sumo.engine.plan import SimulationPlan
@@ -14,9 +13,8 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.live import Window
 from merge_sumo.sumo.replay_folder import case_line, verdict_line
 from merge_sumo.values.case import Case
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import Scenario, level_name
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
 
 ONE: Final[dict[str, Any]] = {
     "cases": 1,
@@ -35,14 +33,6 @@ OPTIONS: Final = {
     "headway_behind_s": "--headway-behind",
 }
 """Options for coordinates of a case, by the names of their fields; --at sets any of them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ended:
-    """A case that was run: its outcome, and what happened."""
-
-    outcome: Outcome
-    trajectory: Trajectory
 
 
 def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
@@ -89,8 +79,8 @@ def run_one(
     case: Case,
     *,
     live: bool = False,
-    on_end: Callable[[Ended], None] = lambda _: None,
-) -> Ended:
+    on_end: Callable[[Episode], None] = lambda _: None,
+) -> Episode:
     """Run one case in SUMO; its outcome is that of the same case in a campaign.
 
     With `live` sumo-gui shows it in real time until a person closes the window; `on_end` is told
@@ -102,12 +92,12 @@ def run_one(
     ):
         if window is not None:
             window.write(case_line(case))
-        episodes = simulator.run([case])
-        _, trajectory = next(episodes)
+        running = simulator.run([case])
+        _, trajectory = next(running)
         lines = centre_lines(plan.road)
-        ended = Ended(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
-        on_end(ended)
+        episode = Episode(plan.criterion.outcome(0, 0, trajectory, lines), trajectory)
+        on_end(episode)
         if window is not None:
-            window.write(verdict_line(ended.outcome))
+            window.write(verdict_line(episode.outcome))
             window.wait()  # before the corridor is made ready for the next case
-    return ended
+    return episode

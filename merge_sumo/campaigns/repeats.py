@@ -21,12 +21,12 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
-from merge_sumo.engine.evaluate import CaseResult
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, replaced, to_json
 from merge_sumo.values.case import Case
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
@@ -70,8 +70,8 @@ class Repeat(Record, frozen=True, omit_defaults=True):
 def repeat(
     run: Run,
     settings: CampaignSettings,
-    run_cases: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
-    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
+    run_cases: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
+    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
 ) -> list[Repeat]:
     """Run some cases of a campaign again; return what became of them, in the order of the cases.
 
@@ -83,7 +83,7 @@ def repeat(
     again = [outcome for outcome in chosen if outcome.index in recorded]
     found = []
     for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
-        if not ran.measures.end.is_error:  # of a slow machine, perhaps
+        if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
             found.append(compared(again[place], recorded[again[place].index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
         drawn = _drawn([outcome.case for outcome in again], run_anew)
@@ -94,7 +94,7 @@ def repeat(
 
 def _drawn(
     cases: Sequence[Case],
-    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, CaseResult]]],
+    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
 ) -> list[bool]:
     """Return which of some cases differ between two new processes that run the same cases."""
     first, second = (dict(run_anew(cases)) for _ in range(2))
@@ -132,10 +132,10 @@ def spread_places(cases: int, count: int) -> list[int]:
     return [*others, *reversed(range(first))]
 
 
-def compared(outcome: Outcome, recorded: Trajectory, ran: CaseResult) -> Repeat:
+def compared(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
     """Return how the second run of a case compares with the recorded one."""
     differs_from_s, first = _difference(recorded, ran.trajectory)
-    now = ran.outcome(outcome.index, outcome.batch)
+    now = ran.outcome
     end = now.measures.end
     other = (end, now.failed) != (outcome.measures.end, outcome.failed)
     return Repeat(outcome.index, differs_from_s, first, end, now.failed, other)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from threading import RLock
 from typing import Any, Final, TypeVar, overload
@@ -21,7 +21,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.system.blame import MAX_DEATHS
 from merge_sumo.system.hashing import Files, hashed
-from merge_sumo.system.pickling import quickly_pickled
 from merge_sumo.system.workers import (
     AnyWorkers,
     InProcess,
@@ -30,50 +29,21 @@ from merge_sumo.system.workers import (
     when_worker_ends,
 )
 from merge_sumo.values.case import Case, FloatArray, Pool
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Measures, Outcome, Verdict, measure_all
+from merge_sumo.values.episode import Episode
+from merge_sumo.values.score import Outcome, Verdict, measure_all
 from merge_sumo.values.trajectory import End, Trajectory
 
 R = TypeVar("R")
 
 
-@quickly_pickled
-@dataclass(frozen=True, slots=True)
-class CaseResult:
-    """What became of one case, and the files that had decided on it by then.
-
-    Attributes:
-        measures: verdict and measures.
-        trajectory: what happened.
-        files: those of the user's that the VUT has loaded, with their hashes.
-        pov_files: those that a POV of the user's own has loaded.
-        margin: that of the plan's criterion; None where it needs none.
-        again: whether it ran again, because a process had died or had been stopped.
-        in_sumo: whether SUMO ran it; the engine of the plan may be another.
-    """
-
-    measures: Measures
-    trajectory: Trajectory
-    files: Files = field(default_factory=dict)
-    pov_files: Files = field(default_factory=dict)
-    margin: float | None = None
-    again: bool = False
-    in_sumo: bool = True
-
-    def outcome(self, index: int, batch: int = 0, prediction: Prediction | None = None) -> Outcome:
-        """Return the outcome of the case with its place in a campaign."""
-        case, margin = self.trajectory.case, self.margin
-        return Outcome(index, batch, case, self.measures, prediction, margin)
-
-
-class CaseResults(Sequence[CaseResult]):
-    """The results of a chunk of cases; they are measured when one of them is asked for.
+class Episodes(Sequence[Episode]):
+    """The episodes of a chunk of cases; they are measured when one of them is asked for.
 
     Attributes:
         trajectories: what happened in each case.
-        files: files of the VUT, as of a `CaseResult`.
+        files: files of the VUT, as of an `Episode`.
         pov_files: those of a POV.
-        in_sumo: places of the cases that SUMO ran.
+        in_sumo: places of the cases that SUMO ran; the engine of the plan may be another.
     """
 
     def __init__(
@@ -97,29 +67,26 @@ class CaseResults(Sequence[CaseResult]):
         return [criterion.verdict(trajectory, lines) for trajectory in self.trajectories]
 
     @cached_property
-    def _measured(self) -> list[CaseResult]:
-        criterion = self._plan.criterion
+    def _measured(self) -> list[Episode]:
+        margin = self._plan.criterion.margin
         measured = measure_all(self.trajectories, centre_lines(self._plan.road))
         return [
-            CaseResult(
-                *(measures, trajectory, self.files, self.pov_files),
-                criterion.margin(trajectory, measures),
+            Episode(
+                Outcome(place, 0, run.case, measures, margin=margin(run, measures)),
+                *(run, self.files, self.pov_files),
                 again=place in self._ran_again,
-                in_sumo=place in self.in_sumo,
             )
-            for place, (measures, trajectory) in enumerate(
-                zip(measured, self.trajectories, strict=True)
-            )
+            for place, (run, measures) in enumerate(zip(self.trajectories, measured, strict=True))
         ]
 
     def __len__(self) -> int:
         return len(self.trajectories)
 
     @overload
-    def __getitem__(self, place: int) -> CaseResult: ...
+    def __getitem__(self, place: int) -> Episode: ...
     @overload
-    def __getitem__(self, place: slice) -> list[CaseResult]: ...
-    def __getitem__(self, place: int | slice) -> CaseResult | list[CaseResult]:
+    def __getitem__(self, place: slice) -> list[Episode]: ...
+    def __getitem__(self, place: int | slice) -> Episode | list[Episode]:
         return self._measured[place]
 
 
@@ -147,14 +114,14 @@ class CasesAt(Sequence[Case]):
         return iter(cases if self.draw == 0 else [replace(case, draw=self.draw) for case in cases])
 
 
-Keep = Callable[[CaseResults], Sequence[R]]
+Keep = Callable[[Episodes], Sequence[R]]
 """What is kept of the results of a chunk; it runs where they are, and only that travels."""
 
 
 @overload
 def evaluate(
     plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None = None
-) -> Generator[tuple[int, CaseResult], None, None]: ...
+) -> Generator[tuple[int, Episode], None, None]: ...
 @overload
 def evaluate(
     plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None, keep: Keep[R]
@@ -183,7 +150,7 @@ def evaluate(
             yield from enumerate(results, start=first)
 
 
-def evaluate_anew(plan: SimulationPlan, cases: Sequence[Case]) -> list[tuple[int, CaseResult]]:
+def evaluate_anew(plan: SimulationPlan, cases: Sequence[Case]) -> list[tuple[int, Episode]]:
     """Run cases in this process, with drivers that drove nothing before; return as `evaluate`."""
     close_simulator()
     try:
@@ -198,12 +165,13 @@ def evaluate_chunks(
     workers: Workers,
     keep: Keep[Any] | None = None,
 ) -> Generator[tuple[int, Sequence[Any]], None, None]:
-    """Run chunks of cases as workers want them; yield (place of the first case, results)."""
-    if keep is None:
-        lost = partial(_lost_result, plan)
-        return workers.run_chunks(partial(_run_all, plan), chunks, lost, ran_again=_again)
+    """Run chunks of cases as workers want them; yield (place of the first case, what is kept)."""
+    kept = keep or list
     return workers.run_chunks(
-        partial(_run_and_keep, plan, keep), chunks, lambda case: keep(_lost(plan, case))[0]
+        partial(_run_and_keep, plan, kept),
+        chunks,
+        lambda case: kept(_lost(plan, case))[0],
+        ran_again=None if keep else _again,
     )
 
 
@@ -245,13 +213,13 @@ THIS_PROCESS: Final = Workers(InProcess, 1)
 """This process, which keeps its simulator between evaluations: for a loop within a worker."""
 
 
-def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> CaseResults:
+def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> Episodes:
     """Run cases in the simulator that this process keeps; return the results in their order."""
     cases = list(cases)
     with opened_simulator(plan) as simulator:
         ran_again: set[int] = set()
         ran = dict(simulator.run(cases, ran_again))
-        return CaseResults(
+        return Episodes(
             plan,
             [ran[place] for place in range(len(cases))],
             files=hashed(simulator.vut.files()),
@@ -259,10 +227,6 @@ def run_cases(plan: SimulationPlan, cases: Iterable[Case]) -> CaseResults:
             ran_again=ran_again,
             in_sumo=simulator.in_sumo,
         )
-
-
-def _run_all(plan: SimulationPlan, cases: Iterable[Case]) -> list[CaseResult]:
-    return list(run_cases(plan, cases))
 
 
 def _run_and_keep(plan: SimulationPlan, keep: Keep[R], cases: Iterable[Case]) -> Sequence[R]:
@@ -319,17 +283,13 @@ def close_simulator() -> None:
             simulator.close()
 
 
-def _lost(plan: SimulationPlan, case: Case) -> CaseResults:
+def _lost(plan: SimulationPlan, case: Case) -> Episodes:
     """Return what is recorded of a case that ended every worker that ran it."""
     start = [[(x, v, 0.0) for x, v in case.starts()]]
     reason = f"its worker process died {MAX_DEATHS} times"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, reason)
-    return CaseResults(plan, [trajectory], files={}, pov_files={}, in_sumo=(0,))
+    return Episodes(plan, [trajectory], files={}, pov_files={}, in_sumo=(0,))
 
 
-def _lost_result(plan: SimulationPlan, case: Case) -> CaseResult:
-    return _lost(plan, case)[0]
-
-
-def _again(result: CaseResult) -> CaseResult:
-    return replace(result, again=True)
+def _again(episode: Episode) -> Episode:
+    return replace(episode, again=True)

@@ -14,8 +14,7 @@ import numpy as np
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.against import AGAINST, earlier_run
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.static_map import map_of
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
@@ -83,7 +82,7 @@ class Chart:
 
 def write_against(run: Run) -> None:
     """Write the page of a campaign against an earlier version into its folder; else do nothing."""
-    compared, earlier = compare_against(run), earlier_run(run)
+    compared, earlier = compare_against(run), run.earlier()
     if compared is not None:
         html = comparison_page(compared, [earlier, run])
         replace_own(run.folder / AGAINST_PAGE, html.encode(errors="backslashreplace"))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from merge_sumo.campaigns.store import Run
+    from merge_sumo.campaigns.run import Run
     from merge_sumo.road.corridor import Corridor
 
 EXPORTS: Final = "exports"

@@ -17,7 +17,7 @@ import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor

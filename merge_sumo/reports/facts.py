@@ -14,7 +14,7 @@ from typing import Final
 from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.summary import LevelSummary, Summary
 from merge_sumo.analysis.verdict import Verdict
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
 from merge_sumo.studies.probability import RESULT, probability_of

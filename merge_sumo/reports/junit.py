@@ -19,8 +19,7 @@ from lxml import etree
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.analysis.merging import place_in_words
 from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
-from merge_sumo.campaigns.against import AGAINST
-from merge_sumo.campaigns.store import NAME_CHARACTERS, Run
+from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against

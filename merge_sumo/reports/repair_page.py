@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.reports.comparison_page import STYLES, comparison_page
 from merge_sumo.reports.pages import page
 from merge_sumo.studies.comparison import cut

@@ -19,7 +19,7 @@ from typing import Final
 from markupsafe import Markup
 
 from merge_sumo.analysis.summary import Summary
-from merge_sumo.campaigns.store import OUTCOMES, Run
+from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.pages import page

@@ -13,7 +13,7 @@ from merge_sumo.analysis.summary import Summary, summarise
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.analysis.verdict import Trouble, judge
 from merge_sumo.campaigns.repeats import read_repeats
-from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.engine.plan import plan_key, versions
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError

@@ -20,8 +20,8 @@ from merge_sumo.analysis.summary import LevelSummary
 from merge_sumo.analysis.surface import FEWEST_FAILURES, PLAUSIBLE
 from merge_sumo.analysis.verdict import in_words
 from merge_sumo.campaigns import repeats
+from merge_sumo.campaigns.run import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.campaigns.store import SETTINGS, TRAJECTORIES, Run
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.reports.comparison_page import AGAINST_PAGE

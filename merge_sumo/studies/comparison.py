@@ -28,10 +28,9 @@ from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, summarise
 from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.against import earlier_run
 from merge_sumo.campaigns.repeats import cause
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, same_pov
-from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.engine.plan import versions as versions_of_packages
 from merge_sumo.errors import UserError
@@ -461,7 +460,7 @@ def compare_against(run: Run) -> Comparison | None:
 
     None where it is against none.
     """
-    earlier = earlier_run(run)
+    earlier = run.earlier()
     if earlier is None:
         return None
     before = Version(
@@ -636,7 +635,7 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
         open_simulators(plan, processes)
         for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
             old = order[place]
-            by_index[old.index] = now.outcome(old.index, old.batch)
+            by_index[old.index] = now.at(old.index, old.batch).outcome
             study.on_cases(1)
     after = [by_index[outcome.index] for outcome in before]
     search = f"merge-sumo campaign --vut {quoted(settings.vut)}"

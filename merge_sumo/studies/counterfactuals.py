@@ -30,7 +30,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import follow_mps2
 from merge_sumo.drivers.levelk import DECISION_STEPS

@@ -27,9 +27,9 @@ from msgspec import Meta
 
 from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.campaigns.store import Run, failures
-from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
+from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
@@ -397,7 +397,7 @@ def _axis(
     return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def pass_of(results: CaseResults) -> list[bool]:
+def pass_of(results: Episodes) -> list[bool]:
     """Return of each result whether the case has a verdict and does not fail."""
     return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
 

@@ -38,7 +38,7 @@ from merge_sumo.analysis.exposure import Distribution, read_distribution
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.analysis.traffic import Traffic
-from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate, open_simulators
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
@@ -336,7 +336,7 @@ def run_fresh(
     return failed, judged, in_sumo
 
 
-def _judged(results: CaseResults) -> list[tuple[bool, bool, bool]]:
+def _judged(results: Episodes) -> list[tuple[bool, bool, bool]]:
     """Return of each case whether it failed, had a verdict, and ran in SUMO."""
     return [
         (verdict.failed, verdict.margin is not None, place in results.in_sumo)

@@ -42,9 +42,9 @@ from msgspec import Meta, field
 
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import summarise
+from merge_sumo.campaigns.run import OUTCOMES, Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, Run, spread_failures
-from merge_sumo.engine.evaluate import CaseResults, evaluate
+from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
@@ -736,6 +736,6 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
     return found
 
 
-def _outcomes_of(results: CaseResults) -> list[Outcome]:
+def _outcomes_of(results: Episodes) -> list[Outcome]:
     """Return the outcomes of a chunk, without motions."""
-    return [result.outcome(0) for result in results]
+    return [episode.outcome for episode in results]

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
-from merge_sumo.campaigns.store import FILES, Run
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.system.hashing import files_now

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.campaigns.campaign import conduct
-from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate, workers_or_here
+from merge_sumo.campaigns.scheduler import groups_here
+from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
@@ -116,8 +116,8 @@ def _search(
     sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
     found = Search([], [], 0.0)
     batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-    for ran in conduct(sampler, partial(evaluate, plan, workers=THIS_PROCESS), cases, batch):
-        found.outcomes.extend(outcome for outcome, _ in ran)
+    for group in groups_here(plan, sampler, cases, batch):
+        found.outcomes.extend(episode.outcome for episode in group)
         found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
     return Search(found.outcomes, found.fmc, spent_s[0])
 

@@ -22,8 +22,8 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.campaigns.store import failures
-from merge_sumo.engine.evaluate import CaseResults, evaluate, workers_or_here
+from merge_sumo.campaigns.run import failures
+from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.comparison import cut
@@ -327,7 +327,7 @@ def _rung(
         for draw in range(runs):
             cases = [_case(o.case, change, draw, changed.scenario) for o in tested]
             found: dict[int, Verdict] = {}
-            for place, verdict in evaluate(changed, cases, workers, keep=CaseResults.verdicts):
+            for place, verdict in evaluate(changed, cases, workers, keep=Episodes.verdicts):
                 found[place] = verdict
                 study.on_cases(1)
             flips.append(flips_of(tested, found))

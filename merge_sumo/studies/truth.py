@@ -14,7 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
@@ -380,7 +380,7 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     return Truth(points, margin, int(in_sumo), *counts)
 
 
-def _margins(results: CaseResults) -> list[tuple[float, bool, Files]]:
+def _margins(results: Episodes) -> list[tuple[float, bool, Files]]:
     """Return of each case the margin, NaN without a verdict, whether SUMO ran it, and the files."""
     files = results.files | results.pov_files
     return [

@@ -9,8 +9,8 @@ from merge_sumo import api
 from merge_sumo.analysis.coordinates import described
 from merge_sumo.api.keywords import Settings
 from merge_sumo.api.results import CampaignRun
+from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.campaigns.store import failures
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.values.scenario import level_name

@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo import api
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import SimulationPlan

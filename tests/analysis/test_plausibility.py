@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from merge_sumo.analysis.plausibility import doubts
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.values.criterion import Criterion, condition_of, values_of
 from merge_sumo.values.scenario import DT_S
 

@@ -18,7 +18,7 @@ from typer.testing import Result
 import merge_sumo as ms
 from merge_sumo.analysis.summary import LevelSummary, Summary, summarise
 from merge_sumo.analysis.verdict import Gate, judge, parse_gates
-from merge_sumo.campaigns.store import Run, failures, read_settings
+from merge_sumo.campaigns.run import Run, failures, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import check_junit, junit, write_junit
 from merge_sumo.system.interrupt import Stopped

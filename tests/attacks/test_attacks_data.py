@@ -25,7 +25,7 @@ from plans import key_of, plan_for
 from merge_sumo import cli
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.campaign import SCENARIOS
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT

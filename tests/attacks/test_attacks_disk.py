@@ -17,7 +17,7 @@ from campaigning import campaign_settings, run_campaign
 from conftest import require
 from plans import plan_for
 
-from merge_sumo.campaigns.store import OUTCOMES, Run
+from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import ground_truth
 

@@ -14,7 +14,7 @@ from attacks import World, tell
 from campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
-from merge_sumo.campaigns.store import OUTCOMES
+from merge_sumo.campaigns.run import OUTCOMES
 
 MANY = """
 import gc, json, os, sys, tempfile, threading

@@ -22,17 +22,17 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from merge_sumo import cli
+from merge_sumo.campaigns.journal import to_line
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
-from merge_sumo.campaigns.store import (
+from merge_sumo.campaigns.run import (
     OUTCOMES,
     SETTINGS,
     TRAJECTORIES,
     Run,
     read_outcomes,
     read_settings,
-    to_line,
 )
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report

@@ -18,7 +18,7 @@ from plans import plan_for
 
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report

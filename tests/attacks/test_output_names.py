@@ -22,15 +22,8 @@ import merge_sumo as ms
 from merge_sumo import cli
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.store import (
-    OUTCOMES,
-    SETTINGS,
-    TRAJECTORIES,
-    Journal,
-    Run,
-    failures,
-    read_settings,
-)
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.reports.report import REPORT, write_report

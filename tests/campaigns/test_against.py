@@ -16,9 +16,8 @@ from calling import assert_refused
 from campaigning import campaign_settings, resume_campaign, run_campaign
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.against import AGAINST, earlier_run
+from merge_sumo.campaigns.run import AGAINST, OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.studies.comparison import Change, compare_against
@@ -88,7 +87,7 @@ class TestFinds:
 
     def test_the_old_version_is_a_campaign_of_its_own(self):
         run = run_campaign(settings(cases=10), Path("run"))
-        earlier = earlier_run(run)
+        earlier = run.earlier()
         assert earlier.settings["vut"] == "old.py:f"
         assert [o.case for o in earlier.outcomes] == [o.case for o in run.outcomes]
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)

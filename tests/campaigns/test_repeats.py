@@ -20,8 +20,8 @@ from merge_sumo.campaigns.repeats import (
     read_repeats,
     unrepeatable,
 )
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.studies.comparison import rerun

@@ -18,16 +18,9 @@ from calling import contents, invoke
 from campaigning import campaign_settings, resume_campaign, run_campaign
 from conftest import some
 
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import (
-    CHECKSUM,
-    OUTCOMES,
-    SETTINGS,
-    TRAJECTORIES,
-    Journal,
-    Run,
-    read_settings,
-)
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import interrupt
@@ -198,7 +191,7 @@ class TestTwoProcessesOnOneFolder:
 
     def test_leave_no_lock_behind_when_one_is_killed(self, folder):
         script = (
-            "import os, sys, pathlib; from merge_sumo.campaigns.store import Journal;"
+            "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
             "kept = Journal.reopen(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)

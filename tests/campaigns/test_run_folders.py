@@ -15,8 +15,8 @@ from calling import Said, assert_refused
 from campaigning import campaign_settings, run_campaign
 from conftest import require
 
+from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.campaigns.store import OUTCOMES, Run, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import files_now
 from merge_sumo.vuts.registry import VutFactory, names_code

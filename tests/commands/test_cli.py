@@ -15,7 +15,7 @@ from lxml import etree
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.campaigns.store import Run, failures, spread_failures
+from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, SUMO_VERSION
 from merge_sumo.sumo.replay_folder import CONFIG, RECORD
 

@@ -17,7 +17,7 @@ import pytest
 from conftest import some
 
 import merge_sumo as ms
-from merge_sumo.campaigns.store import OUTCOMES
+from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.values.case import Case, MergeCase, Pool
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import fmc

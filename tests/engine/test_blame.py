@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from campaigning import campaign_settings, run_campaign
 
+from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame

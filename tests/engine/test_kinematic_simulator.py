@@ -10,7 +10,7 @@ from plans import POVS, key_of, plan_for
 
 from merge_sumo.drivers.levelk import MANY_ROWS, features
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.evaluate import CaseResults, CasesAt, evaluate, run_cases
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, run_cases
 from merge_sumo.engine.kinematic_simulator import CHECKED_SHARE, drawn
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import Engine, SimulationPlan
@@ -29,12 +29,12 @@ def uniform(count: int, level: int, scenario: Scenario = US23) -> list[Case]:
     return from_unit(points, level, scenario=scenario)
 
 
-def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[CaseResults, CaseResults]:
+def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[Episodes, Episodes]:
     """Return the results of SUMO and of the kinematic engine."""
     return run_cases(plan, cases), run_cases(plan.with_engine("kinematic"), cases)
 
 
-def assert_alike(sumo: CaseResults, kinematic: CaseResults) -> None:
+def assert_alike(sumo: Episodes, kinematic: Episodes) -> None:
     for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
         assert one.end is other.end
         np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
@@ -62,7 +62,7 @@ class TestACase:
 
     def test_has_the_verdict_of_its_outcome(self):
         results = run_cases(plan_for("design1"), uniform(200, 0))
-        assert results.verdicts() == [result.outcome(0).verdict for result in results]
+        assert results.verdicts() == [one.outcome.verdict for one in results]
 
 
 class TestACloseCall:
@@ -71,8 +71,8 @@ class TestACloseCall:
         plan = plan_for("level0")
         case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         (found,) = run_cases(plan, [case])
-        assert found.measures.dx_m is not None
-        x_m = case.x_pov0_m + US23.dx_crash_m - found.measures.dx_m
+        assert found.outcome.measures.dx_m is not None
+        x_m = case.x_pov0_m + US23.dx_crash_m - found.outcome.measures.dx_m
         cases: list[Case] = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
         sumo, kinematic = by_both(plan, cases)
         assert len(kinematic.in_sumo) == len(cases)
@@ -159,13 +159,18 @@ class TestATruth:
         assert sum(counted) == 100
 
 
+def in_sumo(results: Episodes) -> list[bool]:
+    return [place in results.in_sumo for place in range(len(results))]
+
+
 def test_cases_are_evaluated_in_their_order():
     points = np.random.default_rng(0).random((700, 2))
     cases = CasesAt(Pool(levels=(0,), scenario=US23), 0, points)
-    found = dict(evaluate(plan_for("design1").with_engine("kinematic"), cases))
+    plan = plan_for("design1").with_engine("kinematic")
+    found = dict(evaluate(plan, cases))
     assert sorted(found) == list(range(700))
     assert all(found[place].trajectory.case == case for place, case in enumerate(cases))
-    assert sum(ran.in_sumo for ran in found.values()) == 7
+    assert sum(by_sumo for _, by_sumo in evaluate(plan, cases, None, in_sumo)) == 7
 
 
 @pytest.mark.parametrize("name", ["pov1", "pov2", "vut1", "vut2"])

@@ -186,7 +186,7 @@ def test_an_episode_is_that_of_the_definition(name, level, tmp_path):
     for case, result, verdict in zip(cases, results, results.verdicts(), strict=True):
         assert isinstance(case, MergeCase)
         place, least_m, braking = simulate(case, VUTS[name]())
-        measures = result.measures
+        measures = result.outcome.measures
         assert (result.trajectory.end is End.MERGED) == (place is not None)
         assert measures.x_merge_m == pytest.approx(place, abs=1e-6)
         assert measures.clearance_m == pytest.approx(least_m, abs=1e-6)

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from plans import plan_for
 
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, policies_of
 from merge_sumo.engine.evaluate import open_simulators

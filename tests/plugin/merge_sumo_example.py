@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat

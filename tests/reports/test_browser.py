@@ -21,7 +21,7 @@ from foreign_nets import corridor_of
 from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
-from merge_sumo.campaigns.store import Run, failures, spread_failures
+from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.report_model import ReportModel

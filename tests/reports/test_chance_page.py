@@ -19,8 +19,8 @@ from lxml import html
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.values.case import from_unit
@@ -131,7 +131,7 @@ def test_controllers_of_the_comparison_fail_as_their_closed_form_says():
     cases = from_unit(points, 0, scenario=US23)
     draws = [replace(case, draw=draw) for case in cases for draw in range(20)]
     ran = list(run_cases(plan.for_cases(len(draws)), draws))
-    share = np.array([one.measures.is_close for one in ran]).reshape(-1, 20).mean(axis=1)
+    share = np.array([one.outcome.measures.is_close for one in ran]).reshape(-1, 20).mean(axis=1)
     assert share[chance == 0.0].max() == 0.0
     inside = chance > 0.0
     # 18 cases with 20 runs each: the mean lies within three standard deviations.

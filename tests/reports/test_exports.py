@@ -20,7 +20,7 @@ from lxml import etree
 from scenariogeneration import xosc
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.store import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table

@@ -15,7 +15,7 @@ from handmade import write_run
 from lxml import html
 
 from merge_sumo.api.results import CampaignRun
-from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports.facts import Fact
 from merge_sumo.reports.report import report_page
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance

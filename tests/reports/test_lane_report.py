@@ -14,7 +14,7 @@ from test_report import data_of, text_of
 
 from merge_sumo.analysis.merging import merging_of
 from merge_sumo.api import CampaignRun
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.reports.report import report_page, write_report
 from merge_sumo.road.scenario_file import named_scenario

@@ -17,7 +17,7 @@ from handmade import write_run
 from lxml import html
 
 from merge_sumo.analysis.surface import learn_surface
-from merge_sumo.campaigns.store import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_model as report_facts
 from merge_sumo.reports.player import SPEED_UNIT_MPS
 from merge_sumo.reports.report import report_page

@@ -16,8 +16,8 @@ from campaigning import run_campaign
 from conftest import some
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.reports.report_model import ReportModel

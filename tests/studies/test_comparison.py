@@ -18,9 +18,10 @@ from campaigning import campaign_settings, run_campaign
 from handmade import drive
 from lxml import etree, html
 
+from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import settings_of
-from merge_sumo.campaigns.store import Journal, Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.studies.comparison import (
@@ -34,6 +35,7 @@ from merge_sumo.studies.comparison import (
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.values.case import MergeCase, from_unit
 from merge_sumo.values.chance import RunsOfCase
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome, measure
 from merge_sumo.values.trajectory import End
@@ -115,7 +117,7 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
         if became != "errs":
             score = -560.0 if became == "fails" else -100.0 - index
             measures = replace(measures, end=End.MERGED, score=score)
-        ran.append((Outcome(index, 0, case, measures), trajectory))
+        ran.append(Episode(Outcome(index, 0, case, measures), trajectory))
     journal.append(ran)
     return Run(folder)
 

@@ -15,8 +15,8 @@ from campaigning import run_campaign
 from plans import plan_for
 
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.campaigns.store import Run, failures
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
@@ -259,8 +259,8 @@ def test_after_the_last_way_out_neither_braking_nor_acceleration_helps_in_sumo(t
     (tmp_path / "vut.py").write_text(ESCAPES)
     case = MergeCase(level=0, x_pov0_m=-240.0, v_pov0_mps=30.0, scenario=US23)
     first = run_cases(plan_for("level0"), [case])[0]
-    case = replace(case, x_pov0_m=-240.0 - first.measures.dx_m + dx_m)
-    measures = run_cases(plan_for("level0"), [case])[0].measures
+    case = replace(case, x_pov0_m=-240.0 - first.outcome.measures.dx_m + dx_m)
+    measures = run_cases(plan_for("level0"), [case])[0].outcome.measures
     assert measures.dx_m == pytest.approx(dx_m)
     for late_s, avoids in ((0.0, True), (0.1, False), (0.2, False), (0.5, False)):
         until_s = measures.last_avoidable_s + late_s
@@ -268,4 +268,4 @@ def test_after_the_last_way_out_neither_braking_nor_acceleration_helps_in_sumo(t
             run_cases(plan_for(f"{tmp_path}/vut.py:Escapes?until_s={until_s}&a_mps2={a}"), [case])
             for a in (2, -4)
         ]
-        assert any(not results[0].measures.is_close for results in ends) == avoids
+        assert any(not results[0].outcome.measures.is_close for results in ends) == avoids

@@ -14,7 +14,7 @@ import pytest
 from plans import plan_for
 
 import merge_sumo as ms
-from merge_sumo.campaigns.store import Run, failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario

@@ -18,7 +18,7 @@ from processes import marked, none_left
 
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.store import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.sumo.replay_folder import COLOURS, LABELS, VIEW
 
 PICTURE_TIMES_S = (2.0, 7.0)

@@ -18,7 +18,7 @@ from foreign_nets import LANE_M, lane_corridor_of
 from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.store import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor

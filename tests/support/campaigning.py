@@ -8,8 +8,8 @@ from typing import Any
 
 from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.campaigns.store import Run, read_settings
 from merge_sumo.values.scenario import US23
 
 

@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.store import Journal, Run
+from merge_sumo.campaigns.journal import Journal
+from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.plan import versions
 from merge_sumo.values.case import Case, from_unit
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import A_MIN_MPS2, DT_S, POV, US23, VUT, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -96,6 +98,6 @@ def write_run(
         ran = []
         for index, case in enumerate(cases[first : first + BATCH], start=first):
             trajectory = drive(case, errors.get(index), timeout=index in timeouts)
-            ran.append((Outcome(index, batch, case, measure(trajectory)), trajectory))
+            ran.append(Episode(Outcome(index, batch, case, measure(trajectory)), trajectory))
         journal.append(ran)
     return Run(folder)

@@ -19,8 +19,8 @@ from campaigning import campaign_settings, run_campaign
 from plans import plan_for
 from processes import wait_for
 
-from merge_sumo.campaigns.store import OUTCOMES
-from merge_sumo.engine.evaluate import _lost_result, open_simulators, run_cases
+from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
 from merge_sumo.system.workers import (
@@ -142,11 +142,11 @@ class TestAWorkerThatDies:
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
         work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-        ran = dict(two.run(work, cases, partial(_lost_result, plan), chunk=1))
-        ends = [ran[place].measures.end for place in range(4)]
+        ran = dict(two.run(work, cases, lambda case: _lost(plan, case)[0], chunk=1))
+        ends = [ran[place].outcome.measures.end for place in range(4)]
         assert ends[2] is End.SIM_ERROR
-        assert "worker process died 2 times" in ran[2].measures.error
-        assert ran[2].measures.score is None
+        assert "worker process died 2 times" in ran[2].outcome.measures.error
+        assert ran[2].outcome.measures.score is None
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
 
 

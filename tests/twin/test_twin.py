@@ -12,7 +12,7 @@ from campaigning import campaign_settings, run_campaign
 from plans import POVS, plan_for
 
 from merge_sumo.analysis.predictions import prediction_error_m, surprises
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs
@@ -43,7 +43,7 @@ def ran(vut: str, level: int, points, scenario=US23, povs=None):
     pool = Pool(levels=(level,), scenario=scenario)
     done = run_cases(plan, pool.cases(points, level))
     return [
-        Outcome(index, index // 10, one.trajectory.case, one.measures)
+        Outcome(index, index // 10, one.trajectory.case, one.outcome.measures)
         for index, one in enumerate(done)
     ], {index: one.trajectory.motion for index, one in enumerate(done)}
 

@@ -11,9 +11,9 @@ from campaigning import run_campaign
 from foreign_nets import FOREIGN
 from merges import SMALLER
 
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError

@@ -100,7 +100,7 @@ def test_agrees_with_polygons_and_steps(tested):
     cases = make_sampler("uniform", Pool(levels=LEVELS, scenario=found), 5).ask(count)
     told: Counter[str] = Counter()
     for ran in run_cases(plan, cases):
-        measures = ran.measures
+        measures = ran.outcome.measures
         assert (measures.impact_speed_mps is None) == (measures.severity != "contact")
         shared_m2 = overlap_before_m(plan.road, ran.trajectory)
         if shared_m2 == 0.0 or shared_m2 > 1e-3:

@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 import merge_sumo as ms
 from merge_sumo import cli
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.store import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.system.records import decode

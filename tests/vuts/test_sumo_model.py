@@ -9,7 +9,7 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from vut_contract import cases_of, factory, run_cases, run_on
 
-from merge_sumo.campaigns.store import failures
+from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay import replay

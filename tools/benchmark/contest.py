@@ -38,8 +38,7 @@ from problems import (
 )
 
 from merge_sumo.analysis.result import Result
-from merge_sumo.campaigns.campaign import conduct
-from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate
+from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
@@ -222,9 +221,8 @@ def _outcomes(
         return sampler(pool, seed, predictor)
 
     sampler = WatchedSampler(make, pool, seed, watch)
-    run = partial(evaluate, plan, workers=THIS_PROCESS)
-    for ran in conduct(sampler, run, task.cases, None):
-        yield [outcome for outcome, _ in ran]
+    for group in groups_here(plan, sampler, task.cases):
+        yield [episode.outcome for episode in group]
 
 
 def _row(outcome: Outcome) -> list[float]:

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import THIS_PROCESS, CaseResults, CasesAt, evaluate
+from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
@@ -341,7 +341,7 @@ def _margins_at(
     return margin
 
 
-def _verdicts(results: CaseResults) -> list[float]:
+def _verdicts(results: Episodes) -> list[float]:
     return [np.nan if one.margin is None else one.margin for one in results.verdicts()]
 
 

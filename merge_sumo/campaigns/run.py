@@ -1,12 +1,13 @@
-"""The folder of a campaign: one process writes it, any process reads it.
+"""The folder of a campaign, as any process reads it; `Journal` (`journal.py`) writes it.
 
 campaign.json             every resolved setting, versions, hashes, and the hash of itself
 outcomes.jsonl            one line per case, in order, synced after every batch
 trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
 
-`Run` reads and `Journal` writes whole batches. A bit that flips on a disk or in a copy shows in
-the hashes, and in arrays in the checksums of the zip archive. Folders of older versions, without
-hashes, are read as they are.
+against/                  the same of the earlier version, where a campaign is against one
+
+A bit that flips on a disk or in a copy shows in the hashes, and in arrays in the checksums of the
+zip archive. Folders of older versions, without hashes, are read as they are.
 """
 
 from __future__ import annotations
@@ -15,38 +16,37 @@ import errno
 import hashlib
 import io
 import json
-import os
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.folders import check_own, make_place, replace_own, sync_folder, write_folder
-from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import decode, to_json
+from merge_sumo.system.printable import printable
+from merge_sumo.system.records import decode
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import regions
 from merge_sumo.values.scenario import ALL_LEVELS, US23, Scenario
 from merge_sumo.values.scenario_kinds import scenario_of_record
 from merge_sumo.values.score import Outcome
-from merge_sumo.values.signals import SignalRuns, Signals, from_runs, to_record
+from merge_sumo.values.signals import SignalRuns, Signals, from_runs
 from merge_sumo.values.trajectory import Trajectory
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
 TRAJECTORIES: Final = "trajectories"
+AGAINST: Final = "against"
+"""Folder of the earlier version, and the key of `campaign.json` that names that."""
 NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
 RAN_AGAIN: Final = "ran_again"
@@ -55,11 +55,8 @@ FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json`: the hash of all other keys with their values."""
-Batch = list[tuple[Outcome, Trajectory]]
 FARTHEST: Final = 1e9
 """No position, speed or acceleration of ours, in m, m/s and m/s2, is as large."""
-MOST_SYNCS: Final = 8
-"""Files that are synced at the same time."""
 
 
 class LostError(UserError):
@@ -213,6 +210,33 @@ class Run:
                 known[index] = self.trajectory(index)
         return known
 
+    def episodes(self, *, motion: bool = True) -> list[Episode]:
+        """Return all cases in order; without `motion` their trajectories have none.
+
+        Raises as `trajectory` does.
+        """
+        if motion:
+            return [Episode(one, self.trajectory(one.index)) for one in self.outcomes]
+        none = np.empty((0, self.scenario.vehicles, 3))
+        return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
+
+    def earlier(self) -> Run | None:
+        """Return the run of the version that this campaign is against; None where there is none.
+
+        Raises `UserError` where that is missing, or has other cases. Of a campaign that was stopped
+        it may have more of them.
+        """
+        if self.settings.get(AGAINST) is None:
+            return None
+        earlier = Run(self.folder / AGAINST)
+        count = len(self.outcomes)
+        if [o.case for o in earlier.outcomes[:count]] != [o.case for o in self.outcomes]:
+            raise UserError(
+                f"{earlier.folder} has other cases than {self.folder}: take both from a copy, or "
+                "run the campaign again"
+            )
+        return earlier
+
     def whole_batches(self) -> int:
         """Return the number of outcomes without those of a last batch that is not complete.
 
@@ -268,11 +292,6 @@ def read_settings(folder: Path) -> dict[str, Any]:
     if not (isinstance(levels, list) and all(type(level) is int for level in levels)):
         raise UserError(f"{path} is no campaign's: its levels are not a list of numbers")
     return settings
-
-
-def to_line(outcome: Outcome) -> str:
-    """Return the line of `outcomes.jsonl` for an outcome, with its line end."""
-    return json.dumps(outcome.to_record(), allow_nan=False) + "\n"
 
 
 def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
@@ -436,151 +455,3 @@ def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:
 def settings_sha256(settings: dict[str, Any]) -> str:
     """Return the hash of settings: what `CHECKSUM` says of them."""
     return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
-
-
-class Journal:
-    """Writes a campaign's folder, as the only process that does; to be used in `with`.
-
-    A folder with settings is whole, and what was appended once stays.
-    """
-
-    def __init__(self, folder: Path, outcomes: io.FileIO) -> None:
-        """Take the folder and its open outcomes; use `create` or `reopen`."""
-        self.folder = folder
-        self._outcomes = outcomes
-        self._threads = ThreadPoolExecutor(MOST_SYNCS)
-        _lock(outcomes, folder)
-        make_place(folder / TRAJECTORIES)
-
-    @classmethod
-    def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
-        """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        write_folder(folder, {OUTCOMES: b"", SETTINGS: _settings_text(settings)})
-        return cls(folder, (folder / OUTCOMES).open("r+b", buffering=0))
-
-    @classmethod
-    def reopen(cls, folder: Path) -> tuple[Self, Run, int]:
-        """Return the journal of a campaign to go on with, what it holds, and what was dropped.
-
-        Dropped are outcomes, whole or torn, of a batch that was not written to its end: they are
-        run again. Raises `UserError` when another process writes the folder, when a link in it
-        leads elsewhere, or as `Run` does.
-        """
-        check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
-        check_own(*(folder / TRAJECTORIES).glob("*"))
-        try:
-            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
-        except OSError as error:
-            if error.errno in (errno.ENOENT, errno.ENOTDIR):
-                raise UserError(
-                    f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
-                ) from error
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
-        try:
-            journal = cls(folder, outcomes)
-            run = Run(folder)
-            dropped = len(run.outcomes) - run.whole_batches() + run.torn
-            if dropped:
-                journal.keep(run, run.whole_batches())
-        except OSError as error:
-            outcomes.close()
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
-        except BaseException:
-            outcomes.close()
-            raise
-        return journal, run, dropped
-
-    def keep(self, run: Run, cases: int) -> None:
-        """Drop the outcomes of a run behind its first cases, from the folder and from memory."""
-        del run.outcomes[cases:]
-        self._outcomes.seek(0)
-        length = sum(len(line) for line, _ in zip(self._outcomes, run.outcomes, strict=False))
-        self._outcomes.truncate(length)
-        os.fsync(self._outcomes.fileno())
-
-    def append(self, *batches: Batch) -> None:
-        """Write batches and sync them to the disk: several at once take little more time than one.
-
-        The trajectories go first, so that every outcome on disk has its trajectory there. Raises
-        `UserError` when they cannot be written; what was there before stays.
-        """
-        paths = [batch_file(self.folder, batch[0][0].batch) for batch in batches]
-        lines, arrays = zip(*map(_encoded, batches), strict=True)
-        try:
-            end = self._outcomes.seek(0, os.SEEK_END)
-            list(self._threads.map(_write, paths, arrays))
-            sync_folder(self.folder / TRAJECTORIES)
-            try:
-                _write_all(self._outcomes, b"".join(lines))
-            except OSError:
-                self._outcomes.truncate(end)
-                raise
-        except OSError as error:
-            goes_on = f"`merge-sumo campaign --resume {quoted(self.folder)}`"
-            kept = f"; what ran before is kept: go on with {goes_on}"
-            raise UserError(
-                f"cannot write {self.folder}: {error.strerror}"
-                f"{kept if (self.folder / OUTCOMES).is_file() else ''}"
-            ) from error
-
-    def rewrite_settings(self, settings: dict[str, Any]) -> None:
-        """Put other settings in the place of those that were there, all or nothing."""
-        replace_own(self.folder / SETTINGS, _settings_text(settings))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._threads.shutdown()
-        self._outcomes.close()
-
-
-def _encoded(batch: Batch) -> tuple[bytes, bytes]:
-    """Return the lines of a batch, and the file of its trajectories."""
-    outcomes, trajectories = zip(*batch, strict=True)
-    lines = "".join(map(to_line, outcomes)).encode()
-    signals = {str(o.index): to_record(t.signals) for o, t in batch if t.signals}
-    text = json.dumps(signals, allow_nan=False).encode()
-    kept: dict[str, Any] = {"signals": np.frombuffer(text, np.uint8)} if signals else {}
-    arrays = io.BytesIO()
-    np.savez(
-        arrays,
-        **kept,
-        index=np.array([o.index for o in outcomes]),
-        rows=np.array([len(t.motion) for t in trajectories]),
-        motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),
-        lines_sha256=hashlib.sha256(lines).hexdigest(),
-    )
-    return lines, arrays.getvalue()
-
-
-def _settings_text(settings: dict[str, Any]) -> bytes:
-    record = {**settings, CHECKSUM: settings_sha256(settings)}
-    return to_json(record, indent=2)
-
-
-def _lock(outcomes: io.FileIO, folder: Path) -> None:
-    """Refuse when another process holds the lock; it goes with the process, however that ends."""
-    if sys.platform == "win32":  # no flock there
-        return
-    import fcntl
-
-    try:
-        fcntl.flock(outcomes, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        outcomes.close()
-        raise UserError(f"another process writes {folder}: wait until it has ended") from error
-
-
-def _write(path: Path, content: bytes) -> None:
-    """Write a file and sync it to the disk."""
-    with path.open("wb", buffering=0) as file:
-        _write_all(file, content)
-
-
-def _write_all(file: io.FileIO, content: bytes) -> None:
-    # Unbuffered: after an error, nothing is left that closing the file would write after all.
-    rest = memoryview(content)
-    while rest:
-        rest = rest[file.write(rest) :]
-    os.fsync(file.fileno())

@@ -18,12 +18,14 @@ from calling import contents
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.campaigns.store import OUTCOMES, Journal, Run, failures, read_outcomes, to_line
+from merge_sumo.campaigns.journal import Journal, to_line
+from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, read_settings
 from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.system.arrays import read_arrays
 from merge_sumo.values.case import Case, MergeCase
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.measures import further_measures
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
@@ -90,8 +92,8 @@ any_outcome = st.builds(
 )
 
 
-def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Trajectory]:
-    """Return an episode with numbers that no short decimal holds, and its outcome."""
+def episode(index: int, batch: int = 0, steps: int = 60) -> Episode:
+    """Return an episode with numbers that no short decimal holds."""
     rng = np.random.default_rng(index)
     case = MergeCase(
         level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0), scenario=US23
@@ -100,11 +102,11 @@ def episode(index: int, batch: int = 0, steps: int = 60) -> tuple[Outcome, Traje
     motion[:, :, 0] = np.linspace(-180.0, -1.0, steps + 1)[:, None]
     motion[-1, :, 0] = rng.uniform(0.0, 2.0, 2)
     trajectory = Trajectory(case, motion, End.MERGED)
-    return Outcome(index, batch, case, measure(trajectory)), trajectory
+    return Episode(Outcome(index, batch, case, measure(trajectory)), trajectory)
 
 
 def lines_of(count: int) -> list[bytes]:
-    return [to_line(episode(index)[0]).encode() for index in range(count)]
+    return [to_line(episode(index).outcome).encode() for index in range(count)]
 
 
 def assert_sentence(error: pytest.ExceptionInfo[UserError], *parts: str) -> None:
@@ -134,18 +136,18 @@ class TestARecord:
         assert all(value is None or isinstance(value, int | float | str) for value in values)
 
     def test_has_the_fields_of_the_specification_in_their_order(self):
-        names = [name for name in episode(0)[0].to_record() if name not in further_measures()]
+        names = [name for name in episode(0).outcome.to_record() if name not in further_measures()]
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
         assert names[-1] == "error"
 
     def test_has_no_orientation_below_level_2(self):
-        outcome, _ = episode(0)
+        outcome = episode(0).outcome
         social = MergeCase(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25, scenario=US23)
         assert json.loads(to_line(outcome))["svo_rad"] is None
         assert json.loads(to_line(replace(outcome, case=social)))["svo_rad"] == 0.25
 
     def test_has_no_number_that_json_does_not_know(self):
-        outcome, _ = episode(0)
+        outcome = episode(0).outcome
         infinite = replace(outcome, measures=replace(outcome.measures, ttc_s=math.inf))
         with pytest.raises(ValueError, match="JSON"):
             to_line(infinite)
@@ -154,7 +156,7 @@ class TestARecord:
 class TestReading:
     def test_gives_the_outcomes_in_order(self):
         outcomes, torn = read_outcomes(b"".join(lines_of(4)), "outcomes.jsonl", scenario=US23)
-        assert outcomes == [episode(index)[0] for index in range(4)]
+        assert outcomes == [episode(index).outcome for index in range(4)]
         assert not torn
 
     def test_of_nothing_gives_nothing(self):
@@ -162,7 +164,7 @@ class TestReading:
 
     def test_drops_a_last_line_that_is_torn_at_any_byte(self):
         whole, last = b"".join(lines_of(2)), lines_of(3)[2]
-        before = [episode(0)[0], episode(1)[0]]
+        before = [episode(0).outcome, episode(1).outcome]
         for cut in range(1, len(last)):
             assert read_outcomes(whole + last[:cut], "outcomes.jsonl", scenario=US23) == (
                 before,
@@ -224,7 +226,7 @@ class TestReading:
         ],
     )
     def test_refuses_a_value_of_the_wrong_type(self, field, value):
-        record = {**episode(0)[0].to_record(), field: value}
+        record = {**episode(0).outcome.to_record(), field: value}
         with pytest.raises(UserError) as error:
             read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
         assert_sentence(error, "line 1")
@@ -247,16 +249,33 @@ class TestAJournal:
         journal = Journal.create(tmp_path / "run", settings)
         ran = [episode(index, batch=index // 2, steps=20 + 7 * index) for index in range(5)]
         for batch in range(3):
-            journal.append([pair for pair in ran if pair[0].batch == batch])
+            journal.append([one for one in ran if one.outcome.batch == batch])
         run = Run(tmp_path / "run")
         assert run.settings == settings
-        assert run.outcomes == [outcome for outcome, _ in ran]
+        assert run.outcomes == [one.outcome for one in ran]
         for index in (4, 0, 3, 1, 2):
             again = run.trajectory(index)
             assert again.motion.dtype == np.float64
-            assert again.motion.shape == ran[index][1].motion.shape
-            assert again.motion.tobytes() == ran[index][1].motion.tobytes()
-            assert again.case == ran[index][1].case
+            assert again.motion.shape == ran[index].trajectory.motion.shape
+            assert again.motion.tobytes() == ran[index].trajectory.motion.tobytes()
+            assert again.case == ran[index].trajectory.case
+
+    def test_writes_groups_together_as_one_by_one(self, tmp_path):
+        groups = [[episode(2 * batch, batch), episode(2 * batch + 1, batch)] for batch in range(12)]
+        with Journal.create(tmp_path / "one", {}) as journal:
+            for group in groups:
+                journal.append(group)
+        with Journal.create(tmp_path / "all", {}) as journal:
+            journal.append(*groups)
+        one, many = contents(tmp_path / "one"), contents(tmp_path / "all")
+        assert list(one.values()) == list(many.values())
+
+    def test_notes_files_and_cases_that_ran_again(self, tmp_path):
+        with Journal.create(tmp_path / "run", {"vut_files": {"a": "1"}, "pov_files": None}) as to:
+            to.append([replace(episode(0), files={"a": "2", "b": "3"}, again=True)])
+            to.append([replace(episode(1, 1), pov_files={"c": "4"})])
+        noted = {"vut_files": {"a": "1", "b": "3"}, "pov_files": {"c": "4"}, "ran_again": 1}
+        assert read_settings(tmp_path / "run") == noted
 
     def test_has_on_disk_what_was_appended_so_far(self, tmp_path):
         journal = Journal.create(tmp_path / "run", {})
@@ -423,7 +442,7 @@ def test_motion_that_is_none_is_one_sentence_of_every_command(run, tmp_path, com
 
 
 def test_every_measure_is_in_the_record():
-    record = episode(0)[0].to_record()
+    record = episode(0).outcome.to_record()
     # In traffic, where there is a follow-up, and on an acceleration lane.
     elsewhere = {"nearest", "further", *FOLLOWED_UP, *ON_LANE}
     assert {field.name for field in fields(Measures)} - elsewhere <= set(record)

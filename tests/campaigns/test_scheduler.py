@@ -1,0 +1,296 @@
+"""The loop of a search: workers, the time of a case and a stop decide nothing."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import shutil
+import signal
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from campaigning import campaign_settings, resume_campaign, run_campaign
+
+from merge_sumo.campaigns.journal import to_line
+from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.scheduler import AGE, GROUPS, Scheduler
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.errors import UserError
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.testing.contracts import episode
+from merge_sumo.values.case import Pool
+from merge_sumo.values.criterion import PAPER_CRITERION
+from merge_sumo.values.episode import Episode
+from merge_sumo.values.scenario import US23
+
+POOL = Pool(levels=(0, 1), scenario=US23)
+LEARNING = sorted(name for name, kind in SAMPLERS.items() if kind.learns)
+
+
+def played(case) -> Episode:
+    """Return what becomes of a case, without SUMO."""
+    trajectory = episode(case)
+    return Episode(PAPER_CRITERION.outcome(0, 0, trajectory), trajectory)
+
+
+def ending_in(order: np.random.Generator):
+    """Return an evaluator without SUMO, where any of the chunks that run may end next."""
+
+    def evaluate(chunks):
+        running, first = [], 0
+        while True:
+            chunk = next(chunks, None)
+            if chunk:
+                running.append((first, chunk))
+                first += len(chunk)
+            if not running:
+                return
+            if not chunk or order.random() < 0.3:
+                place, cases = running.pop(int(order.integers(len(running))))
+                yield place, [played(case) for case in cases]
+
+    return evaluate
+
+
+def searched(sampler, order: int = 0, workers: int = 1, cases: int = 70, **how: Any) -> list[bytes]:
+    """Return the lines of a search whose cases end in an order of their own."""
+    scheduler = Scheduler(sampler, cases, **how)
+    run = scheduler.run(
+        ending_in(np.random.default_rng(order)), Workers(InProcess, workers), whole=workers == 1
+    )
+    groups = [group for together in run for group in together]
+    return [to_line(one.outcome).encode() for group in groups for one in group]
+
+
+class Asked(UniformSampler):
+    """Notes what it was told, and what is pending, whenever it is asked."""
+
+    learns = overlaps = True
+    size = 40
+
+    def __init__(self) -> None:
+        super().__init__(POOL, 0)
+        self.asked: list[tuple[int, int, int]] = []
+
+    def ask(self, n):
+        self.asked.append((n, len(self._outcomes), len(self._pending)))
+        return super().ask(n)
+
+    def batch_size(self):
+        return self.size
+
+
+class TestRoom:
+    """(cases of a group, cases told before, cases pending)"""
+
+    def asked(self, cases: int, *, order: int = 0, size: int = 40, **how: Any) -> list:
+        sampler = Asked()
+        sampler.size = size
+        searched(sampler, order, cases=cases, **how)
+        return sampler.asked
+
+    @pytest.mark.parametrize("order", range(3))
+    def test_in_batches_is_for_one_group(self, order):
+        assert self.asked(5, batch=2, order=order) == [(2, 0, 0), (2, 2, 0), (1, 4, 0)]
+        assert self.asked(7, size=3, first=2, order=order) == [(2, 0, 0), (3, 2, 0), (2, 5, 0)]
+
+    @pytest.mark.parametrize("order", range(3))
+    def test_in_flight_is_for_n_cases(self, order):
+        asked = self.asked(6, in_flight=3, order=order)
+        assert asked == [(1, 0, 0), (1, 0, 1), (1, 0, 2), (1, 1, 2), (1, 2, 2), (1, 3, 2)]
+
+    def test_in_flight_of_one_is_for_one_case(self):
+        assert self.asked(3, in_flight=1) == [(1, 0, 0), (1, 1, 0), (1, 2, 0)]
+
+    def test_grows_with_what_is_known(self):
+        asked = self.asked(400, in_flight=24, size=6)
+        assert sum(n for n, *_ in asked) == 400
+        for n, told, pending in asked:
+            most = min(24, 6 + (told + pending) // AGE)
+            assert pending + n <= most
+            # No more is told than has to be.
+            assert not told or pending + n > most - most // GROUPS
+        assert {n for n, *_ in asked if n > 1} > {2, 24 // GROUPS}
+
+    def test_of_a_sampler_that_waits_is_for_one_group(self, monkeypatch):
+        monkeypatch.setattr(Asked, "overlaps", False)
+        assert self.asked(7, in_flight=3) == [(3, 0, 0), (3, 3, 0), (1, 6, 0)]
+
+    def test_has_no_end_where_outcomes_decide_nothing(self, monkeypatch):
+        monkeypatch.setattr(Asked, "learns", False)
+        assert self.asked(5, batch=2) == [(2, 0, 0), (2, 0, 0), (1, 0, 0)]
+
+    def test_is_for_one_group_where_outcomes_may_end_the_search(self, monkeypatch):
+        monkeypatch.setattr(Asked, "learns", False)
+        asked = self.asked(9, batch=2, stop=lambda known: len(known) >= 4)
+        assert asked == [(2, 0, 0), (2, 2, 0)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LEARNING)
+def test_a_search_depends_neither_on_the_order_of_ends_nor_on_workers_nor_on_a_stop(name):
+    def of(order: int, workers: int, history: list[Episode]) -> list[bytes]:
+        sampler = make_sampler(name, POOL, 3)
+        return searched(sampler, order, workers, in_flight=20, history=history)
+
+    kept: list[Episode] = []
+    run = Scheduler(make_sampler(name, POOL, 3), 70, in_flight=20).run(
+        ending_in(np.random.default_rng(0)), Workers(InProcess, 70)
+    )
+    for groups in run:
+        kept += [one for group in groups for one in group]
+    expected = [to_line(one.outcome).encode() for one in kept]
+    assert [one.outcome.index for one in kept] == list(range(70))
+    assert of(1, 3, []) == of(2, 1, []) == expected
+    for end in ends_of_groups([one.outcome for one in kept])[1::5]:
+        assert of(end, 2, kept[:end]) == expected[end:]
+
+
+def test_many_in_flight_are_batches_for_a_sampler_that_waits():
+    """So the published baselines do what they do in batches of so many cases."""
+    one, other = (make_sampler("annealing", POOL, 3) for _ in range(2))
+    assert searched(one, batch=20) == searched(other, order=1, in_flight=20)
+
+
+def ends_of_groups(outcomes) -> list[int]:
+    """Return the numbers of cases that are whole groups."""
+    return [after.index for before, after in pairwise(outcomes) if after.batch > before.batch]
+
+
+def settings(sampler: str = "coverage", **changes: Any) -> CampaignSettings:
+    values = {"vut": "design1", "cases": 60, "in_flight": 12, "seed": 2}
+    return campaign_settings(sampler=sampler, **{**values, **changes})
+
+
+UNIFORM = campaign_settings(vut="design1", sampler="uniform", cases=90, batch=20)
+
+
+def recorded(folder: Path) -> dict[str, bytes]:
+    """Return what a campaign has recorded, by name."""
+    files = [folder / OUTCOMES, *(folder / TRAJECTORIES).iterdir()]
+    return {file.name: file.read_bytes() for file in files}
+
+
+def outcomes(folder: Path) -> bytes:
+    return recorded(folder)[OUTCOMES]
+
+
+class StopAfter:
+    """A check that stops a campaign after some groups."""
+
+    def __init__(self, groups: int) -> None:
+        self.left = groups
+
+    def __call__(self) -> None:
+        self.left -= 1
+        if not self.left:
+            raise Stopped(signal.SIGINT)
+
+
+@pytest.fixture(scope="module")
+def two():
+    with open_workers(2) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    """Return the folder of a campaign in flight that ran in this process, undisturbed."""
+    return run_campaign(settings(), tmp_path_factory.mktemp("whole") / "run").folder
+
+
+@pytest.fixture(scope="module")
+def in_turn(tmp_path_factory) -> dict:
+    """What is recorded when every batch of uniform cases waits for the one before."""
+    folder = tmp_path_factory.mktemp("in-turn") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(UniformSampler, "learns", True)
+        run_campaign(UNIFORM, folder)
+    return recorded(folder)
+
+
+@pytest.mark.parametrize("in_flight", [1, 3, 8])
+def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two, tmp_path):
+    few = settings(cases=24, in_flight=in_flight, levels=(0, 1))
+    run_campaign(few, tmp_path / "1")
+    run_campaign(few, tmp_path / "2", workers=two)
+    assert recorded(tmp_path / "1") == recorded(tmp_path / "2")
+
+
+class TestInFlight:
+    def test_a_cut_campaign_goes_on_to_the_same_bytes(self, whole, tmp_path):
+        folder = Path(shutil.copytree(whole, tmp_path / "run"))
+        text = outcomes(folder)
+        (folder / OUTCOMES).write_bytes(text[: len(text) // 2])
+        said: list = []
+        resume_campaign(folder, warn=said.append)
+        assert recorded(folder) == recorded(whole)
+        assert "dropped" in said[0]
+
+    @pytest.mark.slow
+    def test_a_campaign_grows_as_one_that_had_the_cases_from_the_start(self, whole, tmp_path):
+        ends = ends_of_groups(Run(whole).outcomes)
+        folder = run_campaign(settings(cases=ends[-3]), tmp_path / "run").folder
+        resume_campaign(folder, {"cases": 60})
+        assert outcomes(folder) == outcomes(whole)
+
+    def test_a_campaign_records_what_decides_its_outcomes(self, whole, tmp_path):
+        assert read_settings(whole)["in_flight"] == 12
+        folder = Path(shutil.copytree(whole, tmp_path / "run"))
+        with pytest.raises(UserError, match="in_flight differs"):
+            resume_campaign(folder, {"in_flight": 13, "cases": 70})
+
+    @pytest.mark.slow
+    def test_a_campaign_that_converges_ends_where_it_would_have_ended(self, tmp_path):
+        eager = settings(cases=400, in_flight=10, stop_when_converged=True)
+        run = run_campaign(eager, tmp_path / "run")
+        count = len(run.outcomes)
+        assert count < 400
+        lines = outcomes(run.folder).splitlines(keepends=True)
+        (run.folder / OUTCOMES).write_bytes(b"".join(lines[: count // 2]))
+        resume_campaign(run.folder)
+        assert outcomes(run.folder) == b"".join(lines)
+
+
+class TestAhead:
+    def test_a_campaign_records_the_same_bytes(self, in_turn, tmp_path):
+        seen = []
+        run_campaign(UNIFORM, tmp_path / "run", on_case=lambda one: seen.append(one.index))
+        assert recorded(tmp_path / "run") == in_turn
+        assert seen == list(range(90))
+
+    def test_a_stopped_campaign_goes_on_to_the_same_bytes(self, in_turn, tmp_path, monkeypatch):
+        monkeypatch.setattr("merge_sumo.campaigns.scheduler.MAX_CHUNK", 32)
+        with pytest.raises(Stopped):
+            run_campaign(UNIFORM, tmp_path / "run", check=StopAfter(1))
+        assert 0 < len(Run(tmp_path / "run").outcomes) < 90
+        resume_campaign(tmp_path / "run")
+        assert recorded(tmp_path / "run") == in_turn
+
+    def test_batches_that_were_not_written_to_their_end_run_again(self, in_turn, tmp_path):
+        """All trajectories are on the disk before the first line."""
+        run_campaign(UNIFORM, tmp_path / "run")
+        with (tmp_path / "run" / OUTCOMES).open("r+b") as file:
+            file.truncate(len(in_turn[OUTCOMES]) // 2)
+        resume_campaign(tmp_path / "run")
+        assert recorded(tmp_path / "run") == in_turn
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"in_flight": 0}, "--in-flight is 0: it must be 1 or more"),
+        ({"in_flight": 8, "batch": 4}, "leave one of them away"),
+        ({"in_flight": 90, "cases": 80}, "no more cases can be in flight"),
+        ({"in_flight": 8, "sampler": "uniform"}, "--sampler uniform waits for none"),
+    ],
+)
+def test_nonsense_is_refused_in_a_sentence(changes, sentence):
+    with pytest.raises(UserError, match=sentence):
+        settings(**changes)
