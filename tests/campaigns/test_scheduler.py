@@ -217,7 +217,7 @@ def in_turn(tmp_path_factory) -> dict:
 
 @pytest.mark.parametrize("in_flight", [1, 3, 8])
 def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two, tmp_path):
-    few = settings(cases=24, in_flight=in_flight, levels=(0, 1))
+    few = settings("gpr", cases=24, in_flight=in_flight, levels=(0, 1))
     run_campaign(few, tmp_path / "1")
     run_campaign(few, tmp_path / "2", workers=two)
     assert recorded(tmp_path / "1") == recorded(tmp_path / "2")
