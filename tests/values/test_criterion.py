@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_score import CASE, ending
 
-from merge_sumo.campaigns.store import Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.values.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion, vocabulary
