@@ -16,13 +16,11 @@ from pathlib import Path
 import pytest
 from calling import contents, invoke
 from campaigning import campaign_settings, resume_campaign, run_campaign
-from conftest import some
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system import interrupt
 from merge_sumo.system.interrupt import Interrupt, Stopped
 
@@ -86,13 +84,6 @@ class TestResuming:
         assert names == {path.relative_to(whole) for path in whole.rglob("*")}
         assert (folder / SETTINGS).read_bytes() == (whole / SETTINGS).read_bytes()
         assert run.trajectory(27).motion.tobytes() == Run(whole).trajectory(27).motion.tobytes()
-
-    @pytest.mark.parametrize("sampler", some(sorted(SAMPLERS.keys() - {"uniform"}), "coverage"))
-    def test_gives_the_same_bytes_whatever_the_sampler(self, sampler, tmp_path):
-        run_campaign(settings(sampler), tmp_path / "whole")
-        stopped = stopped_after(2, tmp_path / "stopped", sampler)
-        resume_campaign(stopped)
-        assert outcomes(stopped) == outcomes(tmp_path / "whole")
 
     @pytest.mark.parametrize("lost", [1, 40, 2000, "a line", "a batch and a half"])
     def test_drops_what_was_not_written_to_its_end_and_says_so(self, whole, folder, lost):
@@ -259,12 +250,6 @@ class TestASignal:
 
 
 class TestTheCommand:
-    def test_goes_on_by_its_folder_alone(self, whole, folder):
-        done = invoke("campaign", "--resume", folder, "--json")
-        assert done.exit_code == 0, done.stderr
-        assert json.loads(done.stdout)["cases"] == 28
-        assert outcomes(folder) == outcomes(whole)
-
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
