@@ -91,7 +91,6 @@ def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = 
 IMPORTERS = ("import_module", "__import__")
 IMPORTED_BY_A_VARIABLE = {
     "merge_sumo": "the room of a public name that is asked for",
-    "merge_sumo.reports.exports": "a package of the extra `export`",
     "merge_sumo.system.workers": "what a worker loads first",
     "merge_sumo.system.spawning": "the function that a new process of this package is to run",
     "merge_sumo.vuts.python": "the module of a user's VUT",
@@ -234,9 +233,6 @@ SIMULATING = ("sumo", "drivers", "vuts", "engine", "twin", "training")
 """The rooms that take part in a simulation. Reports read: what they need of these are values."""
 REPORTS_READ = {
     "merge_sumo.drivers.reference.REFERENCES",  # names of the reference drivers
-    "merge_sumo.engine.plan.plan_key",  # what names a truth in the cache
-    "merge_sumo.engine.plan.versions",
-    "merge_sumo.engine.simulator.road_for",  # reads a net as data, to draw it
     "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
     "merge_sumo.sumo.replay_folder.write_scenario",
     "merge_sumo.training.check.PolicyCheck",  # types of what is shown of a training

@@ -29,7 +29,7 @@ from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.check import returns_of

@@ -15,8 +15,9 @@ from matplotlib.figure import Figure
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import Simulator, road_for
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.values.case import Case, MergeCase

@@ -28,6 +28,11 @@ class Coordinate:
         value: float | None = getattr(case, self.field)
         return value
 
+    def share(self, case: Case) -> float:
+        """Return where a case is between the bounds, from 0 to 1; 0 where it has no value."""
+        low, high = self.dimension.low, self.dimension.high
+        return ((self.of(case) or low) - low) / (high - low)
+
     def text(self, case: Case) -> str:
         """Return the value as it stands in a table; empty where there is none."""
         value = self.of(case)

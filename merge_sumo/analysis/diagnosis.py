@@ -1,4 +1,4 @@
-"""What went wrong in a failure, in words: which vehicle braked when, its kind, and where it lies.
+"""The course of a failure in words: which vehicle braked when, its kind, and where it lies.
 
 All words follow from the recorded speeds and from the order at M. A vehicle brakes where its speed
 falls `BRAKED_MPS` below the highest it had before; it begins when it last had that speed. It
@@ -8,10 +8,12 @@ taken for a decision.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, Self
 
 import numpy as np
 
@@ -26,7 +28,6 @@ from merge_sumo.values.scenario import (
     VUT,
     MergeScenario,
     Scenario,
-    level_name,
 )
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import Trajectory
@@ -37,23 +38,24 @@ ROUNDING_MPS: Final = 1e-6
 
 
 class Kind(StrEnum):
-    """Kinds of failures under the paper's rule; each such failure is of exactly one."""
+    """Kinds of failures under the paper's rule; each such failure is of exactly one.
 
-    STALEMATE = "stalemate"
-    SQUEEZE = "squeeze"
-    POV_BRAKES = "only the POV brakes"
-    LATE_BRAKE = "late brake"
-    WEAK_BRAKE = "weak brake"
+    "Together" is |dx| < 6 m at M, a way out full braking or acceleration.
+    """
 
+    meaning: str
 
-MEANING: Final[dict[Kind, str]] = {
-    Kind.STALEMATE: "both brake, and arrive together",
-    Kind.SQUEEZE: "neither brakes, and both arrive together",
-    Kind.POV_BRAKES: "the VUT does not brake, and both arrive together",
-    Kind.LATE_BRAKE: "only the VUT brakes, and begins when no way out is left",
-    Kind.WEAK_BRAKE: "only the VUT brakes, and begins while a way out is left",
-}
-"""What the kinds mean: "together" is |dx| < 6 m at M, a way out full braking or acceleration."""
+    STALEMATE = "stalemate", "both brake, and arrive together"
+    SQUEEZE = "squeeze", "neither brakes, and both arrive together"
+    POV_BRAKES = "only the POV brakes", "the VUT does not brake, and both arrive together"
+    LATE_BRAKE = "late brake", "only the VUT brakes, and begins when no way out is left"
+    WEAK_BRAKE = "weak brake", "only the VUT brakes, and begins while a way out is left"
+
+    def __new__(cls, name: str, meaning: str) -> Self:
+        """Make a kind of its name, and keep what it means."""
+        kind = str.__new__(cls, name)
+        kind._value_, kind.meaning = name, meaning
+        return kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,11 +78,11 @@ def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
     In traffic the POV is the car that the measures are of: the nearest to the VUT at the end.
     """
     trajectory = trajectory.facing(VEHICLES.index(measures.nearest))
-    speeds_mps = trajectory.v_vut_mps, trajectory.v_pov_mps
-    vut_s, pov_s = (_brakes_s(v_mps) for v_mps in speeds_mps)
-    vut, pov = (_accelerates(v_mps) for v_mps in speeds_mps)
+    vut_mps, pov_mps = trajectory.v_vut_mps, trajectory.v_pov_mps
+    vut_s, pov_s = _brakes_s(vut_mps), _brakes_s(pov_mps)
     kind = _kind(vut_s, pov_s, measures.last_avoidable_s) if measures.is_close else None
-    return Diagnosis(vut_s, pov_s, vut_s is None and vut, pov_s is None and pov, kind)
+    accelerates = vut_s is None and _gains(vut_mps), pov_s is None and _gains(pov_mps)
+    return Diagnosis(vut_s, pov_s, *accelerates, kind)
 
 
 def _brakes_s(v_mps: FloatArray) -> float | None:
@@ -93,7 +95,7 @@ def _brakes_s(v_mps: FloatArray) -> float | None:
     return round(float(at_highest[-1]) * DT_S, 1)
 
 
-def _accelerates(v_mps: FloatArray) -> bool:
+def _gains(v_mps: FloatArray) -> bool:
     """Return whether a vehicle of speeds (T + 1,) became faster than it had been."""
     gained_mps = v_mps - np.minimum.accumulate(v_mps)
     return bool(gained_mps.max() >= BRAKED_MPS - ROUNDING_MPS)
@@ -110,7 +112,14 @@ def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | Non
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """What a sentence says of a case: a coordinate of the pool, or the time it makes for."""
+    """An axis of regions in words: a coordinate of the pool, or the time it makes for.
+
+    Attributes:
+        name: its name.
+        unit: its unit.
+        decimals: with which bounds are written.
+        value: returns the value of a case.
+    """
 
     name: str
     unit: str
@@ -121,42 +130,43 @@ class Feature:
 DECIMALS: Final = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
 """With which bounds of regions are written, by unit."""
 NAMED: Final = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
-
-
-def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
-    """Return what sentences on a level speak of.
-
-    Of a merge it is beside the coordinates the time at which a car would reach M at constant speed:
-    failures lie in bands along which it is the same.
-    """
-    features = tuple(_of_coordinate(c) for c in coordinates(scenario, (level,)))
-    if not isinstance(scenario, MergeScenario):
-        return features
-    x, v, *others = features
-    cars = [row for row in range(scenario.vehicles) if row != VUT]
-    return (*(_due(row) for row in cars), v, x, *others)
-
-
-def _of_coordinate(c: Coordinate) -> Feature:
-    digits = DECIMALS.get(c.unit, c.digits)
-    return Feature(c.name, c.unit, digits, lambda case: c.of(case) or 0.0)
-
-
-def _due(row: int) -> Feature:
-    def due_s(case: Case) -> float:
-        x_m, v_mps = case.starts()[row]
-        return -x_m / v_mps if v_mps > 0.0 else case.scenario.timeout_s
-
-    return Feature(f"{NAMED[row]} due at M (at constant speed)", "s", 2, due_s)
-
-
 MOST_BOXES: Final = 10
 """Leaves of the decision tree of a level."""
 FEWEST_FAILURES: Final = 3
 """Failures that make a region worth a sentence; of fewer, the cases speak for themselves."""
 
+Bounds = tuple[tuple[Feature, float, float], ...]
+"""(feature, low, high), rounded as it is written; infinite where nothing bounds it."""
 
-Bounds = tuple[tuple[Feature, float | None, float | None], ...]
+
+def _value(coordinate: Coordinate, case: Case) -> float:
+    return coordinate.of(case) or 0.0
+
+
+def _due_s(row: int, case: Case) -> float:
+    x_m, v_mps = case.starts()[row]
+    return -x_m / v_mps if v_mps > 0.0 else case.scenario.timeout_s
+
+
+def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
+    """Return what regions of a level are bounded in.
+
+    Of a merge it is beside the coordinates the time at which a car would reach M at constant speed:
+    failures lie in bands along which it is the same.
+    """
+    own = [
+        Feature(c.name, c.unit, DECIMALS.get(c.unit, c.digits), partial(_value, c))
+        for c in coordinates(scenario, (level,))
+    ]
+    if not isinstance(scenario, MergeScenario):
+        return tuple(own)
+    due = [
+        Feature(f"{NAMED[row]} due at M (at constant speed)", "s", 2, partial(_due_s, row))
+        for row in range(scenario.vehicles)
+        if row != VUT
+    ]
+    x, v, *others = own
+    return (*due, v, x, *others)
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,28 +175,34 @@ class FailureBox:
 
     Attributes:
         level: POV level.
-        bounds: (feature, low, high), rounded as it is written; None where nothing bounds it.
-        cases: cases of the run inside, by the bounds as written, and the failures among them.
-        indices: the cases.
+        bounds: its bounds.
+        indices: cases of the run inside, by the bounds as written.
+        failures: number of failures among them.
     """
 
     level: int
     bounds: Bounds
-    cases: int
-    failures: int
     indices: tuple[int, ...]
+    failures: int
+
+    @property
+    def cases(self) -> int:
+        """Number of cases inside."""
+        return len(self.indices)
 
     @property
     def where(self) -> str:
-        """Return the bounds in words."""
-        parts = [words for bounds in self.bounds if (words := _in_words(*bounds))]
+        """The bounds in words."""
+        parts = []
+        for axis, *bounds in self.bounds:
+            low, high = (f"{bound:.{axis.decimals}f}" for bound in bounds)
+            is_bounded = [math.isfinite(bound) for bound in bounds]
+            if all(is_bounded):
+                parts.append(f"{axis.name} between {low} and {high} {axis.unit}")
+            elif any(is_bounded):
+                side = f"above {low}" if is_bounded[0] else f"below {high}"
+                parts.append(f"{axis.name} {side} {axis.unit}")
         return " and ".join(parts) or "anywhere"
-
-    @property
-    def sentence(self) -> str:
-        """Return the box as a sentence."""
-        where = f"POV level {level_name(self.level)}, {self.where}"
-        return f"{where}: {self.failures} of {self.cases} cases fail."
 
 
 def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
@@ -196,14 +212,14 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
     others; its leaves with at least as many failures as other cases are the boxes, joined where
     siblings are. The shares are of cases that a sampler chose: they are no probabilities.
     """
-    scored = [o for o in outcomes if o.case.level == level and o.margin is not None]
-    failed = np.array([o.failed for o in scored], dtype=bool)
+    judged = [o for o in outcomes if o.case.level == level and o.margin is not None]
+    failed = np.array([o.failed for o in judged], dtype=bool)
     if failed.sum() < FEWEST_FAILURES:
         return []
     from sklearn.tree import DecisionTreeClassifier
 
-    axes = features(scored[0].case.scenario, level)
-    places = np.array([[feature.value(o.case) for feature in axes] for o in scored])
+    axes = features(judged[0].case.scenario, level)
+    places = np.array([[feature.value(o.case) for feature in axes] for o in judged])
     tree = DecisionTreeClassifier(
         max_leaf_nodes=MOST_BOXES,
         min_samples_leaf=FEWEST_FAILURES,
@@ -212,11 +228,19 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
     ).fit(places, failed)
     leaf = tree.apply(places)
     failing = {node for node in set(leaf.tolist()) if failed[leaf == node].mean() >= 0.5}
-    boxes = [
-        _box(level, _rounded(axes, low, high), scored)
-        for low, high in _leaf_boxes(tree.tree_, failing, len(axes))
-    ]
-    boxes = [box for box in boxes if box.failures >= FEWEST_FAILURES]
+    boxes = []
+    for bounds in _leaf_boxes(tree.tree_, failing, len(axes)):
+        # Rounding may move a case over a bound: what is counted is what is written.
+        low, high = (
+            [round(x, axis.decimals) for axis, x in zip(axes, side.tolist(), strict=True)]
+            for side in bounds
+        )
+        inside = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1)).tolist()
+        failures = int(failed[inside].sum())
+        if failures >= FEWEST_FAILURES:
+            indices = tuple(judged[place].index for place in inside)
+            written = tuple(zip(axes, low, high, strict=True))
+            boxes.append(FailureBox(level, written, indices, failures))
     return sorted(boxes, key=lambda box: -box.failures)
 
 
@@ -228,51 +252,14 @@ def _leaf_boxes(tree: Any, failing: set[int], dims: int) -> Iterator[tuple[Float
             return node in failing
         return all_fail(tree.children_left[node]) and all_fail(tree.children_right[node])
 
-    def walk(
-        node: int, low: FloatArray, high: FloatArray
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+    rest = [(0, np.full(dims, -np.inf), np.full(dims, np.inf))]
+    while rest:
+        node, low, high = rest.pop()
         if all_fail(node):
             yield low, high
         elif tree.children_left[node] >= 0:
             dim, at = tree.feature[node], tree.threshold[node]
             below, above = high.copy(), low.copy()
-            below[dim], above[dim] = at, at
-            yield from walk(tree.children_left[node], low, below)
-            yield from walk(tree.children_right[node], above, high)
-
-    yield from walk(0, np.full(dims, -np.inf), np.full(dims, np.inf))
-
-
-def _rounded(axes: Sequence[Feature], low: FloatArray, high: FloatArray) -> Bounds:
-    def written(feature: Feature, value: float) -> float | None:
-        return round(value, feature.decimals) if np.isfinite(value) else None
-
-    return tuple(
-        (feature, written(feature, a), written(feature, b))
-        for feature, a, b in zip(axes, low.tolist(), high.tolist(), strict=True)
-    )
-
-
-def _box(level: int, bounds: Bounds, scored: Sequence[Outcome]) -> FailureBox:
-    inside = [o for o in scored if _inside(o, bounds)]
-    failures = sum(o.failed for o in inside)
-    return FailureBox(level, bounds, len(inside), failures, tuple(o.index for o in inside))
-
-
-def _inside(outcome: Outcome, bounds: Bounds) -> bool:
-    return all(
-        (low is None or feature.value(outcome.case) >= low)
-        and (high is None or feature.value(outcome.case) <= high)
-        for feature, low, high in bounds
-    )
-
-
-def _in_words(feature: Feature, low: float | None, high: float | None) -> str:
-    name, unit, decimals = feature.name, feature.unit, feature.decimals
-    if low is not None and high is not None:
-        return f"{name} between {low:.{decimals}f} and {high:.{decimals}f} {unit}"
-    if low is not None:
-        return f"{name} above {low:.{decimals}f} {unit}"
-    if high is not None:
-        return f"{name} below {high:.{decimals}f} {unit}"
-    return ""
+            below[dim] = above[dim] = at
+            rest.append((tree.children_right[node], above, high))
+            rest.append((tree.children_left[node], low, below))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from merge_sumo.values.case import to_unit
@@ -61,12 +61,12 @@ def summarise(
         cases=len(outcomes),
         failures=sum(outcome.failed for outcome in outcomes),
         ends={end.value: ends[end] for end in End if ends[end]},
-        severities=severities_of(outcomes),
+        severities=_severities(outcomes),
         levels={level: _level(outcomes, level) for level in every},
     )
 
 
-def severities_of(outcomes: Iterable[Outcome]) -> dict[str, int]:
+def _severities(outcomes: Sequence[Outcome]) -> dict[str, int]:
     """Return the number of cases of each severity that occurs, the most severe first."""
     counts = Counter(outcome.measures.severity for outcome in outcomes)
     return {severity.value: counts[severity] for severity in Severity if counts[severity]}
@@ -79,7 +79,7 @@ def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
         cases=len(at_level),
         tested=sum(outcome.is_tested for outcome in at_level),
         failures=len(points),
-        severities=severities_of(at_level),
+        severities=_severities(at_level),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -87,16 +87,23 @@ class Verdict:
 
     @property
     def nothing_tested(self) -> str:
-        """Return that no case was tested, as a sentence without its full stop."""
+        """A sentence, without its full stop, on a campaign in which no case was tested."""
         safely = " without an error" if self.errors else ""
         return f"nothing was tested: the VUT reached {self.goal}{safely} in no case"
 
     @property
+    def found(self) -> list[str]:
+        """The numbers in words: errors and timeouts, where there are any, then failures."""
+        wrong = ((self.errors, "error"), (self.timeouts, "timeout"))
+        return [*(counted(n, what) for n, what in wrong if n), counted(self.failures, "failure")]
+
+    @property
     def counts(self) -> str:
-        """Return the result in a line: errors and timeouts, where there are any, then failures."""
-        counts = in_counts(self.errors, self.timeouts, self.failures)
+        """The result in a line."""
+        *wrong, failures = self.found
+        counts = f"{', '.join(wrong)} and {failures}" if wrong else failures
         contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
-        return f"{in_words(counts)}{contacts} in {counted(self.cases, 'case')}"
+        return f"{counts}{contacts} in {counted(self.cases, 'case')}"
 
     def trouble_lines(self) -> list[str]:
         """Return what ended in an error or a timeout, by message; empty where nothing did."""
@@ -123,27 +130,27 @@ class Verdict:
 
 def judge(outcomes: Iterable[Outcome]) -> Verdict:
     """Return the verdict on outcomes."""
-    cases = failures = contacts = errors = timeouts = 0
-    goal = Scenario.default_goal
-    groups: dict[tuple[End, str], tuple[str, list[int]]] = {}
-    for outcome in outcomes:
-        cases += 1
-        goal = outcome.case.scenario.goal
-        measures = outcome.measures
-        failures += outcome.failed
-        contacts += outcome.failed and measures.severity == Severity.CONTACT
-        if outcome.is_tested:
-            continue
-        errors += measures.end.is_error
-        timeouts += not measures.end.is_error
-        message = message_of(outcome)
-        key = measures.end, _VARYING.sub("#", message)
-        groups.setdefault(key, (message, []))[1].append(outcome.index)
+    ran = list(outcomes)
+    failed = [o for o in ran if o.failed]
+    wrong = [o for o in ran if not o.is_tested]
+    errors = sum(o.measures.end.is_error for o in wrong)
+    groups: dict[tuple[End, str], list[Outcome]] = {}
+    for outcome in wrong:
+        key = outcome.measures.end, _VARYING.sub("#", message_of(outcome))
+        groups.setdefault(key, []).append(outcome)
     troubles = [
-        Trouble(end, message, tuple(indices)) for (end, _), (message, indices) in groups.items()
+        Trouble(end, message_of(same[0]), tuple(o.index for o in same))
+        for (end, _), same in groups.items()
     ]
-    troubles.sort(key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))
-    return Verdict(cases, failures, contacts, errors, timeouts, tuple(troubles), goal)
+    return Verdict(
+        cases=len(ran),
+        failures=len(failed),
+        contacts=sum(o.measures.severity == Severity.CONTACT for o in failed),
+        errors=errors,
+        timeouts=len(wrong) - errors,
+        troubles=tuple(sorted(troubles, key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))),
+        goal=ran[0].case.scenario.goal if ran else Scenario.default_goal,
+    )
 
 
 def message_of(outcome: Outcome) -> str:
@@ -162,28 +169,18 @@ def shortened(text: str, characters: int) -> str:
     return text if len(text) <= characters else text[: characters - 3] + "..."
 
 
-def in_counts(errors: int, timeouts: int, failures: int) -> list[str]:
-    """Return the numbers in words: errors and timeouts only where there are any, then failures."""
-    wrong = [counted(n, what) for n, what in ((errors, "error"), (timeouts, "timeout")) if n]
-    return [*wrong, counted(failures, "failure")]
-
-
-def in_words(parts: Sequence[str]) -> str:
-    """Return a list in words: a, b and c."""
-    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
-
-
 REGRESSIONS: Final = "regressions"
 """The gate that counts the cases that fail and pass with an earlier version of the VUT."""
+NUMBERS: Final = ("failures", "errors", "timeouts", REGRESSIONS)
+"""Gates that are met by one case."""
 
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """What a campaign must not show: more than `above` of something.
+    """A bound that a campaign must not exceed.
 
     Attributes:
-        what: "failures", "errors", "timeouts", "regressions" (a number of cases) or "fmc" (at
-            some POV level).
+        what: one of `NUMBERS`, or "fmc", the coverage at some POV level.
         above: the gate is met beyond this.
     """
 
@@ -202,15 +199,12 @@ class Gate:
         against.
         """
         if self.what == "fmc":
-            level, most = max(
-                ((level, of_level.fmc) for level, of_level in summary.levels.items()),
-                key=lambda pair: pair[1],
-                default=(0, 0.0),
-            )
+            by_level = {level: found.fmc for level, found in summary.levels.items()}
+            level = max(by_level, key=lambda level: by_level[level], default=0)
+            most = by_level.get(level, 0.0)
             said = f"FMC {most:.4f} at level {level_name(level)}"
             return GateResult(self.name, most > self.above, said)
-        regressed = self.what == REGRESSIONS
-        number: int = regressions if regressed else getattr(verdict, self.what)
+        number = regressions if self.what == REGRESSIONS else getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
 
 
@@ -224,42 +218,36 @@ class GateResult:
 
     @property
     def sentence(self) -> str:
-        """Return it as a line."""
+        """The result as a line."""
         return f"gate {self.name}: {'met' if self.met else 'not met'} ({self.found})"
 
 
 def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
-    """Return the gates that `--gate` names, each once; `UserError` for what is none.
+    """Return gates by their names, each once; `UserError` for what is none.
 
     `against` is whether the campaign is against an earlier version of the VUT.
     """
     gates: dict[str, Gate] = {}
     for text in texts:
-        gate = _parse_gate(text)
-        if gate.what == REGRESSIONS and not against:
+        what, _, number = (part.strip() for part in text.partition(">"))
+        if text not in NUMBERS and (what != "fmc" or ">" not in text):
             raise UserError(
-                f"--gate {REGRESSIONS} needs an earlier version of the VUT: name it with --against"
+                f"there is no gate {printable(text)!r}: choose {', '.join(NUMBERS)} or "
+                '"fmc>X" (in quotes, or the shell takes the ">")'
             )
+        if text == REGRESSIONS and not against:
+            raise UserError(
+                f"the gate {text} needs an earlier version that the campaign is against"
+            )
+        try:
+            above = 0.0 if text in NUMBERS else float(number)
+        except ValueError:
+            above = math.nan
+        if not 0.0 <= above < 1.0:
+            raise UserError(
+                f'the gate {printable(text)!r} can never be told: X of "fmc>X" is a number from 0 '
+                "to below 1"
+            )
+        gate = Gate(what, above)
         gates[gate.name] = gate
     return list(gates.values())
-
-
-def _parse_gate(text: str) -> Gate:
-    if text in ("failures", "errors", "timeouts", REGRESSIONS):
-        return Gate(text)
-    what, sign, number = (part.strip() for part in text.partition(">"))
-    if (what, sign) != ("fmc", ">"):
-        raise UserError(
-            f"there is no gate {printable(text)!r}: choose failures, "
-            f'errors, timeouts, {REGRESSIONS} or "fmc>X" (in quotes, or the shell takes the ">")'
-        )
-    try:
-        above = float(number)
-    except ValueError:
-        above = math.nan
-    if not 0.0 <= above < 1.0:
-        raise UserError(
-            f'the gate {printable(text)!r} can never be told: X of "fmc>X" is a number from 0 to '
-            "below 1"
-        )
-    return Gate("fmc", above)

@@ -75,7 +75,6 @@ from merge_sumo.drivers.policies import scenario_of as policies_scenario
 from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.comparison_page import comparison_page
@@ -88,7 +87,7 @@ from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.finder import find_corridor
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
@@ -125,7 +124,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
-from merge_sumo.system.workers import Workers, workers_or_cores
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.chance import MOST_RUNS
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
@@ -297,14 +296,7 @@ def _write_findings(
             write_avoidance(done.folder, known)
     explanation.note_explanation(done, plan, workers=opened, check=checks)
     link_latest(done.folder)
-    # Learned on another machine, surrogates may differ in a last bit. More workers than cores
-    # would learn each surrogate more often than that saves time.
-    local = (
-        opened
-        if not isinstance(runner.workers, str) and opened.count <= workers_or_cores(None)
-        else None
-    )
-    write_report(done, result.summary, local, page)
+    write_report(done, result.summary, page)
 
 
 def _notice(sentence: str) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.merging import MergeStatistics, merging_of
 from merge_sumo.analysis.plausibility import doubts
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import Summary, summarise
@@ -150,11 +149,6 @@ class CampaignRun(Result):
         return summarise(self._run.outcomes, self._run.levels, self._run.tolerated)
 
     @cached_property
-    def merging(self) -> MergeStatistics | None:
-        """Where on an acceleration lane the VUT merges, and by which gaps; None without a lane."""
-        return merging_of(self._run.cases)
-
-    @cached_property
     def facts(self) -> list[Fact]:
         """Each fact of the campaign, with the file and the key that it is from."""
         return facts_of(self._run, self.summary, self.verdict)
@@ -230,7 +224,6 @@ class CampaignRun(Result):
             *self.verdict.trouble_lines(),
             *table_lines(self.facts),
             *(f"  {fact.name}: {fact.shown}" for fact in told),
-            None if self.merging is None else f"  {self.merging.sentence}",
             f"  {run.ran_again_in_words}" if run.ran_again else None,
             *(f"  note: {note}" for note in doubts(run.cases, run.criterion)),
             *self._against_lines(),

@@ -25,10 +25,10 @@ from merge_sumo.engine.evaluate import (
     workers_or_here,
 )
 from merge_sumo.engine.plan import SimulationPlan, differences
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_for
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import TakenError, check_new, check_own

@@ -8,8 +8,8 @@ from typing import Final
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import Povs, own_pov, policies_folder
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_for
 from merge_sumo.vuts.registry import VutFactory
 
 DEBUG_DEADLINE_S: Final = 86_400.0

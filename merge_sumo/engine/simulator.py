@@ -14,10 +14,7 @@ from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.world import World
-from merge_sumo.system.resources import resource
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import Scenario, lane_of
 from merge_sumo.values.trajectory import Trajectory
@@ -113,16 +110,3 @@ def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None 
     """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
     library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
     return library if lane_of(scenario) is None else LanePov(library)
-
-
-def road_for(scenario: Scenario) -> Corridor:
-    """Return the road of a scenario.
-
-    Raises `UserError` where there is no such merge, or not room enough for its vehicles.
-    """
-    # Where a path says nothing of folders, the net is one that the package brings.
-    net = None if scenario.net is None else resource("sumo_net") / scenario.net
-    edges = scenario.pov_edges, scenario.vut_edges
-    road = road_of(net, *edges, scenario.room_after_m, lane_of(scenario))
-    road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
-    return road

@@ -6,6 +6,7 @@ Nothing here loads libsumo.
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -49,7 +50,6 @@ WHEEL_M: Final = 0.7
 MERGED_S: Final = 1.0
 """For which a recorded scenario goes on where the VUT has merged from an acceleration lane."""
 
-Row = tuple[float | str | None, ...]
 WriteCase = Callable[[Run, int, Path, Corridor], Path]
 """Writes a case of a run into a new folder; returns the path of the file to open."""
 
@@ -73,18 +73,6 @@ def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
 
 
-def columns_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the columns of a table: time and motion of all vehicles, the case, its severity."""
-    motion = [
-        f"{what}_{who}_{unit}"
-        for who in VEHICLES[: scenario.vehicles]
-        for what, unit in (("x", "m"), ("v", "mps"), ("a", "mps2"))
-    ]
-    merged = () if lane_of(scenario) is None else (MERGED,)
-    place = (c.field for c in coordinates(scenario))
-    return ("case", "level", "time_s", *motion, *merged, *place, SEVERITY)
-
-
 def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
     """Write the motion of cases as one table, one row a step; return its path.
 
@@ -93,60 +81,54 @@ def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
     check_place(folder)
     path = folder / f"{TABLE}.csv"
     check_new(path)
-    names = _signal_names(run, indices)
-    columns = (*columns_of(run.scenario), *(f"{SIGNAL}{name}" for name in names))
-    rows = _rows(run, indices, names)
+    rows = [row for index in indices for row in _rows(run, index)]
+    signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
     make_place(folder)
     with new_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.writer(text)
-        writer.writerow(columns)
-        writer.writerows(map(_without_formulas, rows))
+        writer = csv.DictWriter(text, (*columns_of(run.scenario), *signals))
+        writer.writeheader()
+        writer.writerows(rows)
         text.flush()
         text.detach()
     return path
 
 
-def _signal_names(run: Run, indices: Sequence[int]) -> list[str]:
-    """Return the names of the signals of cases, in the order in which they first come."""
-    cases = (run.trajectory(index).signals or {} for index in indices)
-    return list(dict.fromkeys(name for signals in cases for name in signals))
+def columns_of(scenario: Scenario) -> tuple[str, ...]:
+    """Return the columns of a table: time and motion of all vehicles, the case, its severity."""
+    merged = () if lane_of(scenario) is None else (MERGED,)
+    place = (c.field for c in coordinates(scenario))
+    return ("case", "level", "time_s", *_motion(scenario), *merged, *place, SEVERITY)
 
 
-def _without_formulas(row: Row) -> Row:
-    """Return a row in which no text is a formula."""
-    return tuple(
-        f"'{value}" if isinstance(value, str) and value.startswith(FORMULA) else value
-        for value in row
-    )
+def _motion(scenario: Scenario) -> list[str]:
+    parts = (("x", "m"), ("v", "mps"), ("a", "mps2"))
+    cars = VEHICLES[: scenario.vehicles]
+    return [f"{what}_{who}_{unit}" for who in cars for what, unit in parts]
 
 
-def _rows(run: Run, indices: Sequence[int], names: Sequence[str]) -> list[Row]:
-    rows: list[Row] = []
-    has_lane = lane_of(run.scenario) is not None
-    for index in indices:
-        trajectory = run.trajectory(index)
-        case = trajectory.case
-        place = [c.of(case) for c in coordinates(run.scenario)]
-        severity = run.outcome(index).measures.severity
-        left = trajectory.signals or {}
-        signals = [left.get(name, (None,) * len(trajectory.motion)) for name in names]
-        motion = trajectory.motion.reshape(len(trajectory.motion), -1)
-        merged = merged_rows(trajectory).tolist() if has_lane else None
-        for step, state in enumerate(motion.tolist()):
-            rows.append(
-                (
-                    index,
-                    case.level,
-                    round(step * DT_S, 1),
-                    *state,
-                    *(() if merged is None else (int(merged[step]),)),
-                    *place,
-                    severity,
-                    *(values[step] for values in signals),
-                )
-            )
-    return rows
+def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a case by column; no text in them is a formula."""
+    trajectory, scenario = run.trajectory(index), run.scenario
+    case, names = trajectory.case, _motion(scenario)
+    start = {c.field: c.of(case) for c in coordinates(scenario)}
+    merged = merged_rows(trajectory)
+    severity = run.outcome(index).measures.severity
+    for step, state in enumerate(trajectory.motion.reshape(len(trajectory.motion), -1).tolist()):
+        row: dict[str, Any] = {
+            "case": index,
+            "level": case.level,
+            "time_s": round(step * DT_S, 1),
+            **start,
+        }
+        row |= {**dict(zip(names, state, strict=True)), SEVERITY: severity}
+        if lane_of(scenario) is not None:
+            row[MERGED] = int(merged[step])
+        for name, values in (trajectory.signals or {}).items():
+            value = values[step]
+            is_formula = isinstance(value, str) and value.startswith(FORMULA)
+            row[f"{SIGNAL}{name}"] = f"'{value}" if is_formula else value
+        yield row
 
 
 def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Path:
@@ -165,7 +147,13 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
     folder exists or the package scenariogeneration is missing.
     """
-    scenariogeneration = _need("scenariogeneration")
+    try:
+        importlib.import_module("scenariogeneration.xosc")
+        scenariogeneration: Any = importlib.import_module("scenariogeneration")
+    except ImportError as error:
+        raise UserError(
+            "this format needs scenariogeneration: run `pip install 'merge-sumo[export]'`"
+        ) from error
     xosc, prettify = scenariogeneration.xosc, scenariogeneration.prettify
     trajectory, name = run.trajectory(index), case_name(index)
     title = f"{run.vut}, {name} ({run.outcome(index).measures.became})"
@@ -191,9 +179,7 @@ def _scenario(
         afterwards = _afterwards(xosc, trajectory, row) if free or changes_lane else []
         init.add_init_action(who, xosc.TeleportAction(places[0]))
         init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, row, 1])))
-        if not free:
-            act.add_maneuver_group(_follow(xosc, who, places, afterwards))
-        elif row == VUT:
+        if free and row == VUT:
             controller = xosc.Controller(f"${CONTROLLER}", xosc.Properties())
             init.add_init_action(who, xosc.AssignControllerAction(controller))
         else:
@@ -206,8 +192,7 @@ def _scenario(
     board.add_story(story)
     parameters = xosc.ParameterDeclarations()
     if free:
-        kind = xosc.ParameterType.string
-        parameters.add_parameter(xosc.Parameter(CONTROLLER, kind, "user"))
+        parameters.add_parameter(xosc.Parameter(CONTROLLER, xosc.ParameterType.string, "user"))
     return xosc.Scenario(
         title,
         "merge-sumo",
@@ -222,31 +207,6 @@ def _scenario(
     )
 
 
-def _need(package: str) -> Any:
-    """Import a package of the extra "export"; `UserError` when it is missing."""
-    from importlib import import_module
-
-    try:
-        module = import_module(package)
-        if package == "scenariogeneration":
-            import_module(f"{package}.xosc")
-    except ImportError as error:
-        raise UserError(
-            f"this format needs {package}: run `pip install 'merge-sumo[export]'`"
-        ) from error
-    return module
-
-
-def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list[Any]:
-    """Return the places of a car at all steps."""
-    return [
-        _place(xosc, road, x_m, on_ramp=row == VUT and not merged)
-        for x_m, merged in zip(
-            trajectory.motion[:, row, 0].tolist(), merged_rows(trajectory).tolist(), strict=True
-        )
-    ]
-
-
 def _afterwards(xosc: Any, trajectory: Trajectory, row: int) -> list[tuple[str, Any]]:
     """Return what a car does behind its trajectory, as names and actions."""
     who = VEHICLES[row]
@@ -257,11 +217,17 @@ def _afterwards(xosc: Any, trajectory: Trajectory, row: int) -> list[tuple[str, 
     return actions
 
 
-def _place(xosc: Any, road: Corridor, x_m: float, *, on_ramp: bool) -> Any:
-    _, _, x, y, angle_deg = road.lane_point(x_m, on_ramp=on_ramp)
-    # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
-    heading = math.remainder(math.radians(90.0 - angle_deg), 2.0 * math.pi)
-    return xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9))
+def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list[Any]:
+    """Return the places of a car at all steps."""
+    places = []
+    for x_m, merged in zip(
+        trajectory.motion[:, row, 0].tolist(), merged_rows(trajectory).tolist(), strict=True
+    ):
+        _, _, x, y, angle_deg = road.lane_point(x_m, on_ramp=row == VUT and not merged)
+        # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
+        heading = math.remainder(math.radians(90.0 - angle_deg), 2.0 * math.pi)
+        places.append(xosc.WorldPosition(round(x, 9), round(y, 9), 0.0, round(heading, 9)))
+    return places
 
 
 def _follow(

@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.summary import LevelSummary, Summary
 from merge_sumo.analysis.verdict import Verdict
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
@@ -22,12 +21,13 @@ from merge_sumo.studies.stress import STRESS, stress_of
 from merge_sumo.system.printable import printable
 from merge_sumo.values.chance import MOST_RUNS, by_case, is_decided
 from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import level_name
+from merge_sumo.values.scenario import lane_of, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
 
 PERCENT: Final = "%"
-TABLE: Final = ("cases", "without a verdict", "failures", "regions", "FMC")
+PLACE: Final = "place of the merge, median"
+TABLE: Final = ("cases", "without a verdict", "failures", "regions", "FMC", PLACE)
 """Facts of levels that stand in the table of a terminal."""
 FAILING: Final = "margin < 0"
 """By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
@@ -167,18 +167,25 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         yield fact("regions", found.regions, f"{FAILING}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
         yield fact("FMC", found.fmc, f"{FAILING}: starts within {radius:.2g}")
-    merging = merging_of(o for o in run.cases if o.case.level == level)
-    if merging is not None:
-        yield fact("merges where the lane ends", merging.forced, "lane_share >= 1")
-        yield fact("cases that stood on the lane", merging.stood, "stood_s > 0")
-        for name, value, unit, key in (
-            ("place of the merge", merging.lane_share, "% of the lane", "lane_share"),
-            ("time gap ahead", merging.time_gap_ahead_s, "s", "time_gap_ahead_s"),
-            ("time gap behind", merging.time_gap_behind_s, "s", "time_gap_behind_s"),
-        ):
-            if value is not None:
-                scale = 100.0 if unit.startswith("%") else 1.0
-                yield fact(f"{name}, median", scale * value, key, unit)
+    if lane_of(run.scenario) is not None:
+        yield from _of_lane(run, level)
+
+
+def _of_lane(run: Run, level: int) -> Iterator[Fact]:
+    """Yield where on the acceleration lane the VUT merges, and into which gaps."""
+    at_level = [o.measures for o in run.cases if o.case.level == level]
+    forced = sum((found.lane_share or 0.0) >= 1.0 for found in at_level)
+    stood = sum(found.stood_s > 0.0 for found in at_level)
+    yield Fact("merges where the lane ends", forced, "", OUTCOMES, "lane_share >= 1", level)
+    yield Fact("cases that stood on the lane", stood, "", OUTCOMES, "stood_s > 0", level)
+    for name, key, unit, scale in (
+        (PLACE, "lane_share", "% of the lane", 100.0),
+        ("time gap ahead, median", "time_gap_ahead_s", "s", 1.0),
+        ("time gap behind, median", "time_gap_behind_s", "s", 1.0),
+    ):
+        known = [value for found in at_level if (value := found.value(key)) is not None]
+        if known:
+            yield Fact(name, scale * statistics.median(known), unit, OUTCOMES, key, level)
 
 
 def _repeats(run: Run) -> Iterator[Fact]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import importlib
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -22,27 +22,28 @@ from merge_sumo.studies.sampler_study import SamplerStudy
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.values.case import FloatArray, dimensions
 from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import OWN, US23, Dimension, level_name
+from merge_sumo.values.scenario import OWN, US23, level_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 TRUTH: Final = "truth"
-TRUTH_COLOUR: Final = "#000000"
-LEVEL_COLOURS: Final = {0: "#000000", 1: "#CC79A7", 2: "#56B4E9", OWN: "#009E73"}
-LEVEL_MARKERS: Final = {0: "o", 1: "s", 2: "^", OWN: "D"}
+LEVEL_LOOKS: Final = {
+    0: ("#000000", "o"),
+    1: ("#CC79A7", "s"),
+    2: ("#56B4E9", "^"),
+    OWN: ("#009E73", "D"),
+}
+"""Colour and marker of each level."""
 SAFE_COLOUR: Final = "#c4c9cf"
 DPI: Final = 150
 KINDS: Final = (".png", ".svg")
 STYLE: Final[Any] = {
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.grid": False,
+    "figure.titleweight": "bold",
     "legend.frameon": False,
     "svg.hashsalt": "merge-sumo",
     "svg.fonttype": "path",
@@ -79,68 +80,42 @@ def save(figure: Figure, path: Path) -> None:
 
 
 @contextmanager
-def _drawing(width: float, height: float) -> Iterator[Figure]:
-    """Give an empty figure of a size in inches, and our style while it is drawn."""
+def _drawing(title: str, width: float, height: float) -> Iterator[Figure]:
+    """Give a figure of a size in inches with a title alone, and our style while it is drawn."""
     require_matplotlib()
     import matplotlib
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
-        yield Figure(figsize=(width, height), layout="constrained", facecolor="white")
+        figure = Figure(figsize=(width, height), layout="constrained", facecolor="white")
+        figure.suptitle(title, x=0.01, ha="left")
+        yield figure
 
 
 def colour(name: str) -> str:
     """Return the colour of a sampler, or of the truth."""
-    return TRUTH_COLOUR if name == TRUTH else SAMPLERS[name].colour
+    return "#000000" if name == TRUTH else SAMPLERS[name].colour
 
 
-def coverage_curves(
-    title: str,
-    study: SamplerStudy,
-) -> Figure:
+def coverage_curves(title: str, study: SamplerStudy) -> Figure:
     """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle."""
-    oracle = study.oracle_fmc
-    with _drawing(7.5, 4.6) as figure:
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+    with _drawing(title, 7.5, 4.6) as figure:
         axes = figure.subplots()
-        ends = []
         for name, result in study.samplers.items():
             cases = [0, *result.cases_by_batch]
             low, median, high = ([0.0, *band] for band in result.fmc_by_batch)
             axes.fill_between(cases, low, high, color=colour(name), alpha=0.18, linewidth=0)
-            axes.plot(cases, median, color=colour(name), lw=2)
-            ends.append((median[-1], name, colour(name)))
+            axes.plot(cases, median, color=colour(name), lw=2, label=name)
             axes.set_xlim(0, cases[-1])
-        known = list(oracle)
-        axes.plot(known, list(oracle.values()), color="black", lw=1.2, ls=(0, (4, 2)), zorder=1)
-        axes.axhline(study.truth_fmc, color="black", lw=1.2)
-        axes.axhline(study.limit_fmc, color="black", lw=1.2, ls=":")
-        ends.append((study.limit_fmc, "limit", "black"))
-        ends += [(study.truth_fmc, "truth", "black"), (oracle[known[-1]], "oracle", "black")]
+        oracle = study.oracle_fmc
+        axes.plot([*oracle], [*oracle.values()], color="black", lw=1.2, ls="--", label="oracle")
+        axes.axhline(study.truth_fmc, color="black", lw=1.2, label=TRUTH)
+        axes.axhline(study.limit_fmc, color="black", lw=1.2, ls=":", label="limit")
         axes.set_ylim(0.0)
         axes.set_xlabel("cases")
         axes.set_ylabel("failure mode coverage (FMC)")
-        _label_ends(axes, ends)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
-
-
-def _label_ends(axes: Axes, ends: Sequence[tuple[float, str, str]]) -> None:
-    """Write each name at the right end of its line, moved up where it would lie on another."""
-    low, high = axes.get_ylim()
-    step = 0.055 * (high - low)
-    place = -np.inf
-    for y, name, ink in sorted(ends):
-        place = max(y, place + step)
-        axes.annotate(
-            name,
-            xy=(1.0, y),
-            xytext=(1.03, place),
-            xycoords=("axes fraction", "data"),
-            textcoords=("axes fraction", "data"),
-            color=ink,
-            va="center",
-            arrowprops={"arrowstyle": "-", "color": ink, "lw": 0.6, "shrinkA": 1, "shrinkB": 0},
-        )
 
 
 def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
@@ -151,29 +126,28 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    with _drawing(3.6 * columns, 3.1 * rows + 0.4) as figure:
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+    with _drawing(title, 3.6 * columns, 3.1 * rows + 0.4) as figure:
         for place, (name, panel) in enumerate(panels.items(), start=1):
             axes = figure.add_subplot(rows, columns, place)
             _map(axes, panel, level, colour(name))
             axes.label_outer()
-            found = f"{int(np.sum(panel.failed))} of {len(panel.points)} fail"
-            line: Any = {"transform": axes.transAxes, "va": "bottom"}
-            axes.text(0.0, 1.02, name, color=colour(name), fontweight="bold", fontsize=11, **line)
-            axes.text(1.0, 1.02, f"{found}, FMC {panel.fmc:.4f}", ha="right", fontsize=8.5, **line)
+            failures, cases = int(np.sum(panel.failed)), len(panel.points)
+            axes.set_title(name, color=colour(name), fontweight="bold")
+            axes.set_title(
+                f"{failures} of {cases} fail, FMC {panel.fmc:.4f}", loc="right", fontsize=8.5
+            )
     return figure
 
 
 def _physical(points: FloatArray, level: int) -> FloatArray:
     """Return points of the unit cube, (n, d), in the pool's units."""
-    dims = dimensions(level)
-    low = np.array([d.low for d in dims])
-    high = np.array([d.high for d in dims])
+    low, high = np.array([(d.low, d.high) for d in dimensions(level)]).T
     return np.asarray(low + points * (high - low), dtype=np.float64)
 
 
 def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
     from matplotlib.collections import EllipseCollection
+    from matplotlib.colors import to_rgb
 
     x, v, *more = dimensions(level)
     failing = _physical(panel.points[panel.failed], level)
@@ -181,37 +155,30 @@ def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
     size = 3.0 if len(panel.points) > 2000 else 8.0
     dots: Any = {"linewidths": 0, "rasterized": True}
     axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color=SAFE_COLOUR, **dots)
-    balls = EllipseCollection(
-        [2 * RADIUS * (x.high - x.low)],
-        [2 * RADIUS * (v.high - v.low)],
-        [0.0],
-        units="xy",
-        offsets=failing[:, :2],
-        offset_transform=axes.transData,
-        facecolor=_pale(ink),
-        linewidths=0,
-    )
     if not more:
+        balls = EllipseCollection(
+            [2 * RADIUS * (x.high - x.low)],
+            [2 * RADIUS * (v.high - v.low)],
+            [0.0],
+            units="xy",
+            offsets=failing[:, :2],
+            offset_transform=axes.transData,
+            # Mixed with white, so that discs on discs stay one colour.
+            facecolor=tuple(0.22 * part + 0.78 for part in to_rgb(ink)),
+            linewidths=0,
+        )
         axes.add_collection(balls)
     axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
-    _pool_axes(axes, x, v)
+    _pool_axes(axes, level)
 
 
-def _pale(ink: str) -> tuple[float, ...]:
-    """Return a colour mixed with white, so that discs on discs stay one colour."""
-    from matplotlib.colors import to_rgb
-
-    return tuple(0.22 * part + 0.78 for part in to_rgb(ink))
-
-
-def _pool_axes(axes: Axes, x: Dimension, y: Dimension) -> None:
-    from matplotlib.ticker import MaxNLocator
-
+def _pool_axes(axes: Axes, level: int) -> None:
+    x, y, *_ = dimensions(level)
     axes.set_xlim(x.low, x.high)
     axes.set_ylim(y.low, y.high)
     axes.set_xlabel(US23.notation[x.field].symbol)
     axes.set_ylabel(US23.notation[y.field].symbol)
-    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.locator_params(axis="x", nbins=5)
 
 
 def predicted_margins(
@@ -221,21 +188,19 @@ def predicted_margins(
     x, v = dimensions(level)
     steps = np.linspace(-1.0, 1.0, 21)
     failures = _physical(truth, level)
-    with _drawing(8.6, 6.6) as figure:
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
-        rows, columns = -(-len(by_batch) // 2), min(len(by_batch), 2)
-        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        for unused in grid.flat[len(by_batch) :]:
-            unused.set_visible(False)
-        for axes, (batch, predicted) in zip(grid.flat, by_batch.items(), strict=False):
+    rows, columns = -(-len(by_batch) // 2), min(len(by_batch), 2)
+    with _drawing(title, 8.6, 6.6) as figure:
+        shown = []
+        for place, (batch, predicted) in enumerate(by_batch.items(), start=1):
+            axes = figure.add_subplot(rows, columns, place)
+            shown.append(axes)
             n = len(predicted.margin)
             across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
             filled = axes.contourf(
                 across, up, np.minimum(predicted.margin, 1.0), steps, cmap="cividis", extend="min"
             )
-            line: Any = {"colors": "white", "linewidths": 1.6, "linestyles": "solid"}
             if predicted.margin.min() < 0.0 < predicted.margin.max():
-                axes.contour(across, up, predicted.margin, [0.0], **line)
+                axes.contour(across, up, predicted.margin, [0.0], colors="white", linewidths=1.6)
             axes.scatter(
                 failures[:, 0], failures[:, 1], s=2, color="#D55E00", linewidths=0, alpha=0.5
             )
@@ -244,24 +209,24 @@ def predicted_margins(
                 run[:, 0], run[:, 1], s=9, color="white", edgecolors="black", linewidths=0.5
             )
             axes.set_title(f"after batch {batch}: {len(run)} cases")
-            _pool_axes(axes, x, v)
+            _pool_axes(axes, level)
             axes.label_outer()
-        bar = figure.colorbar(filled, ax=grid, shrink=0.85, ticks=steps[::5])
+        bar = figure.colorbar(filled, ax=shown, shrink=0.85, ticks=steps[::5])
         bar.set_label("predicted margin (white line: 0, below which a case fails)")
     return figure
 
 
 def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
     """Draw cases per level and mean margin per level over the batches: median and quartile band."""
-    with _drawing(4.6 * len(by_sampler), 6.4) as figure:
-        figure.suptitle(title, x=0.01, ha="left", fontweight="bold")
+    with _drawing(title, 4.6 * len(by_sampler), 6.4) as figure:
         grid = figure.subplots(2, len(by_sampler), sharex=True, sharey="row", squeeze=False)
-        for column, (name, levels) in enumerate(by_sampler.items()):
-            for axes, rows in zip(grid[:, column], (levels.cases, levels.margin), strict=True):
-                for level, values in rows.items():
-                    _band(axes, values, level)
-            grid[0, column].set_title(name, color=colour(name))
-            grid[1, column].set_xlabel("batch")
+        for (above, below), (name, levels) in zip(grid.T, by_sampler.items(), strict=True):
+            for level in levels.cases:
+                _band(above, levels.cases[level], level)
+                _band(below, levels.margin[level], level)
+            above.set_title(name, color=colour(name))
+            below.set_xlabel("batch")
+            below.locator_params(axis="x", integer=True)
         grid[0, 0].set_ylim(0)
         grid[0, 0].set_ylabel("cases of the batch")
         grid[1, 0].set_ylabel("mean margin of the batch")
@@ -270,17 +235,11 @@ def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
 
 
 def _band(axes: Axes, values: FloatArray, level: int) -> None:
-    from matplotlib.ticker import MaxNLocator
-
+    """Draw median and quartiles of values, (seeds, batches); a batch without any is a gap."""
     batches = np.arange(1, values.shape[1] + 1)
-    # A batch in which no seed has a case at this level has no mean margin: there is a gap.
     some = ~np.isnan(values).all(axis=0)
     parts = np.full((3, len(batches)), np.nan)
     parts[:, some] = np.nanquantile(values[:, some], [0.25, 0.5, 0.75], axis=0)
-    ink = LEVEL_COLOURS[level]
+    ink, marker = LEVEL_LOOKS[level]
     axes.fill_between(batches, parts[0], parts[2], color=ink, alpha=0.18, linewidth=0)
-    axes.plot(
-        batches, parts[1], color=ink, marker=LEVEL_MARKERS[level], ms=4, label=level_name(level)
-    )
-    axes.set_xlim(1, max(len(batches), 2))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.plot(batches, parts[1], color=ink, marker=marker, ms=4, label=level_name(level))

@@ -17,7 +17,6 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.merging import place_in_words
 from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
@@ -52,25 +51,12 @@ def write_junit(
     path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> None:
     """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written."""
-    _write(path, junit(run, facts, verdict, gates))
-
-
-def _write(path: Path, root: etree._Element) -> None:
-    suites = root.findall("testsuite")
-    for key in ("tests", "failures", "errors"):
-        root.set(key, str(sum(int(suite.get(key, "0")) for suite in suites)))
-    root.set("time", f"{sum(float(suite.get('time', '0')) for suite in suites):.1f}")
-    text = etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
-    write_new(path, text, "--junit")
-
-
-def junit(
-    run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
-) -> etree._Element:
-    """Return a campaign as the element `testsuites`."""
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, facts, verdict, gates)
-    _against(root, run)
+    compared = compare_against(run)
+    if compared is not None:
+        earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
+        _step(root, f"against {earlier}", compared.steps[0])
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
     shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
     for level, _ in by_level(facts)[1]:
@@ -78,8 +64,28 @@ def junit(
         for outcome in run.cases:
             if outcome.case.level == level:
                 _case(suite, outcome, shares.get(outcome.index, ""))
-        _count(suite)
-    return root
+    _write(path, root)
+
+
+def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
+    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
+    root = etree.Element("testsuites", name="merge-sumo compare")
+    for step in compared.steps:
+        before, after = (compared.versions[n - 1] for n in (step.before, step.after))
+        _step(root, printable(f"{before.folder} to {after.folder}"), step)
+    _write(path, root)
+
+
+def _write(path: Path, root: etree._Element) -> None:
+    """Count the test cases of all suites, and write them."""
+    for part in (*root.findall("testsuite"), root):
+        tests = list(part.iter("testcase"))
+        part.set("tests", str(len(tests)))
+        part.set("failures", str(len(list(part.iter("failure")))))
+        part.set("errors", str(len(list(part.iter("error")))))
+        part.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")
+    text = etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
+    write_new(path, text, "--junit")
 
 
 def _gates(
@@ -97,15 +103,6 @@ def _gates(
         test = _test(suite, gate.name, f"{CLASS}.gates", 0.0)
         if gate.met:
             _wrong(test, "failure", "GATE", gate.sentence)
-    _count(suite)
-
-
-def _against(root: etree._Element, run: Run) -> None:
-    """Add what changed from the version that a campaign is against, if it is against one."""
-    compared = compare_against(run)
-    if compared is not None:
-        earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
-        _step(root, f"against {earlier}", compared.steps[0])
 
 
 def _step(root: etree._Element, name: str, step: Step) -> None:
@@ -117,16 +114,6 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
             if one.change is Change.BROKE:
                 _wrong(test, "failure", REGRESSION, one.became)
-    _count(suite)
-
-
-def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
-    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
-    root = etree.Element("testsuites", name="merge-sumo compare")
-    for step in compared.steps:
-        before, after = (compared.versions[n - 1] for n in (step.before, step.after))
-        _step(root, printable(f"{before.folder} to {after.folder}"), step)
-    _write(path, root)
 
 
 def _case(suite: etree._Element, outcome: Outcome, runs: str) -> None:
@@ -138,22 +125,10 @@ def _case(suite: etree._Element, outcome: Outcome, runs: str) -> None:
     elif not outcome.is_tested:
         _wrong(test, "failure", End.TIMEOUT.value, message_of(outcome))
     elif outcome.failed:
-        _wrong(test, "failure", measures.severity or FAILED, _why(outcome))
-
-
-def _why(outcome: Outcome) -> str:
-    """Return what a failing case shows, in a line."""
-    measures = outcome.measures
-    parts = [measures.became]
-    if measures.impact_speed_mps is not None:
-        parts.append(f"relative speed {measures.impact_speed_mps:.1f} m/s")
-    if measures.dx_m is not None:
-        parts.append(f"dx {measures.dx_m:.1f} m")
-    if measures.lane_share is not None:
-        parts.append(f"merges {place_in_words(measures.lane_share)}")
-    if outcome.margin is not None:
-        parts.append(f"margin {outcome.margin:.3g}")
-    return ", ".join(parts)
+        parts = [measures.became, f"margin {outcome.margin:.3g}"]
+        if measures.impact_speed_mps is not None:
+            parts.append(f"relative speed {measures.impact_speed_mps:.1f} m/s")
+        _wrong(test, "failure", measures.severity or FAILED, ", ".join(parts))
 
 
 def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> etree._Element:
@@ -165,13 +140,3 @@ def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> e
 def _wrong(test: etree._Element, tag: str, kind: str, message: str) -> None:
     # Jenkins shows the message, GitLab the text.
     etree.SubElement(test, tag, type=kind, message=message).text = message
-
-
-def _count(suite: etree._Element) -> None:
-    """Set what a suite says of its test cases."""
-    tests = suite.findall("testcase")
-    suite.set("tests", str(len(tests)))
-    suite.set("failures", str(len(suite.findall("testcase/failure"))))
-    suite.set("errors", str(len(suite.findall("testcase/error"))))
-    suite.set("skipped", "0")
-    suite.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")

@@ -11,22 +11,29 @@ from typing import TYPE_CHECKING, Any, Final
 
 from markupsafe import Markup
 
+from merge_sumo.analysis.coordinates import described
+from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.values.scenario import level_name
 
 if TYPE_CHECKING:
     from jinja2 import Environment
 
 TEMPLATES: Final = Path(__file__).parent / "templates"
+ERROR_CHARACTERS: Final = 2000
+"""Of a message or a setting in a page; the files of the run folder have the whole."""
 
 
 def page(
     template: str, *, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **words: Any
 ) -> str:
     """Return a page as HTML, with style sheets and scripts in it, by name, and words as needed."""
-    style, source = ("".join(map(source_of, names)) for names in (styles, scripts))
-    policy = {"style_hash": _policy_hash(style), "script_hash": _policy_hash(source)}
-    own = {"style": Markup(style), "script": Markup(source)}  # noqa: S704 (our own files)
-    return _environment().get_template(template).render({**own, **policy, **words})
+    own = {}
+    for name, files in (("style", styles), ("script", scripts)):
+        source = "".join(map(source_of, files))
+        digest = base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()
+        own[name] = Markup(source)  # noqa: S704 (our own files)
+        own[f"{name}_hash"] = Markup(f"sha256-{digest}")  # noqa: S704 (by this a policy names it)
+    return environment().get_template(template).render({**own, **words})
 
 
 def fragment(source: str, words: Mapping[str, Any]) -> Markup:
@@ -40,20 +47,19 @@ def source_of(name: str) -> str:
 
 
 @cache
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return the templates' environment, with the functions that every template has."""
     from jinja2 import Environment, PackageLoader
 
-    loader = PackageLoader("merge_sumo.reports")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True)
-    environment.globals["level_name"] = level_name
-    return environment
+    made = Environment(
+        loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True
+    )
+    made.globals |= {"level_name": level_name, "counted": counted, "quoted": quoted}
+    made.globals |= {"described": described}
+    made.filters["shown"] = lambda value: printable(str(value)[:ERROR_CHARACTERS])
+    return made
 
 
 @cache
 def _compiled(source: str) -> Any:
-    return _environment().from_string(source)
-
-
-def _policy_hash(source: str) -> str:
-    """Return by what a page's policy names a style or a script in it."""
-    return "sha256-" + base64.b64encode(hashlib.sha256(source.encode()).digest()).decode()
+    return environment().from_string(source)

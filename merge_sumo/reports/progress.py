@@ -1,4 +1,4 @@
-"""What a person sees while something runs: bars on a terminal, elsewhere a line now and then."""
+"""Progress of what runs: bars on a terminal, elsewhere a line now and then."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Final, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from merge_sumo.analysis.verdict import in_counts, judge
+from merge_sumo.analysis.verdict import judge
 from merge_sumo.reports.report import REPORT, RunningReport
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.values.chance import one_per_case
@@ -47,10 +47,10 @@ def is_watched() -> bool:
 
 
 @dataclass(slots=True)
-class _Work:
-    """What a bar counts: done of a total, since when, and how much of it was done before.
+class _Bar:
+    """A bar: its total, since when it counts, and how much was done before.
 
-    `said` and `said_s` are what was done, and when, as it was last shown.
+    `said` and `said_s` are what was done, and when, as it was last shown; `task` draws it.
     """
 
     total: int
@@ -58,6 +58,7 @@ class _Work:
     before: int = 0
     said: int = 0
     said_s: float = -1e9
+    task: TaskID | None = None
 
     def is_due(self, done: int, *, drawn: bool) -> bool:
         """Return whether to show it: on a terminal what is fresh, else a tenth; the end always.
@@ -67,9 +68,8 @@ class _Work:
         now_s = time.monotonic()
         since, since_s = done - self.said, now_s - self.said_s
         slow = now_s - max(self.said_s, self.start_s) >= SLOW_S
-        due = since_s >= (FRESH_S if drawn else LINE_S) and (
-            drawn or since * LINES >= self.total or (since > 0 and slow)
-        )
+        enough = drawn or since * LINES >= self.total or (since > 0 and slow)
+        due = enough and since_s >= (FRESH_S if drawn else LINE_S)
         if due or (done >= self.total and since > 0):
             self.said, self.said_s = done, now_s
             return True
@@ -103,8 +103,7 @@ class Bars:
             TextColumn("{task.fields[note]}", markup=False),
             console=self._console,
         )
-        self._tasks: dict[str, TaskID] = {}
-        self._work: dict[str, _Work] = {}
+        self._bars: dict[str, _Bar] = {}
         self._opened_s = time.monotonic()
 
     def counted(
@@ -116,23 +115,21 @@ class Bars:
         """
         # What ends first began before: with the others, or when the bar before was full.
         start_s = self._opened_s if done else time.monotonic()
-        work = self._work.setdefault(title, _Work(total, start_s))
+        bar = self._bars.setdefault(title, _Bar(total, start_s))
         if done >= total:
             self._opened_s = time.monotonic()
         drawn = self._console.is_terminal
-        if not (self._is_shown and work.is_due(done, drawn=drawn)):
+        if not (self._is_shown and bar.is_due(done, drawn=drawn)):
             return
         text = note if isinstance(note, str) else note()
-        said = "  ".join(filter(None, (text.strip(), work.note(done, unit))))
+        said = "  ".join(filter(None, (text.strip(), bar.note(done, unit))))
         if not drawn:
             self.say(f"{printable(title)}: {done:,}/{total:,}  {said}")
-        elif title in self._tasks:
-            self._progress.update(self._tasks[title], completed=done, note=said)
-        else:
+            return
+        if bar.task is None:
             self._progress.start()
-            self._tasks[title] = self._progress.add_task(
-                printable(title), total=total, completed=done, note=said
-            )
+            bar.task = self._progress.add_task(printable(title), total=total, note="")
+        self._progress.update(bar.task, completed=done, note=said)
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
@@ -196,12 +193,11 @@ class CampaignBars(Bars):
     def ran_before(self, outcome: Outcome) -> None:
         """Count a case that ran before a resume: it says nothing of how fast this goes."""
         self._outcomes.append(outcome)
-        work = self._work.setdefault("cases", _Work(self._cases, 0.0))
-        work.before, work.start_s = len(self._outcomes), time.monotonic()
+        bar = self._bars.setdefault("cases", _Bar(self._cases, 0.0))
+        bar.before, bar.start_s = len(self._outcomes), time.monotonic()
 
     def _found(self) -> str:
-        found = judge(one_per_case(self._outcomes, self._tolerated))
-        return ", ".join(in_counts(found.errors, found.timeouts, found.failures))
+        return ", ".join(judge(one_per_case(self._outcomes, self._tolerated)).found)
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Stop the bars, and the rewriting of a report that nobody will finish."""

@@ -8,7 +8,6 @@ page's own policy lets nothing run but that script and lets nothing load at all.
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from contextlib import suppress
@@ -16,6 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+import msgspec
 from markupsafe import Markup
 
 from merge_sumo.analysis.summary import Summary
@@ -25,9 +25,8 @@ from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
-from merge_sumo.reports.report_sections import head_words, sections_of, shared_words
+from merge_sumo.reports.report_sections import sections_of, shared
 from merge_sumo.system.folders import check_ours, replace_own
-from merge_sumo.system.workers import Workers
 
 REPORT: Final = "report.html"
 """By this a report is known as ours, and may be replaced by a newer one."""
@@ -42,20 +41,20 @@ MOST_SHARE: Final = 0.1
 def write_report(
     run: Run,
     summary: Summary | None = None,
-    workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
 ) -> Path:
     """Write `report.html` into the folder of a run, in place of an older one; return its path.
 
-    A campaign against an earlier version of the VUT has a page of what broke beside it. See
-    `ReportModel` for the other arguments. Raises `UserError` when it cannot be written, or what is
-    there is no report of ours.
+    A campaign against an earlier version of the VUT has a page of what broke beside it. Raises
+    `UserError` when it cannot be written, or what is there is no report of ours.
     """
-    path = run.folder / REPORT
-    html = report_page(run, summary, workers, on_part)
-    replace_own(path, html.encode(errors="backslashreplace"))
+    _replace(run, report_page(run, summary, on_part))
     write_against(run)
-    return path
+    return run.folder / REPORT
+
+
+def _replace(run: Run, html: str) -> None:
+    replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"))
 
 
 class RunningReport:
@@ -88,8 +87,8 @@ class RunningReport:
     def _write(self, *, running: bool) -> None:
         self._is_there = False
         with suppress(UserError):
-            html = report_page(Run(self._folder), learns=False, running=running)
-            replace_own(self._folder / REPORT, html.encode(errors="backslashreplace"))
+            run = Run(self._folder)
+            _replace(run, report_page(run, learns=False, running=running))
             self._is_there = True
 
 
@@ -102,7 +101,6 @@ def check_report(folder: Path) -> None:
 def report_page(
     run: Run,
     summary: Summary | None = None,
-    workers: Workers | None = None,
     on_part: OnPart = lambda _done, _total: None,
     *,
     learns: bool = True,
@@ -110,22 +108,18 @@ def report_page(
 ) -> str:
     """Return the report of a run as HTML; of one that is `running`, it is loaded again and again.
 
-    Without `learns` it has no surrogates.
+    See `ReportModel` for the other arguments.
     """
-    model = ReportModel(run, summary, workers, on_part, learns=learns)
-    words = shared_words(model)
-    sections = sections_of(model, words)
-    data = json.dumps(page_data(model), allow_nan=False, separators=(",", ":"))
+    model = ReportModel(run, summary, on_part, learns=learns)
     # No "<" in the JSON: nothing in it can end its element.
-    data = data.replace("<", "\\u003c")
+    data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
     return page(
         "report.html.jinja",
         styles=("report.css",),
         scripts=("player.js", "report.js"),
-        sections=sections,
+        sections=sections_of(model),
         every_s=EVERY_S if running else 0,
         now=f"{datetime.now().astimezone():%H:%M:%S}",
         data=Markup(data),  # noqa: S704 (JSON without "<")
-        **words,
-        **head_words(model),
+        **shared(model),
     )

@@ -1,132 +1,138 @@
-"""What the report draws from: maps, motion and charts as plain JSON for the script of the page."""
+"""The data that the script of the report draws from: cases, motion, maps and charts, as JSON."""
 
 from __future__ import annotations
 
-import shlex
-from collections.abc import Mapping
-from pathlib import Path
+import base64
+import math
+from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.analysis.coordinates import Coordinate
-from merge_sumo.analysis.diagnosis import Diagnosis, Kind
-from merge_sumo.analysis.predictions import prediction_error_m
+from merge_sumo.analysis.diagnosis import Diagnosis
+from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.analysis.verdict import shortened
-from merge_sumo.reports.player import motion_row, packed, player_data
-from merge_sumo.reports.report_maps import maps_of
-from merge_sumo.reports.report_model import ERROR_CHARACTERS, ReportModel
+from merge_sumo.reports.pages import ERROR_CHARACTERS
+from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.studies.explanation import in_words, name_and_unit
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import RunsOfCase
-from merge_sumo.values.fmc import fmc
+from merge_sumo.values.fmc import fmc, radius_for
 from merge_sumo.values.measures import Measure
 from merge_sumo.values.scenario import (
     ALL_LEVELS,
+    DT_S,
+    VEHICLES,
+    MergeScenario,
     Scenario,
+    lane_of,
     level_name,
 )
-from merge_sumo.values.score import measures_in
+from merge_sumo.values.score import Outcome, measures_in
 from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
+from merge_sumo.values.trajectory import Trajectory
 
 SVO_NEAR_RAD: Final = 0.1
 NEAR_SHARE: Final = 1.0 / 16.0
 MOST_STEPS: Final = 20
-"""Batches, or groups of batches, in the charts of the search."""
-MOST_BALLS: Final = 20_000
-"""Balls that are counted for a level's curve of coverage: of more failures it has fewer points."""
-
+"""Batches, or groups of batches, in the chart of the search."""
+SPEED_UNIT_MPS: Final = 0.002
+"""Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
+COUNT_GRID: Final = (32, 20)
+GRID: Final[dict[int, Grid]] = {2: (49, 49, 1), 3: (33, 33, 9)}
+"""Nodes of a map in its two coordinates and in the one that it moves through."""
+PAIR_NODES: Final = 41
+BLUR_NODES: Final = 1.5
+"""Nodes of the map of a pair, in each direction, and over how many of them its means are taken."""
 
 UNKNOWN: Final = Diagnosis(None, None, False, False, None)
 """Of a case whose motion is lost."""
 
+Axes = tuple[int, int]
+"""Places of two coordinates in the pool's order."""
 
-def page_data(facts: ReportModel) -> dict[str, Any]:
+
+def page_data(model: ReportModel) -> dict[str, Any]:
     """Return what the script draws from: plain JSON."""
-    speeds, offsets = packed(facts.motion)
-    scenario = facts.run.scenario
+    scenario, lane_m = model.run.scenario, lane_of(model.run.scenario)
+    speeds, offsets = packed(model.motion)
+    columns = [m for m in measures_in(scenario) if m.column]
+    rows = [_row(model, o, offsets.get(o.index, 0), columns) for o in model.shown]
+    shown = {o.index for o in model.shown}
+    others = [o for o in model.cases if o.index not in shown]
     return {
+        "dt": DT_S,
+        "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
         "goal": scenario.goal,
+        "lane": lane_m,
+        "place": "M" if lane_m is None else scenario.place,
+        "vehicles": VEHICLES[: scenario.vehicles],
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
-        "coordinates": [_coordinate(c) for c in facts.coordinates],
-        "severities": [severity.value for severity in Severity],
-        "kinds": [kind.value for kind in Kind],
-        "measures": _headings(facts),
-        "cases": _columns(facts, offsets),
-        "boxes": _boxes(facts),
-        "errors": {
-            o.index: shortened(o.measures.error, ERROR_CHARACTERS)
-            for o in facts.shown
-            if o.measures.error
+        "coordinates": [_coordinate(c) for c in model.coordinates],
+        "severities": list(Severity),
+        "measures": [
+            {"name": m.name, "title": m.title_in(scenario), "digits": m.digits}
+            for m in columns
+            if any(row[m.name] is not None for row in rows)
+        ],
+        "cases": {name: [row[name] for row in rows] for name in (rows or [{"index": 0}])[0]},
+        "speeds": speeds,
+        "speed_unit_mps": SPEED_UNIT_MPS,
+        "signals": {i: to_record(t.signals) for i, t in model.motion.items() if t.signals},
+        "why": _explanations(model),
+        "boxes": [
+            {"level": box.level, "cases": [index for index in box.indices if index in shown]}
+            for box in model.boxes
+        ],
+        "maps": {
+            level: map_data(
+                *(scenario, level),
+                [o for o in others if o.case.level == level],
+                model.surfaces[level],
+            )
+            for level in model.levels
         },
-        "signals": {i: to_record(t.signals) for i, t in facts.motion.items() if t.signals},
-        "maps": _maps(facts),
-        "search": _search(facts),
-        "replay": f"merge-sumo replay {_quoted(facts.run.folder)}",
-        "why": _explanations(facts),
-        "explain": f"merge-sumo explain {_quoted(facts.run.folder)}",
-        "report": f"merge-sumo report {_quoted(facts.run.folder)}",
-        **player_data(scenario, facts.road, speeds),
+        "search": _search(model),
+        **road_data(model.road),
     }
 
 
-def listed_measures(scenario: Scenario) -> list[Measure]:
-    """Return the measures that the table of all cases of a scenario has a column for."""
-    return [measure for measure in measures_in(scenario) if measure.column]
-
-
-def _headings(facts: ReportModel) -> list[dict[str, Any]]:
-    """Return the columns of the table: measures of which a case has a value."""
-    scenario = facts.run.scenario
-    return [
-        {"name": m.name, "title": m.title_in(scenario), "digits": m.digits}
-        for m in listed_measures(scenario)
-        if any(o.measures.value(m.name) is not None for o in facts.shown)
-    ]
-
-
-def _boxes(facts: ReportModel) -> list[dict[str, Any]]:
-    """Return level and cases of the regions in words, of the cases that are shown."""
-    shown = {o.index for o in facts.shown}
-    return [
-        {"level": box.level, "cases": [index for index in box.indices if index in shown]}
-        for box in facts.boxes
-    ]
-
-
-def _columns(facts: ReportModel, offsets: Mapping[int, int]) -> dict[str, list[Any]]:
-    kinds, severities = list(Kind), list(Severity)
-    listed = listed_measures(facts.run.scenario)
-    columns: dict[str, list[Any]] = {}
-    for o in facts.shown:
-        found = facts.diagnoses.get(o.index, UNKNOWN)
-        row = {
-            "index": o.index,
-            "level": o.case.level,
-            **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in facts.coordinates},
-            **motion_row(o, facts.motion.get(o.index), offsets.get(o.index, 0)),
-            "severity": None
-            if o.measures.severity is None
-            else severities.index(Severity(o.measures.severity)),
-            "failed": int(o.failed),
-            **{m.name: _rounded(o.measures.value(m.name), 4) for m in listed},
-            "margin": _rounded(o.margin, 3),
-            "region": facts.regions.get(o.index),
-            **_avoidance(facts, o.index),
-            "way_out": _rounded(o.measures.last_avoidable_s, 1),
-            "vut_brakes": found.vut_brakes_s,
-            "pov_brakes": found.pov_brakes_s,
-            "vut_accelerates": int(found.vut_accelerates),
-            "pov_accelerates": int(found.pov_accelerates),
-            "kind": kinds.index(facts.kinds[o.index]) if o.index in facts.kinds else None,
-        }
-        if facts.repeated:
-            row["runs"] = _runs(facts.repeated.get(o.index))
-        for name, value in row.items():
-            columns.setdefault(name, []).append(value)
-    return columns or {"index": []}
+def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]) -> dict[str, Any]:
+    """Return what the page has of a case; it has no rows where its motion is not known."""
+    motion, measures = model.motion.get(o.index), o.measures
+    avoidance = model.avoidance.get(o.index)
+    row = {
+        "index": o.index,
+        "level": o.case.level,
+        **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in model.coordinates},
+        "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
+        "nearest": VEHICLES.index(measures.nearest),
+        "offset": offset,
+        "rows": 0 if motion is None else len(motion.motion),
+        "end": measures.end,
+        "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
+        "severity": measures.severity,
+        "failed": o.failed,
+        "margin": _rounded(o.margin, 3),
+        "region": model.regions.get(o.index),
+        "last_avoidable_s": _rounded(measures.last_avoidable_s, 1),
+        **{m.name: _rounded(measures.value(m.name), 4) for m in columns},
+        **to_plain(model.diagnoses.get(o.index, UNKNOWN)),
+        "kind": model.kinds.get(o.index),
+    }
+    if model.avoidance:
+        row["avoided_by"] = avoidance and avoidance.avoided_by
+        row["latest_takeover_s"] = avoidance and avoidance.latest_takeover_s
+        row["pov_careful"] = avoidance and avoidance.pov_careful
+    if model.repeated:
+        row["runs"] = _runs(model.repeated.get(o.index))
+    return row
 
 
 def _runs(of: RunsOfCase | None) -> dict[str, Any] | None:
@@ -134,46 +140,24 @@ def _runs(of: RunsOfCase | None) -> dict[str, Any] | None:
     if of is None:
         return None
     low, high = of.interval()
-    return {
-        "failed": of.failures,
-        "number": of.runs,
-        "low": round(low, 3),
-        "high": round(high, 3),
-        "each": [[run.index, int(run.failed)] for run in of.outcomes],
-    }
+    each = [(run.index, run.failed) for run in of.outcomes]
+    return {"failed": of.failures, "number": of.runs, "low": low, "high": high, "each": each}
 
 
-def _avoidance(facts: ReportModel, index: int) -> dict[str, Any]:
-    """Return who would have avoided a case, where that is known."""
-    if not facts.avoidance:
-        return {}
-    found = facts.avoidance.get(index)
-    return {
-        "avoided_by": None if found is None else list(found.avoided_by),
-        "latest_takeover": None if found is None else found.latest_takeover_s,
-        "pov_careful": None if found is None else int(found.pov_careful),
-    }
-
-
-def _explanations(facts: ReportModel) -> dict[int, dict[str, Any]]:
+def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
     """Return by index the words on a failure, and its axes with a title each."""
     found = {}
-    for o in facts.shown:
-        known = facts.explanations.get(o.index)
-        if known is not None:
-            titles = [
-                *(name_and_unit(o.case, axis.name) for axis in known.start),
-                *((f"vut: {axis.name}", "") for axis in known.parameters),
-            ]
-            found[o.index] = {
-                "words": list(in_words(known, o, facts.avoidance.get(o.index))),
-                "axes": [
-                    {**to_plain(axis), "name": name, "unit": unit}
-                    for (name, unit), axis in zip(
-                        titles, (*known.start, *known.parameters), strict=True
-                    )
-                ],
-            }
+    for index, known in model.explanations.items():
+        outcome = model.run.outcome(index)
+        titles = [
+            *(name_and_unit(outcome.case, axis.name) for axis in known.start),
+            *((f"vut: {axis.name}", "") for axis in known.parameters),
+        ]
+        axes = zip(titles, (*known.start, *known.parameters), strict=True)
+        found[index] = {
+            "words": list(in_words(known, outcome, model.avoidance.get(index))),
+            "axes": [{**to_plain(axis), "name": name, "unit": unit} for (name, unit), axis in axes],
+        }
     return found
 
 
@@ -191,58 +175,135 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
     }
 
 
-def _maps(facts: ReportModel) -> dict[int, dict[str, Any]]:
-    shown = {o.index for o in facts.shown}
-    others = [o for o in facts.cases if o.index not in shown]
+def _search(model: ReportModel) -> dict[str, Any]:
+    """Return the coverage of each level after groups of batches."""
+    batches = sorted({o.batch for o in model.cases})
+    width = -(-len(batches) // MOST_STEPS) or 1
+    levels = []
+    for level in model.levels:
+        at = [o for o in model.cases if o.failed and o.case.level == level]
+        group = np.array([o.batch // width for o in at], dtype=np.int64)
+        points = to_unit((o.case for o in at), level, model.run.scenario)
+        steps = range(-(-len(batches) // width))
+        covered = [round(fmc(points[group <= number]), 5) for number in steps]
+        levels.append({"level": level, "fmc": covered})
+    return {"batch": batches[::width], "width": width, "levels": levels}
+
+
+def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
+    """Return the speeds of all cars at every step in base64, and the first row of each motion."""
+    speeds = [motion.motion[:, :, 1] for motion in motions.values()]
+    whole = [np.rint(np.clip(v / SPEED_UNIT_MPS, 0, 65535)).astype("<u2").tobytes() for v in speeds]
+    first = np.cumsum([0, *map(len, speeds)]).tolist()
+    return base64.b64encode(b"".join(whole)).decode(), dict(zip(motions, first, strict=False))
+
+
+def road_data(road: Corridor) -> dict[str, Any]:
+    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
+
+    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
+    """
+    at = road.lane_point(0.0, on_ramp=False)
+    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
+
+    def place(x: float, y: float) -> list[float]:
+        dx, dy = x - at.x_m, y - at.y_m
+        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
+        return [round(along, 2), round(left, 2)]
+
+    def points(path: LanePath) -> list[list[float]]:
+        return [
+            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
+            for piece in path.pieces
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
+        ]
+
+    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
+    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
     return {
-        level: maps_of(
-            facts.run.scenario,
-            level,
-            [o for o in others if o.case.level == level],
-            facts.surfaces[level],
-            facts.truths[level],
-        )
-        for level in facts.levels
+        "main": points(road.mainline),
+        "ramp": points(road.ramp),
+        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
     }
 
 
-def _search(facts: ReportModel) -> dict[str, Any]:
-    """Return coverage, and error of predictions, of each level after groups of batches."""
-    batches = sorted({o.batch for o in facts.cases})
-    width = -(-len(batches) // MOST_STEPS) or 1
-    groups = batches[::width]
-    levels = []
-    for level in facts.levels:
-        at = [o for o in facts.cases if o.case.level == level]
-        group = np.array([o.batch // width for o in at], dtype=np.int64)
-        failed = np.array([o.failed for o in at], dtype=bool)
-        points = to_unit((o.case for o in at), level, facts.run.scenario)
-        covered: list[float | None] = []
-        stride = -(-len(groups) * int(failed.sum()) // MOST_BALLS) or 1
-        last = len(groups) - 1
-        for number in range(len(groups)):
-            so_far = points[failed & (group <= number)]
-            wanted = (last - number) % stride == 0
-            covered.append(round(fmc(so_far), 5) if wanted else None)
-        off = np.array([prediction_error_m(o) for o in at], dtype=np.float64)
-        levels.append(
+def pairs_of(dims: int) -> list[Axes]:
+    """Return the pairs of coordinates of a level that may be shown, the first one first."""
+    return [(0, 1)] if dims <= 3 else list(combinations(range(dims), 2))
+
+
+def map_data(
+    scenario: Scenario, level: int, others: Sequence[Outcome], surface: Surface | None
+) -> dict[str, Any]:
+    """Return what the script draws the map of a level from.
+
+    A level with two coordinates has one map; with a third, the reader moves through it. Of more, a
+    map shows a pair, and the chance to fail is a mean over all values of the others. `others` are
+    outcomes that the page counts instead of showing one by one.
+    """
+    dims = len(scenario.dimensions(level))
+    return {
+        "pairs": pairs_of(dims),
+        "through": 2 if dims == 3 else None,
+        # The ball of more coordinates is as wide as the map: its shadow says nothing.
+        "radius": radius_for(dims) if dims <= 3 else None,
+        "grids": [
             {
-                "level": level,
-                "fmc": covered,
-                "off": [_median(off[group == number]) for number in range(len(groups))],
+                "chance": surface and _chance(surface, dims, axes),
+                "counts": _counts(others, scenario, level, axes) if others else None,
             }
-        )
-    return {"batch": groups, "width": width, "levels": levels}
+            for axes in pairs_of(dims)
+        ],
+    }
 
 
-def _median(values: FloatArray) -> float | None:
-    """Return the median of those that are numbers, if there are any."""
-    known = values[~np.isnan(values)]
-    return round(float(np.median(known)), 3) if len(known) else None
+def _counts(
+    others: Sequence[Outcome], scenario: Scenario, level: int, axes: Axes
+) -> dict[str, Any]:
+    nx, ny = COUNT_GRID
+    grid: dict[str, Any] = {"nx": nx, "ny": ny}
+    for name, failing in (("safe", False), ("failing", True)):
+        cases = (o.case for o in others if o.failed is failing)
+        x, y = to_unit(cases, level, scenario)[:, list(axes)].T
+        cells, _, _ = np.histogram2d(y, x, bins=(ny, nx), range=((0, 1), (0, 1)))
+        grid[name] = cells.astype(int).ravel().tolist()
+    return grid
 
 
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))
+def _chance(surface: Surface, dims: int, axes: Axes) -> dict[str, Any]:
+    """Return the chance at the nodes of a map; of a pair the means around them, as shares."""
+    if dims in GRID:
+        return _grid(GRID[dims], surface.chance(nodes(GRID[dims])))
+    mean = means(*surface.pool, axes)
+    most = float(mean.max())
+    shares = mean / most if most > 0.0 else mean
+    return {"most": round(most, 3), **_grid((PAIR_NODES, PAIR_NODES, 1), shares)}
+
+
+def means(points: FloatArray, values: FloatArray, axes: Axes) -> FloatArray:
+    """Return the means of values, (n,), at points, (n, d), around the nodes of two coordinates."""
+    from scipy.ndimage import gaussian_filter
+
+    node = np.rint(points[:, list(axes)] * (PAIR_NODES - 1)).astype(np.int64) @ (1, PAIR_NODES)
+    near, total = (
+        gaussian_filter(
+            np.bincount(node, weights, minlength=PAIR_NODES**2)
+            .astype(np.float64)
+            .reshape(PAIR_NODES, PAIR_NODES),
+            BLUR_NODES,
+            mode="constant",
+        ).ravel()
+        for weights in (None, values)
+    )
+    mean: FloatArray = np.divide(total, near, out=np.zeros_like(total), where=near > 0.0)
+    return mean
+
+
+def _grid(grid: Grid, share: NDArray[Any]) -> dict[str, Any]:
+    nx, ny, through = grid
+    values = np.rint(255.0 * share).astype(np.uint8)
+    data = base64.b64encode(values.tobytes()).decode()
+    return {"nx": nx, "ny": ny, "np": through, "data": data}
 
 
 def _rounded(value: float | None, digits: int) -> float | None:

@@ -12,7 +12,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds
+from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
 RAMP_EDGES: Final = ("ramp", "main_out")
@@ -48,3 +48,16 @@ def road_of(
         net_file = NetFile(path, content)
         _found[key] = find_corridor(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
     return _found[key]
+
+
+def road_for(scenario: Scenario) -> Corridor:
+    """Return the road of a scenario.
+
+    Raises `UserError` where there is no such merge, or not room enough for its vehicles.
+    """
+    # Where a path says nothing of folders, the net is one that the package brings.
+    net = None if scenario.net is None else resource("sumo_net") / scenario.net
+    edges = scenario.pov_edges, scenario.vut_edges
+    road = road_of(net, *edges, scenario.room_after_m, lane_of(scenario))
+    road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
+    return road

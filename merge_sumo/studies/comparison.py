@@ -24,7 +24,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.merging import merging_of
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, summarise
 from merge_sumo.analysis.verdict import judge
@@ -365,8 +364,6 @@ class Comparison(Result):
             place = f"{version.folder} " if version.folder else "now "
             text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
             text += verdict.trouble_lines()
-            merging = merging_of(version.cases)
-            text += [] if merging is None else [f"  {merging.sentence}"]
         text += [
             f"level {level_name(level)}: FMC {' -> '.join(row)}"
             for level, row in self.fmc().items()

@@ -32,7 +32,7 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.report_sections import ReportSection, shared_words
+from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
@@ -332,8 +332,7 @@ class ReportSectionContract:
 
     def html(self) -> str:
         """Return the section of a campaign; "" where it is left out."""
-        model = ReportModel(campaign_of())
-        return self.section.html(model, shared_words(model)) or ""
+        return self.section.html(ReportModel(campaign_of()))
 
     def test_is_one_section_or_nothing(self) -> None:
         html = self.html().strip()

@@ -13,7 +13,7 @@ from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.env import pool_starts

@@ -25,9 +25,9 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, actions_mps2
 from merge_sumo.drivers.policies import load_driver
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_for
 from merge_sumo.sumo.world import World
 from merge_sumo.training.game import of_two
 from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role

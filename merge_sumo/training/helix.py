@@ -33,9 +33,9 @@ from merge_sumo.drivers.policies import (
     scenario_of,
     scenario_record,
 )
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_for
 from merge_sumo.system.folders import (
     NO_LINK,
     cannot_write,

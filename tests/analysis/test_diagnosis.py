@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.analysis.diagnosis import MEANING, Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.analysis.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.case import MergeCase, from_unit
 from merge_sumo.values.scenario import BEHIND, DT_S, POV, US23, VUT
@@ -130,9 +130,6 @@ class TestTheKind:
     def test_is_none_where_the_cars_are_6_m_apart(self):
         assert kind(meeting(BRAKES, COASTS, gap_m=30.0)) is None
 
-    def test_has_a_meaning(self):
-        assert set(MEANING) == set(Kind)
-
 
 def outcome(index: int, x: float, v: float, failed: bool, level: int = 1) -> Outcome:
     """Return an outcome of a case at (x, v), with both cars at M or far apart."""
@@ -156,9 +153,7 @@ class TestRegions:
         failed = sum(o.failed for o in outcomes)
         boxes = failure_boxes(outcomes, 1)
         assert sum(box.failures for box in boxes) >= 0.9 * failed
-        for box in boxes:
-            assert box.failures >= 0.5 * box.cases
-            assert "POV level 1" in box.sentence
+        assert all(box.failures >= 0.5 * box.cases for box in boxes)
 
     def test_of_a_band_of_equal_arrival_speak_of_the_time(self):
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)
@@ -166,26 +161,22 @@ class TestRegions:
         assert box.failures == sum(o.failed for o in outcomes)
         ((feature, low, high), *others) = box.bounds
         assert (low, high) == pytest.approx((8.3, 8.8), abs=0.02)
-        assert {bound for _, *bounds in others for bound in bounds} == {None}
+        assert {abs(bound) for _, *bounds in others for bound in bounds} == {np.inf}
         assert box.where == f"{feature.name} between {low:.2f} and {high:.2f} s"
-        assert (
-            box.sentence == f"POV level 1, {box.where}: {box.failures} of {box.cases} cases fail."
-        )
 
     def test_count_the_cases_inside_the_bounds_as_written(self):
         (box,) = failure_boxes(outcomes := over_the_pool(lambda x, v: 8.3 < -x / v < 8.8), 1)
         _, low, high = box.bounds[0]
         inside = [o for o in outcomes if low <= -o.case.x_pov0_m / o.case.v_pov0_mps <= high]
-        assert box.cases == len(inside)
+        assert box.indices == tuple(o.index for o in inside)
 
     def test_of_another_level_are_not_mixed_in(self):
         outcomes = over_the_pool(lambda x, v: x > -200, level=2)
         assert failure_boxes(outcomes, 1) == []
         assert failure_boxes(outcomes, 2)[0].level == 2
 
-    @pytest.mark.parametrize("failures", [0, 1, 2])
-    def test_are_not_made_of_a_few_failures(self, failures):
-        outcomes = [outcome(n, -300.0 + n, 30.0, n < failures) for n in range(40)]
+    def test_are_not_made_of_a_few_failures(self):
+        outcomes = [outcome(n, -300.0 + n, 30.0, n < 2) for n in range(40)]
         assert failure_boxes(outcomes, 1) == []
 
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):

@@ -200,7 +200,7 @@ class TestCommand:
 
     def test_gate_needs_an_earlier_version(self, call):
         said = call("campaign", "--vut", "new.py:f", "--gate", "regressions", "--out", "run")
-        assert_refused(said, "--gate regressions needs an earlier version")
+        assert_refused(said, "the gate regressions needs an earlier version")
         assert not Path("run").exists()
 
 

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes, read_settings
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import road_for
 from merge_sumo.system.arrays import read_arrays
 from merge_sumo.values.case import Case, MergeCase
 from merge_sumo.values.episode import Episode

@@ -11,7 +11,7 @@ from conftest import require
 from crosscheck import HighwayEnvWorld, crosscheck
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.scenario import US23, VUT
 

@@ -19,7 +19,7 @@ from merge_sumo.drivers.policies import (
     read_manifest,
     scenario_of,
 )
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.training.reward import RewardWeights
 from merge_sumo.values.case import from_unit

@@ -7,7 +7,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import os
 import shutil
 from typing import Any
 
@@ -19,14 +18,11 @@ from lxml import html
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_model as report_facts
-from merge_sumo.reports.player import SPEED_UNIT_MPS
 from merge_sumo.reports.report import report_page
-from merge_sumo.road.merge import road_of
+from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.truth import Truth
 from merge_sumo.values.case import to_unit
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import DT_S, US23, Scenario
+from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.output import LINES, LOG
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
@@ -92,7 +88,7 @@ class TestThePage:
         assert root.xpath("//img | //@onerror") == []
         (title,) = root.xpath("//h1")
         assert title.text == EVIL
-        assert data_of(page)["errors"][str(len(run.outcomes) - 1)] == EVIL
+        assert data_of(page)["cases"]["error"][-1] == EVIL
 
     def test_lists_the_worst_and_the_nearest_misses(self, made, page):
         root = root_of(page)
@@ -133,13 +129,6 @@ class TestThePage:
         page = report_page(run)
         assert "psi" not in [c["name"] for c in data_of(page)["coordinates"]]
         assert "psi" not in root_of(page).xpath("//th/text()")
-
-    def test_says_when_it_was_recorded_and_how_long_it_took(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=10)
-        for file in (run.folder / "campaign.json", *(run.folder / "trajectories").iterdir()):
-            os.utime(file, (1_800_000_000, 1_800_000_000))
-        os.utime(run.folder / "trajectories" / "00000.npz", (1_800_000_090, 1_800_000_090))
-        assert "2027-01-15 08:00 UTC, in 90 s" in text_of(report_page(run))
 
     def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
         assert "interrupted" not in text_of(report_page(made))
@@ -231,39 +220,6 @@ class TestALongCampaign:
         root = root_of(page)
         shown = set(data["cases"]["index"])
         assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
-
-
-class TestTheTruth:
-    @pytest.fixture
-    def cached(self, monkeypatch):
-        """Keep a truth where the left half of each pool fails."""
-
-        def truth(path: object, level: int, cases: int, scenario: Scenario = US23) -> Truth:
-            points = np.random.default_rng(1).random((2000, len(scenario.dimensions(level))))
-            return Truth(points, np.where(points[:, 0] < 0.5, -0.8, 0.9))
-
-        monkeypatch.setattr("merge_sumo.studies.truth.read_truth", truth)
-        return truth
-
-    def test_is_drawn_where_it_is_cached(self, tmp_path, cached):
-        run = write_run(tmp_path / "run", per_level=10, net_sha256=road_of().sha256)
-        page = report_page(run)
-        grid = data_of(page)["maps"]["0"]["grids"][0]["truth"]
-        values = np.frombuffer(base64.b64decode(grid["data"]), dtype=np.uint8)
-        values = values.reshape(grid["ny"], grid["nx"])
-        half = grid["nx"] // 2 - 2  # Nodes beside the border have neighbours of both halves.
-        assert (values[:, :half] == 255).all()
-        assert (values[:, -half:] == 0).all()
-        assert f"{fmc(cached(None, 0, 0).failures):.4f}" in text_of(page)
-        assert "lie within 0.05 of a failure found" in text_of(page)
-
-    @pytest.mark.parametrize("settings", [{"versions": {"libsumo": "0"}}, {"net_sha256": "0"}])
-    def test_of_something_else_is_not(self, tmp_path, cached, settings):
-        run = write_run(
-            tmp_path / "run", per_level=10, **{"net_sha256": road_of().sha256, **settings}
-        )
-        maps = data_of(report_page(run))["maps"].values()
-        assert {grid["truth"] for of in maps for grid in of["grids"]} == {None}
 
 
 class TestTheSurrogate:

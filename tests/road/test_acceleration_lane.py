@@ -18,10 +18,10 @@ from foreign_nets import (
 )
 
 from merge_sumo import api
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.scenario import MergeScenario

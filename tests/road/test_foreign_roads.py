@@ -17,7 +17,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.player import road_data
+from merge_sumo.reports.report_data import road_data
 from merge_sumo.road.merge import road_of
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay

@@ -240,8 +240,10 @@ def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run, t
         assert lines == [line.get("points") for line in right.xpath(".//polyline")]
         assert len(lines) == 4, "speeds and positions of two cars"
         places = [tuple(map(float, p.split(","))) for line in lines for p in line.split()]
-        assert all(pages.OVER_TIME.left <= x <= pages.OVER_TIME.right for x, _ in places)
-        assert max(x for x, _ in places) == pages.OVER_TIME.right
+        _, top, width, height = map(float, left.xpath(".//svg/svg/@viewbox")[0].split())
+        assert max(x for x, _ in places) == width
+        speeds = [y for _, y in places[: len(places) // 2]]
+        assert (min(speeds), max(speeds)) == pytest.approx((top, top + height), abs=0.01)
     assert root.xpath("//script | //@src | //@href | //@style | //img") == []
     (policy,) = root.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
     assert policy.startswith("default-src 'none'; style-src 'sha256-")

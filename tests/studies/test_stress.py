@@ -12,8 +12,8 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.engine.kinematic_world import EquationWorld
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_for
 from merge_sumo.studies.stress import DRAWS, RUNGS, STRESS, Flips, Rung, Stress, flips_of, stress_of
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.imperfection import Actuation

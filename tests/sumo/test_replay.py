@@ -19,10 +19,9 @@ from lxml import etree
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program

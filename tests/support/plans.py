@@ -7,7 +7,7 @@ from typing import Any
 from merge_sumo.drivers.policies import policies_of, policies_sha256
 from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan, plan_key, versions
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.studies.truth import TruthKey
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import US23, Scenario

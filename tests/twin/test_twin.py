@@ -11,14 +11,13 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from plans import POVS, plan_for
 
-from merge_sumo.analysis.predictions import prediction_error_m, surprises
 from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
@@ -287,12 +286,3 @@ def test_a_sampler_without_games_is_the_surrogate_alone():
     sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
     sampler.ask(3)
     assert [sampler.prediction(place) for place in range(3)] == [None] * 3
-
-
-class TestTheReport:
-    def test_lists_what_came_otherwise_than_predicted(self):
-        told = [outcome(i, 10.0 + i, said(10.0, 0.5, 0.5)) for i in range(3)]
-        missed = outcome(3, -2.0, said(math.nan, 0.5, 0.5))
-        assert [o.index for o in surprises([*told, missed, outcome(4, 0.0)])] == [3, 2, 1, 0]
-        assert prediction_error_m(told[2]) == 2.0
-        assert prediction_error_m(missed) is None

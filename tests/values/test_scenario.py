@@ -15,8 +15,8 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.engine.simulator import road_for
 from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
 from merge_sumo.values.case import MergeCase, Pool, from_unit, to_unit
 from merge_sumo.values.scenario import RANGES, US23, MergeScenario

@@ -12,7 +12,7 @@ from controllers import STOCK_CLIENT, program
 from traci_pair import ToSession, close_shadow, shadow
 from vut_contract import factory, run_on
 
-from merge_sumo.engine.simulator import road_for
+from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.traci.session import STAYED, Session

@@ -21,10 +21,9 @@ from jinja2 import Environment, Template
 from markupsafe import Markup
 from problems import Problem
 
-from merge_sumo.reports.comparison_page import STYLES, Frame
+from merge_sumo.reports.comparison_page import STYLES
 from merge_sumo.reports.pages import source_of
 
-FRAME: Final = Frame(34.0, 352.0, 10.0, 150.0)
 PLAIN_COLOUR: Final = "#7B3294"
 COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{6}")
 DASHES: Final = ("none", "7 3", "2 3", "7 2 2 2", "4 2")
@@ -53,14 +52,15 @@ class ProblemChart:
 
 def contest_page(result: SamplerBenchmark) -> str:
     """Return the page of a benchmark as HTML."""
+    own = Path(__file__).with_suffix(".css").read_text(encoding="utf-8")
     return _template().render(
-        style=Markup("".join(map(source_of, STYLES))),  # noqa: S704 (our own files)
+        style=Markup("".join([*map(source_of, STYLES), own])),  # noqa: S704 (our own files)
         result=result,
         scores=list(result.samplers.values()),
         first_seed=FIRST_SEED,
         ratio_text=ratio_text,
         charts=[_chart(result, problem) for problem in result.settings.problems],
-        up=[(FRAME.y(share), f"{share:g}") for share in (0.0, 0.5, 0.9, 1.0)],
+        up=[(_up(share), f"{share:g}") for share in (0.0, 0.5, 0.9, 1.0)],
         faults=[
             (score.entrant.label, name, seed, fault)
             for score in result.samplers.values()
@@ -93,10 +93,20 @@ def _chart(result: SamplerBenchmark, problem: Problem) -> ProblemChart:
     best = {n: truth_share(truth, n) for n in settings.curve}
     curves.append(Curve(ORACLE, "", "1 3", _points(best, settings.cases)))
     ticks = sorted({0, settings.cases, *settings.counted})
-    return ProblemChart(problem, curves, [(FRAME.x(n / settings.cases), str(n)) for n in ticks])
+    return ProblemChart(problem, curves, [(_across(n / settings.cases), str(n)) for n in ticks])
 
 
 def _points(curve: Mapping[int, float], cases: int) -> str:
     """Return the points of a curve, from no case on."""
     places = [(0, 0.0), *curve.items()]
-    return " ".join(f"{FRAME.x(n / cases)},{FRAME.y(share)}" for n, share in places)
+    return " ".join(f"{_across(n / cases)},{_up(share)}" for n, share in places)
+
+
+def _across(share: float) -> float:
+    """Return the pixel at a share of the way from left to right."""
+    return round(34.0 + 318.0 * share, 1)
+
+
+def _up(share: float) -> float:
+    """Return the pixel at a share of the way from the bottom up."""
+    return round(150.0 - 140.0 * share, 1)

@@ -1,11 +1,11 @@
 "use strict";
-// The motion of one case, or of two beside each other: the road from above, and charts over time.
+// The motion of a case: the road from above, and charts over time.
 // Everything that is drawn comes from the JSON in #data; text is set as text, never as markup.
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const namespace = document.querySelector("svg").namespaceURI;
 const DT = data.dt, CRASH = data.crash_m;
-const LANE = data.lane ?? null; // an acceleration lane: [begin, end]
+const LANE = data.lane; // an acceleration lane: [begin, end], or null
 const vehicles = data.vehicles, POV = vehicles.indexOf("pov"), VUT = vehicles.indexOf("vut");
 const NAMES = { pov: "POV", vut: "VUT", ahead: "car ahead", behind: "car behind" };
 const cases = data.cases;
@@ -37,7 +37,7 @@ function motion(i) {
     return places;
   });
   // On an acceleration lane the last row is that of the merge.
-  const merge = LANE && data.ends[cases.end[i]] === "MERGED" ? x[VUT][rows - 1] : null;
+  const merge = LANE && cases.end[i] === "MERGED" ? x[VUT][rows - 1] : null;
   return { rows, v, x, met: cases.nearest[i], merge };
 }
 
@@ -83,35 +83,28 @@ function range(values, pad = 0.06) {
 }
 
 /* ---------- road, motion, charts ---------- */
-const slider = byId("time"), views = ["view", "view-beside"].map((id) => new TopView(byId(id)));
+const slider = byId("time"), view = new TopView(byId("road"));
 let moving = null, step = 0, final = 0, playing = false, last = 0, charts = [];
-function showMotions(first, second, names, flags = [], more = () => []) { // a motion, and another one beside it, whose lines are faint
-  const { v, x, met } = moving = first;
+function animate(first, flags, more) { // flags: who begins to brake, and when; more: further charts up to a time
+  const { v, x, met, rows, merge } = moving = first;
   const over = (values) => values.map((value, t) => [t * DT, value]);
-  const lines = (values, more = "") => vehicles.map((name, who) => ({ name: name + more, points: over(values[who]) }));
-  const both = (key) => (second ? [...lines(second[key], " beside"), ...lines(first[key])] : lines(first[key]));
-  const all = (key) => [...first[key].flat(), ...(second?.[key].flat() ?? [])];
-  const secondGap = second ? second.x[second.met].map((place, t) => place - second.x[VUT][t]) : [];
+  const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
   const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
-  const inView = range([...gap[met], ...secondGap, -12, 12]); // of the car that the VUT meets
-  const merges = [second, first].filter((one) => one && one.merge !== null)
-    .map((one) => ({ name: one === second ? "merged beside" : "merged", x: (one.rows - 1) * DT, y: one.merge }));
-  final = Math.max(first.rows, second?.rows ?? 0) - 1;
+  const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
+  final = rows - 1;
   const end = final * DT, common = { xRange: [0, end], xLabel: "time, s" };
   charts = [
-    plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: both("v"), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
-    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: both("x"), windows: LANE ? [LANE] : [], dots: merges }),
+    plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
+    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x), windows: LANE ? [LANE] : [], dots: merge === null ? [] : [{ name: "merged", x: end, y: merge }] }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
-      lines: [...(second ? [{ name: "gap beside", points: over(secondGap) }] : []), ...others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }))],
+      lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
     }),
     ...more(end),
   ];
   slider.max = final;
-  byId("views").classList.toggle("two", second !== null);
-  views[0].show(first, names[0]);
-  views[1].show(second, names[1]);
+  view.show();
 }
 const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path
@@ -122,17 +115,10 @@ function pose(path, along) { // front bumper at a lane coordinate of a path
   const [[s0, x0, y0], [s1, x1, y1]] = [path[k - 1], path[k]], share = (along - s0) / (s1 - s0 || 1);
   return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), angle: Math.atan2(y0 - y1, x1 - x0) * 180 / Math.PI };
 }
-function TopView(figure) {
-  const svg = figure.querySelector("svg"), caption = figure.querySelector("figcaption");
+function TopView(svg) {
   const cars = {};
-  let name = "";
-  this.svg = svg;
   this.cars = cars;
-  this.moving = null; // what it shows
-  this.show = (moving, named) => {
-    this.moving = moving;
-    name = named;
-    figure.hidden = moving === null;
+  this.show = () => {
     svg.replaceChildren();
     // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
     for (const lane of data.lanes) draw(svg, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
@@ -141,8 +127,7 @@ function TopView(figure) {
       const group = draw(svg, "g");
       draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
       const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
-      const label = draw(svg, "text", { "text-anchor": "middle" });
-      cars[who] = { group, brake, label };
+      cars[who] = { group, brake, label: draw(svg, "text", { "text-anchor": "middle" }) };
     }
   };
   const across = (name, from, to, x) => { // a line over the road between two paths, at a lane coordinate
@@ -154,23 +139,24 @@ function TopView(figure) {
     const inside = data.ramp.filter(([at]) => at > begin && at < end).map(([at]) => at);
     const points = [begin, ...inside, end].map((at) => pose(data.ramp, at));
     draw(svg, "path", { class: "window", d: path(points.map(({ x, y }) => [x, -y])), "stroke-width": 3.05 });
-    if (this.moving && this.moving.merge !== null) across("merge", data.main, data.ramp, Math.min(this.moving.merge, end));
+    if (moving.merge !== null) across("merge", data.main, data.ramp, Math.min(moving.merge, end));
   };
-  const row = (t) => { // the rows of the motion that a step is between; its last one stays
-    const { rows } = this.moving, s = Math.min(t, rows - 1), k = Math.min(Math.floor(s), Math.max(rows - 2, 0));
-    return { k, next: Math.min(k + 1, rows - 1), share: s - k };
-  };
-  const mix = (values, { k, next, share }) => (1 - share) * values[k] + share * values[next];
-  const hasMerged = (t) => this.moving.merge !== null && t >= this.moving.rows - 1;
-  this.places = (t) => this.moving.x.map((x, who) => pose(who === VUT && !hasMerged(t) ? data.ramp : data.main, mix(x, row(t))));
-  this.at = (t, { x: middle, y: centre, width, height }) => {
-    const now = row(t), places = this.places(t), vutAbove = places[VUT].y > places[POV].y;
+  this.at = (t) => {
+    const { rows, x: xs, v: vs, merge } = moving, k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
+    const mix = (values) => values[k] + (t - k) * (values[next] - values[k]); // between two rows
+    const merged = merge !== null && t >= rows - 1;
+    const places = xs.map((x, who) => pose(who === VUT && !merged ? data.ramp : data.main, mix(x)));
+    const vutAbove = places[VUT].y > places[POV].y;
+    // The view follows all cars, never closer than 90 m.
+    const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
+    const ratio = svg.clientHeight / (svg.clientWidth || 1) || 0.25, middle = (low + high) / 2, centre = (bottom + top) / 2;
+    const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90), height = width * ratio;
     const size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
     // Letters of a small picture are 11 pixels high.
     const letters = Math.max(2.6 * size, 11 * width / (svg.clientWidth || width)), aside = 0.5 * width - 3.6 * letters;
     svg.setAttribute("viewBox", `${middle - width / 2} ${-centre - height / 2} ${width} ${height}`);
     for (const [who, name] of vehicles.entries()) {
-      const { x, y, angle } = places[who], v = this.moving.v[who], a = (v[now.next] - v[now.k]) / DT;
+      const { x, y, angle } = places[who], v = vs[who], a = (v[next] - v[k]) / DT;
       const { group, brake, label } = cars[name];
       group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
       brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
@@ -179,23 +165,16 @@ function TopView(figure) {
       const below = -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters);
       label.setAttribute("y", clamp(below, letters - centre - height / 2, height / 2 - centre - 0.4 * letters));
       label.style.fontSize = `${letters}px`;
-      label.textContent = named ? `${NAMES[name]} ${fixed(mix(v, now), 1)} m/s` : name;
+      label.textContent = named ? `${NAMES[name]} ${fixed(mix(v), 1)} m/s` : name;
       // The POV's own label has the room where two would lie on each other.
       label.setAttribute("visibility", named || Math.abs(x - places[POV].x) > 0.14 * width ? "visible" : "hidden");
     }
-    const end = (this.moving.rows - 1) * DT;
-    caption.textContent = t < this.moving.rows - 1 ? name : `${name}, ended at ${fixed(end, 1)} s`;
   };
 }
 function at(t) {
   if (!moving) return;
   step = clamp(t, 0, final);
-  const shown = views.filter((view) => view.moving), places = shown.flatMap((view) => view.places(step));
-  // The view follows all cars, never closer than 90 m; of two cases it is the same stretch of road.
-  const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
-  const { clientWidth, clientHeight } = views[0].svg, ratio = clientHeight / (clientWidth || 1) || 0.25;
-  const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90);
-  for (const view of shown) view.at(step, { x: (low + high) / 2, y: (bottom + top) / 2, width, height: width * ratio });
+  view.at(step);
   slider.value = Math.round(step);
   slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
   byId("time-value").textContent = `${fixed(step * DT, 1)} s`;

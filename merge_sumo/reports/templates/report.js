@@ -1,19 +1,19 @@
-// The report beside its player (player.js), which it shares with the page of a comparison.
-const PLACE = data.place ?? "M"; // what merges from an acceleration lane are called
+// The report beside its player (player.js): maps, the view of a case, and the table of all cases.
+const PLACE = data.place; // M, or what merges from an acceleration lane are called
 const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
 const place = new Map(cases.index.map((index, i) => [index, i]));
 
 /* ---------- cases ---------- */
-const failed = (i) => cases.failed[i] === 1;
+const failed = (i) => cases.failed[i];
 let matching = null; // the cases that the filters let through; null without a filter
 const wanted = (i) => matching === null || matching.has(i);
 function avoidedBy(i, who) { // a driver, "pov" or "none"
   const by = failed(i) ? cases.avoided_by[i] : null;
   if (by === null) return false;
-  return who === "pov" ? cases.pov_careful[i] === 1 : who === "none" ? by.length === 0 : by.includes(who);
+  return who === "pov" ? cases.pov_careful[i] : who === "none" ? by.length === 0 : by.includes(who);
 }
-const tested = (i) => failed(i) || data.ends[cases.end[i]] === "MERGED";
-const severity = (i) => cases.severity[i] === null ? null : data.severities[cases.severity[i]];
+const tested = (i) => failed(i) || cases.end[i] === "MERGED";
+const severity = (i) => cases.severity[i];
 function drawMark(parent, i, x, y, faint) { // shape and colour by severity; what fails is large
   const found = severity(i), large = failed(i);
   const look = { class: `mark ${found ?? (large ? "unclassed" : "error")}${large ? " fail" : ""}${faint}`, "data-case": cases.index[i] };
@@ -34,7 +34,7 @@ function runsInWords(i) {
   const each = runs.each.map(([index, fails]) => `${index} ${fails ? "fails" : "passes"}`).join(", ");
   return `Fails in ${runs.failed} of ${runs.number} runs (95 % interval ${percent(runs.low)} to ${percent(runs.high)} %): ${each}. Shown is run ${cases.index[i]}, which decides.`;
 }
-const rank = (i) => cases.severity[i] ?? data.severities.length; // the most severe lie on top
+const rank = (i) => (severity(i) === null ? data.severities.length : data.severities.indexOf(severity(i))); // the most severe lie on top
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
@@ -44,17 +44,17 @@ function title(i) {
 function conduct(i) { // what both did, by their speeds
   const met = NAMES[vehicles[cases.nearest[i]]];
   const of = (brakes, accelerates) => brakes !== null ? `begins to brake at ${fixed(brakes, 1)} s` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
-  return `The VUT ${of(cases.vut_brakes[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes[i], cases.pov_accelerates[i])}.`;
+  return `The VUT ${of(cases.vut_brakes_s[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes_s[i], cases.pov_accelerates[i])}.`;
 }
 function placeOfMerge(i) { // on an acceleration lane
   const share = cases.lane_share[i];
   return share >= 1 ? "where the lane ends" : `after ${fixed(100 * share, 0)} % of the lane`;
 }
 function words(i) {
-  const end = data.ends[cases.end[i]], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
+  const end = cases.end[i], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
   const met = NAMES[vehicles[cases.nearest[i]]];
   if (end === "MERGED") {
-    const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${data.kinds[cases.kind[i]]})`;
+    const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${cases.kind[i]})`;
     if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
     parts.push(`The VUT ${LANE ? `merges at ${at}, ${placeOfMerge(i)}` : `reaches M at ${at}`}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
     if (found === "contact") parts.push(`Bodies touch${cases.bumper_gap_m[i] > 0 ? ` after ${PLACE},` : ""} at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
@@ -68,7 +68,7 @@ function words(i) {
   } else if (end === "TIMEOUT") {
     parts.push(`Timeout: the VUT did not reach ${data.goal} in ${fixed(cases.t_end_s[i], 0)} s.`);
   } else {
-    parts.push(`${end}: ${(data.errors[cases.index[i]] || "no reason given").replace(/\.?$/, ".")}`);
+    parts.push(`${end}: ${(cases.error[i] || "no reason given").replace(/\.?$/, ".")}`);
   }
   if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push(`Bodies overlap before ${PLACE}, where the lanes run together.`);
   if (LANE && cases.stood_s[i] > 0) parts.push(`The VUT stood on the lane for ${fixed(cases.stood_s[i], 1)} s.`);
@@ -77,12 +77,12 @@ function words(i) {
   }
   if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
   if (cases.kind[i] !== null) {
-    const until = cases.way_out[i];
+    const until = cases.last_avoidable_s[i];
     const none = LANE ? `Neither full braking nor full acceleration of the VUT would ever have kept ${fixed(CRASH, 0)} m at this place.` : "There never was a way out for the VUT.";
     parts.push(until === null ? none : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at ${LANE ? "this place" : "M"} until ${fixed(until, 1)} s.`);
   }
   if (cases.avoided_by && cases.avoided_by[i] !== null) {
-    const by = cases.avoided_by[i], until = cases.latest_takeover[i];
+    const by = cases.avoided_by[i], until = cases.latest_takeover_s[i];
     parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
     if (until !== null) parts.push(`The last time at which the fuzzy safety model (fsm) can take over and avoid it is ${fixed(until, 1)} s.`);
     if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
@@ -91,7 +91,7 @@ function words(i) {
   return parts.filter(Boolean).join(" ");
 }
 
-/* ---------- grids: the surrogate's chance, the truth's outline ---------- */
+/* ---------- grids: the surrogate's chance ---------- */
 function slice(grid, at) { // `at` a share of the third coordinate; null for all of it at once
   if (!grid.values) grid.values = bytes(grid.data);
   const { nx, ny, np, values } = grid, size = nx * ny;
@@ -104,25 +104,6 @@ function slice(grid, at) { // `at` a share of the third coordinate; null for all
   const place = clamp(at, 0, 1) * (np - 1), low = Math.min(Math.floor(place), np - 2), share = place - low;
   for (let n = 0; n < size; n++) out[n] = (1 - share) * values[low * size + n] + share * values[(low + 1) * size + n];
   return out;
-}
-function contour(values, nx, ny, level, X, Y) {
-  // Marching squares; the two ambiguous squares are cut as two corners.
-  let d = "";
-  const cut = (a, b) => (level - a) / (b - a);
-  for (let j = 0; j + 1 < ny; j++) for (let i = 0; i + 1 < nx; i++) {
-    const a = values[j * nx + i], b = values[j * nx + i + 1], c = values[(j + 1) * nx + i + 1], e = values[(j + 1) * nx + i];
-    const code = (a > level) | ((b > level) << 1) | ((c > level) << 2) | ((e > level) << 3);
-    if (code === 0 || code === 15) continue;
-    const south = () => [i + cut(a, b), j], north = () => [i + cut(e, c), j + 1];
-    const west = () => [i, j + cut(a, e)], east = () => [i + 1, j + cut(b, c)];
-    const lines = {
-      1: [[west, south]], 2: [[south, east]], 3: [[west, east]], 4: [[east, north]], 5: [[west, south], [east, north]],
-      6: [[south, north]], 7: [[west, north]],
-    }[code > 7 ? 15 - code : code];
-    const pairs = code === 10 ? [[south, east], [west, north]] : lines;
-    for (const [from, to] of pairs) d += path([from(), to()].map(([x, y]) => [X(x / (nx - 1)), Y(y / (ny - 1))]));
-  }
-  return d;
 }
 function shade(svg, values, nx, ny, box) {
   const canvas = document.createElement("canvas");
@@ -146,34 +127,32 @@ const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureM
 function FailureMap(figure) {
   const svg = figure.querySelector("svg"), level = Number(figure.dataset.level), of = data.maps[level];
   const [left, top, width, height] = BOX;
-  const frame = { scale: 1, u: 0, v: 0 }; // what is in the frame: from (u, v), shares of the pool, 1 / scale of it
-  const X = (u) => left + (u - frame.u) * frame.scale * width, Y = (v) => top + (1 - (v - frame.v) * frame.scale) * height;
+  const X = (u) => left + u * width, Y = (v) => top + (1 - v) * height; // of shares of the pool
   const own = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level);
   const third = of.through === null ? null : coordinates[of.through]; // the reader moves through it
   const slider = figure.querySelector("input[type=range]"), check = figure.querySelector("input[type=checkbox]");
   const pairs = figure.querySelector("select");
   let pair = 0, at = 0, all = third === null, axes = [], marks = [];
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
-  const framed = (x, y) => x >= left - 1e-6 && x <= left + width + 1e-6 && y >= top - 1e-6 && y <= top + height + 1e-6;
   const near = (i) => all || apart(i) <= third.near;
 
   const place = () => {
-    axes = of.pairs[pair].axes.map((k) => coordinates[k]);
+    axes = of.pairs[pair].map((k) => coordinates[k]);
     const [across, up] = axes;
     marks = own.map((i) => ({ i, x: X(unit(across, cases[across.field][i])), y: Y(unit(up, cases[up.field][i])) }))
       .sort((a, b) => failed(a.i) - failed(b.i) || rank(b.i) - rank(a.i));
   };
   this.level = level;
   this.draw = () => {
-    const { chance, truth } = of.grids[pair], share = all ? null : unit(third, at);
+    const { chance } = of.grids[pair], share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
-    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, [X(0), Y(1), frame.scale * width, frame.scale * height]);
+    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX);
     for (const [n, c] of axes.entries()) {
-      const vertical = n === 0, span = (c.high - c.low) / frame.scale, low = c.low + (vertical ? frame.u : frame.v) * (c.high - c.low);
+      const vertical = n === 0, span = c.high - c.low;
       const step = ticks(span / (vertical ? 4 : 5));
-      for (let value = Math.ceil(low / step - 1e-9) * step; value <= low + span + 1e-9; value += step) {
+      for (let value = Math.ceil(c.low / step - 1e-9) * step; value <= c.high + 1e-9; value += step) {
         const u = unit(c, value);
         draw(svg, "line", vertical ? { class: "grid", x1: X(u), x2: X(u), y1: top, y2: top + height } : { class: "grid", x1: left, x2: left + width, y1: Y(u), y2: Y(u) });
         draw(svg, "text", vertical ? { x: X(u), y: top + height + 15, "text-anchor": "middle" } : { x: left - 6, y: Y(u) + 4, "text-anchor": "end" }, fixed(value, digits(step)));
@@ -188,12 +167,10 @@ function FailureMap(figure) {
       const off = all ? 0 : apart(i) / (third.high - third.low);
       if (off >= of.radius) continue;
       const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
-      draw(balls, "ellipse", { cx: x, cy: y, rx: r * frame.scale * width, ry: r * frame.scale * height });
+      draw(balls, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
     }
-    if (truth) draw(svg, "path", { class: "outline", "clip-path": "url(#clip)", d: contour(slice(truth, share), truth.nx, truth.ny, 127.5, X, Y) });
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
-      if (!framed(x, y)) continue;
       const faint = near(i) && wanted(i) ? "" : " faint";
       drawMark(svg, i, x, y, faint);
       drawShare(svg, i, x, y, faint);
@@ -221,50 +198,17 @@ function FailureMap(figure) {
     for (let n = 0; n < grid.nx * grid.ny; n++) {
       const x = X((n % grid.nx) / grid.nx), y = Y((Math.floor(n / grid.nx) + 1) / grid.ny);
       for (const [name, count] of [["count", grid.safe[n]], ["count failing", grid.failing[n]]]) if (count) {
-        draw(svg, "rect", { class: name, x, y, width: frame.scale * width / grid.nx, height: frame.scale * height / grid.ny, "clip-path": "url(#clip)", "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
+        draw(svg, "rect", { class: name, x, y, width: width / grid.nx, height: height / grid.ny, "clip-path": "url(#clip)", "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
       }
     }
   };
   this.choose = () => {
     svg.querySelector(".chosen")?.remove();
     const mark = marks.find((m) => m.i === chosen);
-    if (mark && !framed(mark.x, mark.y)) return zoom(1, mark.x, mark.y, true);
     if (mark) draw(svg, "circle", { class: "chosen", cx: mark.x, cy: mark.y, r: 8 });
   };
-  const visible = () => marks.filter((m) => near(m.i) && wanted(m.i) && framed(m.x, m.y));
-  const pan = (u, v) => {
-    frame.u = clamp(u, 0, 1 - 1 / frame.scale);
-    frame.v = clamp(v, 0, 1 - 1 / frame.scale);
-    svg.classList.toggle("zoomed", frame.scale > 1);
-    place();
-    this.draw();
-  };
-  const zoom = (factor, x, y, centre = false) => { // (x, y) stays where it is, or comes to the centre
-    const a = (x - left) / width, b = 1 - (y - top) / height, u = frame.u + a / frame.scale, v = frame.v + b / frame.scale;
-    frame.scale = clamp(frame.scale * factor, 1, 64);
-    pan(u - (centre ? 0.5 : a) / frame.scale, v - (centre ? 0.5 : b) / frame.scale);
-  };
-  const zoomBy = (factor) => { // about the case that is shown, if it is here
-    const { x, y } = marks.find((m) => m.i === chosen) ?? { x: left + width / 2, y: top + height / 2 };
-    zoom(factor, x, y, true);
-  };
+  const visible = () => marks.filter((m) => near(m.i) && wanted(m.i));
   const pointOf = (event) => new DOMPoint(event.clientX, event.clientY).matrixTransform(svg.getScreenCTM().inverse());
-  for (const button of figure.querySelectorAll("[data-zoom]")) button.addEventListener("click", () => zoomBy(Number(button.dataset.zoom)));
-  svg.addEventListener("wheel", (event) => {
-    if (!event.ctrlKey) return; // the page scrolls
-    event.preventDefault();
-    const { x, y } = pointOf(event);
-    zoom(event.deltaY < 0 ? 1.25 : 0.8, x, y);
-  }, { passive: false });
-  let held = null, dragged = false;
-  svg.addEventListener("pointerdown", (event) => { held = { from: pointOf(event), ...frame }; dragged = false; });
-  addEventListener("pointerup", () => { held = null; });
-  svg.addEventListener("pointermove", (event) => {
-    if (!held || frame.scale === 1) return;
-    const { x, y } = pointOf(event), across = x - held.from.x, up = held.from.y - y;
-    dragged ||= Math.hypot(across, up) > 4;
-    if (dragged) pan(held.u - across / width / frame.scale, held.v - up / height / frame.scale);
-  });
   const under = (event) => {
     const point = pointOf(event);
     let best = null, least = 14;
@@ -275,15 +219,13 @@ function FailureMap(figure) {
     return best;
   };
   const drawn = (i) => svg.querySelector(`[data-case="${cases.index[i]}"]`);
-  svg.addEventListener("click", (event) => { const mark = dragged ? null : under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
+  svg.addEventListener("click", (event) => { const mark = under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
   svg.addEventListener("pointermove", (event) => {
     const mark = event.pointerType === "touch" ? null : under(event);
     mark ? tip(event, title(mark.i)) : tip(null);
   });
   svg.addEventListener("pointerleave", () => tip(null));
   svg.addEventListener("keydown", (event) => {
-    const factor = { "+": 2, "-": 0.5, 0: 1 / 64 }[event.key];
-    if (factor) return zoomBy(factor);
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
     if (!way) return;
     event.preventDefault();
@@ -323,8 +265,6 @@ function ticks(step) {
 }
 
 /* ---------- a case: road, motion, charts ---------- */
-let beside = -1;
-
 const panel = byId("case");
 function dock(on) { // at the foot of the window, or in its place beside the lists
   panel.classList.toggle("docked", on);
@@ -373,10 +313,6 @@ function restore() { // an address is data: what it names that is not here is le
     if (control.selectedIndex < 0) control.selectedIndex = 0;
   }
 }
-byId("keep").addEventListener("click", () => {
-  beside = beside < 0 ? chosen : -1;
-  show(chosen);
-});
 addEventListener("hashchange", () => { restore(); filter(); openLinked(); });
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
 byId("close").addEventListener("click", () => dock(false));
@@ -390,41 +326,26 @@ function show(i) {
   link.hidden = false;
   link.href = address(i);
   link.textContent = `#case-${cases.index[i]}`;
-  const command = `${data.replay} ${cases.index[i]} --gui`;
-  // Lines break between words only: a hyphen in a name is no place for it.
-  byId("command").replaceChildren(...command.split(" ").flatMap((word, n) => {
-    const whole = document.createElement("span");
-    whole.textContent = word;
-    return n ? [" ", whole] : [whole];
-  }));
-  for (const part of document.querySelectorAll(".command, .command-title")) part.hidden = false;
+  for (const place of document.querySelectorAll("code .index")) place.textContent = cases.index[i];
   for (const map of maps) map.choose();
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
-  const compared = beside >= 0 && beside !== i;
-  byId("beside").hidden = !compared;
-  byId("beside-title").textContent = compared ? title(beside) : "";
-  byId("beside-words").textContent = compared ? words(beside) : "";
-  byId("keep").hidden = false;
-  byId("keep").textContent = beside < 0 ? "Compare with the next" : "End the comparison";
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
   play(false);
   if (moving) showMotion(i);
 }
 function showMotion(i) {
-  const other = beside >= 0 && beside !== i ? motion(beside) : null;
-  const flags = [[moving.met, cases.pov_brakes[i]], [VUT, cases.vut_brakes[i]]].filter(([, t]) => t !== null);
-  showMotions(moving, other, [`Case ${cases.index[i]}`, `Case ${cases.index[beside] ?? ""}`], flags, (end) => [...signalCharts(i, end), ...whyCharts(i)]);
-  at(failed(i) || other ? final : 0);
+  const flags = [[moving.met, cases.pov_brakes_s[i]], [VUT, cases.vut_brakes_s[i]]].filter(([, t]) => t !== null);
+  animate(moving, flags, (end) => [...signalCharts(i, end), ...whyCharts(i)]);
+  at(failed(i) ? final : 0);
 }
 function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
   const found = data.why[cases.index[i]];
   byId("why").hidden = !failed(i);
   byId("why-known").hidden = !found;
   byId("why-ask").hidden = Boolean(found);
-  byId("why-command").textContent = `${data.explain} ${cases.index[i]} && ${data.report}`;
   if (!found) return [];
   byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   drawAxes(byId("why-changes"), found.axes);
@@ -436,9 +357,9 @@ function moments(svg, i) { // both distances to M, and the last moments at which
   const dots = [{ name: "merged", x: end, y: -x[VUT][rows - 1] }];
   const yRange = range(lines.flatMap(({ points }) => points.map(([, y]) => y)));
   const chart = plot(svg, { xRange: [0, end], yRange, xLabel: "time, s", lines, dots }), [top, bottom] = [8, 162];
-  const never = cases.kind[i] !== null && cases.way_out[i] === null, closes = never ? 0 : cases.way_out[i];
+  const never = cases.kind[i] !== null && cases.last_avoidable_s[i] === null, closes = never ? 0 : cases.last_avoidable_s[i];
   if (closes !== null) draw(svg, "rect", { class: "danger", x: chart.X(closes), y: top, width: chart.to - chart.X(closes), height: bottom - top });
-  const takeover = cases.latest_takeover?.[i] ?? null;
+  const takeover = cases.latest_takeover_s?.[i] ?? null;
   const flags = [[takeover, "take-over until"], [closes, never ? "never a way out from" : "way out until"], [end, "ends at"]];
   for (const [row, [t, what]] of flags.entries()) {
     if (t === null) continue;
@@ -522,16 +443,16 @@ for (const table of document.querySelectorAll(".list")) {
 }
 
 /* ---------- all cases ---------- */
-const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : data.ends[cases.end[i]]);
+const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : cases.end[i]);
 function allCases() { // gives what shows the cases that the filters let through
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
   const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
   const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
-  const kindOf = (i) => (cases.kind[i] === null ? null : data.kinds[cases.kind[i]]);
+  const kindOf = (i) => cases.kind[i];
   const columns = [
     { name: "case", exact: true, value: (i) => cases.index[i] },
     { name: "level", value: (i) => cases.level[i], text: (value) => data.level_names[value] },
-    { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !data.errors[cases.index[i]] ? value : `${value}: ${data.errors[cases.index[i]]}`) },
+    { name: "verdict", words: true, value: verdict, text: (value, i) => (tested(i) || !cases.error[i] ? value : `${value}: ${cases.error[i]}`) },
     { name: "severity", words: true, value: severity, order: rank },
     { name: "kind", words: true, value: kindOf },
     { name: "region", value: (i) => cases.region[i], text: (value) => String(value + 1) },
@@ -552,7 +473,7 @@ function allCases() { // gives what shows the cases that the filters let through
     for (const i of all) if (value(i) !== null) counts.set(value(i), (counts.get(value(i)) ?? 0) + 1);
     return counts;
   };
-  const message = (i) => (tested(i) ? null : data.errors[cases.index[i]] ?? null);
+  const message = (i) => (tested(i) ? null : cases.error[i]);
   const where = (i) => (cases.region[i] === null ? null : `${cases.level[i]}:${cases.region[i]}`);
   for (const [value] of count((i) => cases.level[i])) option(level, value, data.level_names[value]);
   for (const [value, n] of count(verdict)) option(ended, value, `${value} (${n})`);
@@ -638,18 +559,6 @@ function allCases() { // gives what shows the cases that the filters let through
     changed();
     document.querySelector(".map").scrollIntoView({ block: "nearest" });
   });
-  byId("download").addEventListener("click", () => {
-    const cell = (c, i) => {
-      const value = c.value(i);
-      return value === null ? "" : c.exact ? String(value) : csvText(c.text ? c.text(value, i) : String(value));
-    };
-    const lines = [columns.map((c) => csvText(c.name)), ...found.map((i) => columns.map((c) => cell(c, i)))];
-    const link = document.createElement("a");
-    link.href = URL.createObjectURL(new Blob([lines.map((line) => `${line.join(",")}\r\n`).join("")], { type: "text/csv" }));
-    link.download = "cases.csv";
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 60000);
-  });
   form.addEventListener("submit", (event) => event.preventDefault());
   more.addEventListener("click", extend);
   body.addEventListener("click", (event) => {
@@ -666,22 +575,14 @@ function allCases() { // gives what shows the cases that the filters let through
   byId("all").hidden = !all.length;
   return filter;
 }
-function csvText(text) { // a spreadsheet is to run nothing: not at the start, nor where it may split
-  const defused = text.replace(/(^|[;,\t\r\n])(\s*)(?=[=+\-@])/g, "$1$2'").replace(/[\t\r\n]+/g, " ");
-  return /[",;]/.test(defused) ? `"${defused.replaceAll('"', '""')}"` : defused;
-}
-
 /* ---------- the search ---------- */
 function search() {
   const { batch, levels } = data.search;
   if (!batch.length) return;
-  const xRange = [batch[0], batch[batch.length - 1] + data.search.width];
-  const lines = (key) => levels.map((of) => ({ name: `level${of.level}`, points: of[key].map((y, n) => [batch[n] + data.search.width / 2, y]).filter(([, y]) => y !== null) })).filter(({ points }) => points.length);
-  const common = { xRange, xLabel: "batch" };
-  const coverage = lines("fmc");
-  const off = lines("off");
-  if (byId("chart-off")) plot(byId("chart-off"), { ...common, yRange: [0, Math.max(...off.flatMap(({ points }) => points.map(([, y]) => y)), 1) * 1.1], lines: off });
-  plot(byId("chart-fmc"), { ...common, yRange: [0, Math.max(...coverage.flatMap(({ points }) => points.map(([, y]) => y)), 0.001) * 1.1], lines: coverage });
+  const half = data.search.width / 2, end = batch[batch.length - 1] + data.search.width;
+  const lines = levels.map(({ level, fmc }) => ({ name: `level${level}`, points: fmc.map((y, n) => [batch[n] + half, y]) }));
+  const most = Math.max(...levels.flatMap(({ fmc }) => fmc), 0.001);
+  plot(byId("chart-fmc"), { xRange: [batch[0], end], xLabel: "batch", yRange: [0, 1.1 * most], lines });
 }
 
 const worst = document.querySelector(".list button");
