@@ -93,6 +93,7 @@ IMPORTED_BY_A_VARIABLE = {
     "merge_sumo": "the room of a public name that is asked for",
     "merge_sumo.system.workers": "what a worker loads first",
     "merge_sumo.system.spawning": "the function that a new process of this package is to run",
+    "merge_sumo.vuts.built_in": "the files of `drivers/`, which may have VUTs",
     "merge_sumo.vuts.python": "the module of a user's VUT",
 }
 """Files that import what a variable names, and what that is."""
@@ -306,6 +307,12 @@ class TestImports:
             for file in commands
         }
         assert {module: names for module, names in others.items() if names} == {}
+
+    def test_of_a_vut_are_of_sumo_in_its_own_models_and_its_traci_server_alone(self):
+        of_sumo = ("merge_sumo.vuts.sumo_model", "merge_sumo.vuts.traci")
+        importing = offenders(files_below("vuts"), {"merge_sumo.sumo"})
+        assert importing
+        assert {module for module in importing if not module.startswith(of_sumo)} == set()
 
     def test_unpickle_nothing(self):
         assert offenders(FILES, UNSAFE_MODULES) == {}

@@ -38,7 +38,7 @@ from merge_sumo.sumo.world import MAX_SPEED_MPS, World
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.scenario import DT_S, MAX_STEPS, US23, VEHICLES, X_VUT0_M, Scenario
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 KS = (1, 8, 32, 64)
 STEPS = 80
@@ -50,7 +50,7 @@ VUT = "design1"
 def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
     pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
-    vut = VutFactory(VUT)(world.corridors)
+    vut = VutFactory.of(VUT)(world.corridors)
     start = time.perf_counter()
     trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
     return time.perf_counter() - start, trajectories
@@ -122,7 +122,7 @@ def process_s(cases: list[Case]) -> list[float]:
                     case,
                     hosted_paths(road),
                     PovLibrary(1, Povs(policies=policies_of(US23))),
-                    VutFactory(VUT)(1),
+                    VutFactory.of(VUT)(1),
                 )
             finally:
                 traci.close()

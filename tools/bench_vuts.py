@@ -40,7 +40,7 @@ from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 STEPS = 80
 """Of an episode."""
@@ -183,7 +183,7 @@ def main() -> None:
         world: Any = SimpleNamespace(road=road_of(), scenario=US23)
 
         def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
-            return VutFactory(spec, given or VutOptions())(corridors, world)
+            return VutFactory.of(spec, given or VutOptions())(corridors, world)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),

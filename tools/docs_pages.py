@@ -172,9 +172,9 @@ WRITTEN: dict[str, Callable[[], str]] = {
 
 def vut_kinds_table() -> str:
     """Return the registered kinds of VUT as a table."""
-    from merge_sumo.vuts.registry import KINDS, PYTHON
+    from merge_sumo.vuts.registry import KINDS
 
-    kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
+    kinds = [kind for kind in KINDS.values() if kind.form]
     rows = [f"| `{kind.form}` | {kind.what} | `{kind.example}` |" for kind in kinds]
     return "\n".join(("| form | kind | example |", "|---|---|---|", *rows))
 

@@ -130,10 +130,11 @@ from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import Car, Seen
+from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.python import SeenBatch, installed_vuts
-from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS, PYTHON
+from merge_sumo.vuts.registry import KINDS
 
 if TYPE_CHECKING:
     from merge_sumo.values.case import Case
@@ -682,7 +683,7 @@ def truth(
     with _study(settings, runner, engine) as study:
         repeats = _repeats_of(settings, repeat, tolerated)
         by_level = {one: study.truth(one, cases, seed, repeats) for one in settings.levels}
-    if study.plan.vut.vut.named_only and not is_here(settings.vut):
+    if not study.plan.vut.kind.files_are_known and not is_here(settings.vut):
         warnings.warn(
             "note: nobody can tell what the program behind this VUT loads; this truth is kept for "
             "its command and the files that are named there",
@@ -985,7 +986,7 @@ def vuts(policies: AnyPath | None = None) -> Shown:
     """
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
-    kinds = [kind for kind in (PYTHON, *KINDS.values()) if kind.form]
+    kinds = [kind for kind in KINDS.values() if kind.form]
     names = {"built in": built_in, "installed": list(installed_vuts())}
     listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
     lines = [f"{title}: {', '.join(known)}" for title, known in names.items() if known]

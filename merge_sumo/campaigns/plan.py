@@ -8,9 +8,8 @@ from typing import Final
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import Povs, own_pov, policies_folder
-from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 DEBUG_DEADLINE_S: Final = 86_400.0
 """A person at a breakpoint takes their time."""
@@ -28,7 +27,7 @@ def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPla
     options = settings.vut_options(policies)
     if debug:
         options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
-    vut = VutFactory(settings.vut, options)
+    vut = VutFactory.of(settings.vut, options)
     own = None if settings.pov is None else own_pov(settings.pov, options)
     povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
     for level in settings.levels:
@@ -50,7 +49,4 @@ def resolve_earlier(settings: CampaignSettings, plan: SimulationPlan) -> Simulat
     if settings.against is None:
         return None
     options = settings.earlier.vut_options(plan.povs.policies)
-    try:
-        return replace(plan, vut=VutFactory(settings.against, options))
-    except UserError as error:
-        raise UserError(str(error).replace("--vut ", "--against ", 1)) from error
+    return replace(plan, vut=VutFactory.of(settings.against, options))

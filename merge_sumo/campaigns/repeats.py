@@ -30,7 +30,7 @@ from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import is_built_in, waits_for_client
+from merge_sumo.vuts.spec import is_built_in, waits_for_client
 
 REPEATS: Final = "repeats.jsonl"
 MOST: Final = 20

@@ -27,7 +27,7 @@ from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import is_built_in, names_code, waits_for_client
+from merge_sumo.vuts.spec import is_built_in, names_code, waits_for_client
 
 DEFAULT_CASES: Final = 800
 

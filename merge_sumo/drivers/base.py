@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -200,6 +200,24 @@ class Design:
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0.0):
                 raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltInVut:
+    """A VUT that the package brings: a value of `VUTS` in a file of this folder, by its name.
+
+    Attributes:
+        make: makes its driver for a number of corridors, by its design where it has one, by a
+            folder of networks where it is learned.
+        design: the parameters that a spec may set, with their values where it does not.
+        network: name of the network by which a learned VUT acts.
+        ramp_only: whether it cannot drive a POV.
+    """
+
+    make: Callable[..., Driver]
+    design: Design | None = None
+    network: str = ""
+    ramp_only: bool = False
 
 
 class DriverWrapper(Driver):

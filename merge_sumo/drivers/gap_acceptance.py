@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Design, Scene
+from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, US23
@@ -73,3 +73,6 @@ class GapAcceptanceVut(Level0Vut):
         waits = np.where(needed >= design.brake_mps2, -needed, 0.0)
         answer: FloatArray = np.where(self._goes, super().act(scene), waits)
         return answer
+
+
+VUTS: Final = {"roundabout": BuiltInVut(GapAcceptanceVut, ROUNDABOUT)}

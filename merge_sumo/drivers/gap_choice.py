@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Design, Scene
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, BuiltInVut, Design, Scene
 from merge_sumo.drivers.lane import acc_mps2, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
@@ -124,3 +124,6 @@ class GapChoiceVut(Level0Vut):
         gap_m = ahead_m[leader, places] - self._pov_length_m
         following = acc_mps2(gap_m, scene.v_vut_mps, v_leader, a_leader, self.v_cruise_mps)
         return np.where(ahead_m[leader, places] < FREE_M, following, np.inf)
+
+
+VUTS: Final = {"gap": BuiltInVut(GapChoiceVut, HEADWAY, ramp_only=True)}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import BuiltInVut, Driver, Scene
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, US23
 
@@ -73,3 +75,6 @@ class Level0Vut(Driver):
     def act(self, scene: Scene) -> FloatArray:
         """Return the level-0 acceleration."""
         return level0_acceleration(scene.v_vut_mps, self.a_mps2, self.v_cruise_mps)
+
+
+VUTS: Final = {"level0": BuiltInVut(Level0Vut, ramp_only=True)}

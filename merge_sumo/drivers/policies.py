@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import hashlib
 import stat
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.drivers.base import BuiltInVut
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import quoted
@@ -191,3 +192,9 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
 def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelKDriver:
     """Return the driver that acts by a network."""
     return LevelKDriver(corridors, load_network(name, folder))
+
+
+VUTS: Final = {
+    f"level{level}": BuiltInVut(partial(load_driver, name), network=name, ramp_only=True)
+    for level, name in ((1, "vut1"), (2, "vut2"))
+}

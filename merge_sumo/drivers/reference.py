@@ -30,7 +30,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import BuiltInVut, Driver, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.drivers.safety_models import (
     JERK_MPS3,
@@ -305,3 +305,6 @@ REFERENCES: Final[dict[str, type[RampDriver]]] = {
     "rss": RssVut,
 }
 """The reference drivers by name, as VUTs."""
+
+
+VUTS: Final = {name: BuiltInVut(driver) for name, driver in REFERENCES.items()}

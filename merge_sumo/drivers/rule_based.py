@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Design, Scene
+from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import Case, FloatArray
@@ -110,3 +110,6 @@ class RuleBasedVut(Level0Vut):
         pid = design.kp * error + design.ki * self._integral + design.kd * rate
         limited: FloatArray = np.minimum(np.maximum(pid, self._a_min), self._a_max)
         return limited
+
+
+VUTS: Final = {name: BuiltInVut(RuleBasedVut, design) for name, design in DESIGNS.items()}

@@ -19,7 +19,8 @@ from merge_sumo.values.criteria import CRITERIA
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.measures import MEASURES
 from merge_sumo.values.scenario import OWN, Scenario
-from merge_sumo.vuts.registry import VutFactory, runs_code
+from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.vuts.spec import runs_code
 
 MAX_CORRIDORS: Final = 32
 """Episodes that one process runs at a time."""
@@ -95,9 +96,9 @@ class SimulationPlan:
         """Return what decides the outcomes of cases at a level: see `plan_key`."""
         own = self.povs.own if level == OWN else None
         return plan_key(
-            vut=self.vut.spec,
+            vut=str(self.vut.spec),
             deadline_s=self.vut.options.deadline_s,
-            pov=None if own is None else own.spec,
+            pov=None if own is None else str(own.spec),
             policies_sha256=self.policies_sha256,
             road_sha256=self.road.sha256,
             scenario=self.scenario,
@@ -130,7 +131,7 @@ class SimulationPlan:
         """Why cases run in SUMO alone, in a clause; None where eq. (4) moves vehicles as well."""
         if self.povs.own is not None:
             return f"the POV {self.povs.own.spec} is none of this package"
-        if not self.vut.vut.by_arrays:
+        if not self.vut.kind.by_arrays:
             return f"the VUT {self.vut.spec} is none of this package"
         return None
 

@@ -24,7 +24,8 @@ from merge_sumo.system.suggestions import either
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, lane_of, level_name
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory, kind_of
+from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.vuts.spec import parse
 from merge_sumo.vuts.sumo_model import SumoVut
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}
@@ -73,7 +74,7 @@ class Povs:
             return asked
         most = self.own.vut.max_corridors
         if most < cars:
-            raise UserError(f"--pov {self.own.spec}: it drives {most} car at a time, not {cars}")
+            raise UserError(f"the POV {self.own.spec}: it drives {most} car at a time, not {cars}")
         return min(asked, most // cars)
 
 
@@ -144,17 +145,18 @@ def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
     return policies_of(scenario) if policies is None else policies_in(policies)
 
 
-def own_pov(spec: str, options: VutOptions) -> VutFactory:
-    """Return what makes the POV that a person brings; `UserError` for what cannot be one.
+def own_pov(text: str, options: VutOptions) -> VutFactory:
+    """Return what makes the POV that a spec names; `UserError` for what cannot be one.
 
-    It is any VUT but one behind TraCI, and is hosted with the same options.
+    It is any VUT that can drive on the mainline, and is hosted with the same options.
     """
-    if why := kind_of(spec).no_pov:
-        raise UserError(f"--pov {spec}: {why}")
     try:
-        return VutFactory(spec, options)
+        own = VutFactory(parse(text), options)
     except UserError as error:
-        raise UserError(f"--pov {spec}: {error}") from error
+        raise UserError(f"the POV {text}: {str(error).removeprefix(f'{text}: ')}") from error
+    if why := own.vut.no_pov:
+        raise UserError(f"the POV {text}: {why}")
+    return own
 
 
 class PovLibrary(Driver):

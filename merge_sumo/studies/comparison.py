@@ -43,7 +43,7 @@ from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
-from merge_sumo.vuts.registry import is_built_in
+from merge_sumo.vuts.spec import is_built_in
 
 LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""

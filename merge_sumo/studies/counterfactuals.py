@@ -53,8 +53,8 @@ from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, EpisodeTime, Scenario
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.output import LOG
-from merge_sumo.vuts.registry import VutFactory
 
 AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
@@ -153,7 +153,7 @@ def avoidance(
     if not failing:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    plan = replace(plan, vut=VutFactory(CAREFUL)).with_log(run.folder.resolve() / LOG)
+    plan = replace(plan, vut=VutFactory.of(CAREFUL)).with_log(run.folder.resolve() / LOG)
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:
         on_part(done := 0, len(failing))

@@ -42,8 +42,9 @@ from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
-from merge_sumo.vuts.parameters import Range, spec_with
-from merge_sumo.vuts.registry import VutFactory, values_of
+from merge_sumo.vuts.base import VutSpec
+from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.vuts.parameters import Range
 
 EXPLANATIONS: Final = "explanations.jsonl"
 START_STEPS: Final = 160
@@ -57,7 +58,7 @@ ROUNDED: Final = 1e-6
 PSI: Final = 0.0
 """Orientation of a POV that becomes one of level 2."""
 
-Trial = tuple[str, Case]
+Trial = tuple[VutSpec, Case]
 """The spec of a VUT, and a case that it drives."""
 
 
@@ -286,7 +287,7 @@ class _Search:
     ) -> None:
         """Take the plan, the failure, the parameters that are searched, and where cases run."""
         self._plan, self._outcome, self._workers = plan, outcome, workers
-        case, present = outcome.case, values_of(plan.vut, ranges)
+        case, present = outcome.case, plan.vut.values_of(ranges)
         self._axes = [
             _axis(c.field, getattr(case, c.field), c.dimension.low, c.dimension.high, c.digits)
             for c in coordinates(case.scenario, (case.level,))
@@ -340,7 +341,7 @@ class _Search:
         changed: dict[str, Any] = {self._axes[place].name: value}
         if place < self._coordinates:
             return vut, replace(case, **changed)
-        return spec_with(vut, changed), case
+        return vut.with_values(changed), case
 
     def _at_level(self, level: int) -> Trial:
         case = replace(self._outcome.case, level=level, svo_rad=PSI if level == 2 else None)

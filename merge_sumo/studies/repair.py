@@ -57,8 +57,9 @@ from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
-from merge_sumo.vuts.parameters import Range, spec_with
-from merge_sumo.vuts.registry import VutFactory, values_of
+from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.vuts.parameters import Range
+from merge_sumo.vuts.spec import parse
 
 if TYPE_CHECKING:
     import optuna
@@ -250,7 +251,9 @@ class Repair(Result):
     @property
     def spec(self) -> str | None:
         """The repaired controller as a spec."""
-        return None if self.chosen is None else spec_with(self.vut, self.chosen.values, self.today)
+        if self.chosen is None:
+            return None
+        return str(parse(self.vut).with_values(self.chosen.values, self.today))
 
     @property
     def stays(self) -> tuple[int, ...]:
@@ -465,7 +468,7 @@ class Search:
         self._plan, self._settings, self._begin = plan, settings, begin
         self._record = {
             "cases_sha256": hashlib.sha256(_read(run.folder / OUTCOMES)).hexdigest(),
-            "vut": plan.vut.spec,
+            "vut": str(plan.vut.spec),
             "vut_files": plan.vut.files,
             "parameters": to_plain(settings.ranges),
             **{name: getattr(settings, name) for name in ("cost", "trials", "rounds", "cases")},
@@ -475,7 +478,7 @@ class Search:
         self._open, self._check, self._on_trial = open_workers, check, on_trial
         self._workers: Workers | None = None
         self._ranges = {one.name: one for one in settings.ranges}
-        self.today = values_of(plan.vut, settings.ranges)
+        self.today = plan.vut.values_of(settings.ranges)
         self.cases: list[Case] = [outcome.case for outcome in run.outcomes]
         self._own = len(self.cases)
         self._before: list[Outcome] = []
@@ -507,8 +510,8 @@ class Search:
             if chosen is None:
                 rounds.append(Round(None))
                 break
-            spec = spec_with(self._plan.vut.spec, chosen.values, self.today)
-            campaign = fresh(spec, number)
+            spec = self._plan.vut.spec.with_values(chosen.values, self.today)
+            campaign = fresh(str(spec), number)
             with self._opened():
                 compared = self._compared(campaign)
             found = summarise(campaign.cases, campaign.levels).levels.values()
@@ -523,7 +526,7 @@ class Search:
             self.cases += with_neighbours(against, rng)
         return Repair(
             folder=folder,
-            vut=self._plan.vut.spec,
+            vut=str(self._plan.vut.spec),
             settings=self._settings,
             today=self.today,
             failing=failing,
@@ -545,7 +548,7 @@ class Search:
             replace(before, index=after.index)
             for before, after in zip(self._run(self._plan, cases), campaign.outcomes, strict=True)
         ]
-        return compare_outcomes(today, campaign, self._plan.vut.spec)
+        return compare_outcomes(today, campaign, str(self._plan.vut.spec))
 
     def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
         ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
@@ -641,7 +644,7 @@ class Search:
         return trial
 
     def _ran(self, wanted: Trial, indices: Sequence[int]) -> Trial:
-        spec = spec_with(self._plan.vut.spec, wanted.values, self.today)
+        spec = self._plan.vut.spec.with_values(wanted.values, self.today)
         is_todays = wanted.values == self.today
         try:
             if is_todays:

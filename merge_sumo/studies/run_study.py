@@ -70,7 +70,7 @@ class RunStudy:
 def notice_changes(run: Run, plan: SimulationPlan) -> None:
     """Warn with a `Notice` where a controller that a campaign ran is not as it was then."""
     pov = plan.povs.own
-    specs = plan.vut.spec, None if pov is None else pov.spec
+    specs = str(plan.vut.spec), None if pov is None else str(pov.spec)
     loaded = plan.vut.files or {}, plan.povs.files or {}
     for name, setting, spec, files in zip(FILES, ("vut", "pov"), specs, loaded, strict=True):
         known = run.settings.get(name)

@@ -18,8 +18,7 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, FloatArray, MergeCase, from_unit
 from merge_sumo.values.scenario import DT_S, Scenario, lane_of
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.in_memory import is_here
-from merge_sumo.vuts.registry import waits_for_client
+from merge_sumo.vuts.base import HERE
 
 CORRIDORS: Final = 4
 PLACES: Final = tuple(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
@@ -96,7 +95,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         ]
         problems.append(_why(plan, differing[0]))
     return VutCheck(
-        vut=plan.vut.spec,
+        vut=str(plan.vut.spec),
         problems=problems,
         notes=notes,
         us_per_step_median=statistics.median(timed.us_per_step),
@@ -203,7 +202,7 @@ def _differences(
 def _why(plan: SimulationPlan, difference: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
     spec = plan.vut.spec
-    if is_here(spec) or waits_for_client(spec):
+    if spec.kind == HERE or plan.vut.kind.waits(spec.argument):
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."

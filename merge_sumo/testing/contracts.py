@@ -46,8 +46,7 @@ from merge_sumo.values.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.values.scenario_kinds import SCENARIO_KINDS, scenario_of_record
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 __all__ = [
     "CriterionContract",
@@ -270,13 +269,13 @@ class VutContract:
 
     def test_sees_with_late_sensors_what_was_before(self) -> None:
         """SUMO's own drivers see in SUMO, and have no sensors."""
-        factory = VutFactory(self.vut, VutOptions())
+        factory = VutFactory.of(self.vut)
         if factory.vut.vut_type is None:
             assert_sees_late(factory)
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""
-        first, second = (VutFactory(self.vut, VutOptions()) for _ in range(2))
+        first, second = (VutFactory.of(self.vut) for _ in range(2))
         assert first == second
         assert first.files == second.files
 

@@ -1,4 +1,4 @@
-"""What all kinds of VUT share: options, observation, deadline, and one controller per corridor."""
+"""Names of VUTs and what all kinds share: observation, deadline, one controller per corridor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 import threading
 from abc import abstractmethod
 from bdb import BdbQuit
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from numbers import Real
 from pathlib import Path
@@ -16,13 +16,13 @@ from time import perf_counter
 from types import FrameType, TracebackType
 from typing import Any, Final, NamedTuple, Self, TextIO
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT, Bounds, lane_of
@@ -57,12 +57,67 @@ def _is_positive(value: object) -> bool:
     return isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0
 
 
+BUILT_IN, INSTALLED, PYTHON, HERE = "built-in", "installed", "python", "here"
+WITHOUT_PREFIX: Final = (BUILT_IN, INSTALLED, PYTHON)
+"""The kinds whose specs do not begin with the name of the kind."""
+
+
+class VutSpec(msgspec.Struct, frozen=True):
+    """The name of a VUT, as after `--vut`, in its parts; `spec.parse` reads one.
+
+    Attributes:
+        kind: a name of `registry.KINDS`.
+        argument: a name, a file or a command, as the kind has it.
+        parameters: names and values in the order in which they were written.
+    """
+
+    kind: str
+    argument: str = ""
+    parameters: tuple[tuple[str, str], ...] = ()
+
+    def __str__(self) -> str:
+        head = self.argument if self.kind in WITHOUT_PREFIX else self.kind
+        if head is self.kind and self.argument:
+            head = f"{self.kind}:{self.argument}"
+        options = "&".join(f"{name}={value}" for name, value in self.parameters)
+        return f"{head}?{options}" if options else head
+
+    def numbers(self) -> dict[str, float]:
+        """Return the parameters as numbers, whole ones as int; `UserError` for what is none."""
+        numbers: dict[str, float] = {}
+        for name, text in self.parameters:
+            try:
+                value = float(text)
+                numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value):
+                raise UserError(f"{self}: {name} is {text!r}: give a number")
+        return numbers
+
+    def with_values(
+        self, values: Mapping[str, float], today: Mapping[str, float] | None = None
+    ) -> VutSpec:
+        """Return the spec with other values of parameters, those that are `today`'s left out."""
+        known = today or {}
+        changed = {name: f"{v:.12g}" for name, v in values.items() if known.get(name) != v}
+        return msgspec.structs.replace(
+            self, parameters=tuple({**dict(self.parameters), **changed}.items())
+        )
+
+    def has_no(self, name: str, known: Iterable[str]) -> UserError:
+        """Return the error for a parameter that the VUT does not have among those `known`."""
+        names = ", ".join(sorted(known))
+        choice = f"choose from {names}" if names else "it has none"
+        return UserError(f"{self}: it has no parameter {name!r}: {choice}")
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Vut:
     """A VUT that is ready to be made."""
 
-    make: Callable[[int, World | None], Driver]
-    """Returns the driver for a number of corridors in a world; None for no world."""
+    make: Callable[[int, object], Driver]
+    """Returns the driver for a number of corridors in a world of SUMO; None for no world."""
     max_corridors: int | None = None  # corridors that one driver can serve; None for any number
     max_workers: int | None = None
     """Processes that can each have such a driver at a time; None for any number."""
@@ -71,48 +126,30 @@ class Vut:
     files: tuple[Path, ...] = ()  # files of the user's that it is made of, as far as they are known
     parameters: Mapping[str, float] | None = None
     """Numbers that its spec may set, with their present values; None where its driver has them."""
-    named_only: bool = False  # whether it may be made of unknown files besides `files`
+    no_pov: str = ""  # why it cannot drive a POV; "" where it can
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class VutKind:
+    """A kind of VUT: all that the package asks of it."""
+
+    form: str = ""  # what a person writes for it; "" for a kind that no list shows
+    what: str = ""  # what it is, in a phrase
+    example: str = ""  # an option `--vut` that names one
+    prepare: Callable[[VutSpec, VutOptions], Vut]
+    """Makes the VUT of a spec of this kind; raises `UserError`."""
+    has_parameters: bool = True  # whether "?" ends the argument in a spec
+    no_parameters: str = ""
+    """Why a spec cannot set the parameters of its controller, in a clause; "" where it can."""
+    hosted: bool = False
+    """Whether it runs a user's code in this process, unless that is hosted in one of its own."""
+    own_code: bool = True
+    """Whether to test it is to run code that is neither of this package nor of SUMO."""
+    files_are_known: bool = True  # whether `Vut.files` are all of which it is made before it drives
     by_arrays: bool = False
-    """Whether it is a driver of this package, which needs nothing of SUMO and takes any number
-    of corridors."""
-
-
-def split_options(argument: str, spec: str) -> tuple[str, dict[str, str]]:
-    """Return what stands before "?", and the options NAME=VALUE behind it, joined by "&".
-
-    Raises `UserError` for what is no option, and for one that is given twice.
-    """
-    before, _, text = argument.partition("?")
-    options: dict[str, str] = {}
-    for part in filter(None, text.split("&")):
-        name, equals, value = part.partition("=")
-        if not (name and equals and value):
-            raise UserError(f"--vut {spec}: {part!r} is not an option: write NAME=VALUE")
-        if name in options:
-            raise UserError(f"--vut {spec}: the option {name} is there twice")
-        options[name] = value
-    return before, options
-
-
-def with_options(spec: str, options: Mapping[str, str]) -> str:
-    """Return a spec with options, in the place of those of the same name."""
-    before, given = split_options(spec, spec)
-    both = {**given, **options}
-    return f"{before}?{'&'.join(f'{name}={value}' for name, value in both.items())}"
-
-
-def numbers_of(given: Mapping[str, str], spec: str) -> dict[str, float]:
-    """Return options as numbers, whole ones as int; `UserError` for what is no finite number."""
-    numbers: dict[str, float] = {}
-    for name, text in given.items():
-        try:
-            value = float(text)
-            numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            raise UserError(f"--vut {spec}: {name} is {text!r}: give a number")
-    return numbers
+    """Whether its drivers need nothing of SUMO, take any number of corridors, and never fail."""
+    waits: Callable[[str], bool] = lambda _: False
+    """Returns whether the controller of an argument is a program that a person starts."""
 
 
 class Car(NamedTuple):
@@ -188,42 +225,39 @@ class Seen(NamedTuple):
         return False
 
 
-class SeenInTraffic(Seen):
-    """What a VUT sees where more than one car drives on the mainline."""
+class SeenOnRoad(Seen):
+    """What a VUT sees in traffic, or on a road with an acceleration lane."""
 
     _vehicles: tuple[Car, ...] = ()
+    _lane_m: Bounds | None = None
+    _merged: bool = False
 
     @property
     def vehicles(self) -> tuple[Car, ...]:
         """All vehicles in the order of their rows."""
         return self._vehicles
 
-
-class SeenOnLane(SeenInTraffic):
-    """What a VUT sees on a road with an acceleration lane."""
-
-    _lane_m: Bounds = (0.0, 0.0)
-    _merged: bool = False
-
     @property
     def lane_begin_m(self) -> float:
-        """Where the acceleration lane begins."""
-        return self._lane_m[0]
+        """Where the acceleration lane begins; 0 where there is none."""
+        return 0.0 if self._lane_m is None else self._lane_m[0]
 
     @property
     def lane_end_m(self) -> float:
-        """Where it ends."""
-        return self._lane_m[1]
+        """Where it ends; 0 where there is none."""
+        return 0.0 if self._lane_m is None else self._lane_m[1]
 
     @property
     def merged(self) -> bool:
-        """Whether the VUT is on the mainline."""
-        return self._merged
+        """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
+        return self.x_vut_m >= 0.0 if self._lane_m is None else self._merged
 
     @property
     def may_merge(self) -> bool:
         """Whether a wish to merge, now, puts the VUT on the mainline in the next step."""
-        return not self._merged and self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
+        if self._lane_m is None or self._merged:
+            return False
+        return self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
 
 
 def seen_in(
@@ -243,10 +277,8 @@ def seen_in(
     state = t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT]
     if lane_m is None and len(x_m) == 2:
         return Seen(*state)
-    seen = SeenInTraffic(*state) if lane_m is None else SeenOnLane(*state)
-    seen._vehicles = tuple(map(Car, x_m, v_mps))
-    if isinstance(seen, SeenOnLane) and lane_m is not None:
-        seen._lane_m, seen._merged = lane_m, merged
+    seen = SeenOnRoad(*state)
+    seen._vehicles, seen._lane_m, seen._merged = tuple(map(Car, x_m, v_mps)), lane_m, merged
     return seen
 
 

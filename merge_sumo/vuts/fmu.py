@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
 from merge_sumo.system.suggestions import either
+from merge_sumo.system.trust import check_code
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, as_merge, split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
 from merge_sumo.vuts.blame_cell import current_call
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
@@ -25,23 +25,22 @@ _FLOATS: Final = ("Real", "Float64")
 _BOOLEAN: Final = "Boolean"
 
 
-def fmu_vut(argument: str, options: VutOptions) -> Vut:
+def fmu_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT of `fmu:FILE?x_vut_m=NAME&...`; `UserError` for one that cannot be."""
-    spec = f"fmu:{argument}"
-    file, names = split_options(argument, spec)
-    unknown = set(names) - set(NAMES)
-    if unknown:
+    file, names = Path(spec.argument), dict(spec.parameters)
+    check_code(file)
+    if unknown := set(names) - set(NAMES):
         raise UserError(
-            f"--vut {spec}: there is no variable {unknown.pop()!r} to name: choose from "
+            f"{spec}: there is no variable {unknown.pop()!r} to name: choose from "
             f"{', '.join(NAMES)}"
         )
-    unit = Unit(Path(file), names)
+    unit = Unit(file, names)
 
-    def make(corridors: int, _world: World | None) -> Driver:
+    def make(corridors: int, _world: object) -> Driver:
         return FmuVut(corridors, unit, options.deadline_s)
 
     once = str(unit.description.coSimulation.canBeInstantiatedOnlyOncePerProcess) == "True"
-    return Vut(make=make, max_corridors=1 if once else None, files=(Path(file),))
+    return Vut(make=make, max_corridors=1 if once else None, files=(file,))
 
 
 class Unit:
@@ -215,3 +214,13 @@ def _free(instance: Any) -> None:
         with suppress(Exception):  # a unit that failed cannot be terminated
             instance.terminate()
         instance.freeInstance()
+
+
+KIND: Final = VutKind(
+    form="fmu:FILE[?VARIABLE=NAME&...]",
+    what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
+    example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
+    no_parameters="the options of an FMU are the names of its variables",
+    prepare=fmu_vut,
+    hosted=True,
+)

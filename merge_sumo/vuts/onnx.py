@@ -13,10 +13,10 @@ import numpy as np
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
+from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutOptions, as_merge, split_options
+from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its decision."""
@@ -31,19 +31,18 @@ WEIGHTED: Final = ("Gemm", "MatMul", "Conv", "ConvTranspose", "LSTM", "GRU", "RN
 _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
 
-def onnx_vut(argument: str, options: VutOptions) -> Vut:
+def onnx_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT of `onnx:FILE?decision_period_s=...`; `UserError` for one that cannot be."""
-    spec = f"onnx:{argument}"
-    file, given = split_options(argument, spec)
-    unknown = set(given) - {PERIOD}
-    if unknown:
-        raise UserError(f"--vut {spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
-    network = Network(Path(file), given.get(PERIOD))
+    file, given = Path(spec.argument), dict(spec.parameters)
+    check_code(file)
+    if unknown := set(given) - {PERIOD}:
+        raise UserError(f"{spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
+    network = Network(file, given.get(PERIOD))
 
-    def make(corridors: int, _world: World | None) -> Driver:
+    def make(corridors: int, _world: object) -> Driver:
         return OnnxVut(corridors, network, options.deadline_s)
 
-    return Vut(make=make, files=(Path(file), *network.weights))
+    return Vut(make=make, files=(file, *network.weights))
 
 
 class Network:
@@ -181,3 +180,13 @@ class OnnxVut(PerCorridor):
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
             self._held[corridor] = self._network.decision(seen[1:], self._of_actions[corridor])
         return self._held[corridor]
+
+
+KIND: Final = VutKind(
+    form="onnx:FILE[?decision_period_s=SECONDS]",
+    what="a network from the state to an acceleration, or to values of the 7 actions",
+    example="--vut onnx:policy.onnx",
+    no_parameters="the parameters of a network are its weights",
+    prepare=onnx_vut,
+    hosted=True,
+)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from inspect import Parameter
 from types import MemberDescriptorType
@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.vuts.base import with_options
+from merge_sumo.vuts.base import VutSpec
 
 DIGITS: Final = 3
 """A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
@@ -37,13 +37,13 @@ class Parameters:
             no number by default.
     """
 
-    spec: str
+    spec: VutSpec
     keywords: Mapping[str, float]
     attributes: Mapping[str, float]
     known: Mapping[str, float | None]
 
     @classmethod
-    def of(cls, target: Any, spec: str, given: Mapping[str, float], in_order: int) -> Self:
+    def of(cls, target: Any, spec: VutSpec, given: Mapping[str, float], in_order: int) -> Self:
         """Return how `given` parameters reach a class, a function or an object.
 
         `in_order` arguments are given by their place. Raises `UserError` for a parameter that a
@@ -54,7 +54,7 @@ class Parameters:
         keywords = {name: value for name, value in given.items() if name in defaults}
         attributes = {name: value for name, value in given.items() if name not in defaults}
         if attributes and inspect.isroutine(target):
-            raise unknown_parameter(spec, next(iter(attributes)), defaults)
+            raise spec.has_no(next(iter(attributes)), defaults)
         known = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
         return cls(spec, keywords, attributes, known)
 
@@ -74,11 +74,11 @@ class Parameters:
             present = self.present(made)
             for name, value in self.attributes.items():
                 if name not in present:
-                    raise unknown_parameter(self.spec, name, present)
+                    raise self.spec.has_no(name, present)
                 try:
                     setattr(made, name, value)
                 except Exception as error:
-                    raise UserError(f"--vut {self.spec}: {name} cannot be set") from error
+                    raise UserError(f"{self.spec}: {name} cannot be set") from error
         return made
 
     def present(self, made: Any) -> dict[str, float]:
@@ -124,15 +124,6 @@ def _number(value: Any) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def unknown_parameter(spec: str, name: str, known: Iterable[str]) -> UserError:
-    """Return the error for a parameter of a spec that the controller does not have."""
-    names = ", ".join(sorted(known))
-    return UserError(
-        f"--vut {spec}: it has no parameter {name!r}: "
-        + (f"choose from {names}" if names else "it has none")
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Range:
     """The values that a parameter may take.
@@ -169,12 +160,3 @@ class Range:
     def rounded(self, value: float) -> float:
         """Round a value of the range to few digits."""
         return min(max(round(value, self.digits), self.low), self.high)
-
-
-def spec_with(
-    vut: str, values: Mapping[str, float], today: Mapping[str, float] | None = None
-) -> str:
-    """Return the spec of a controller with values of its parameters, but not with `today`'s."""
-    known = today or {}
-    changed = {name: f"{v:.12g}" for name, v in values.items() if known.get(name) != v}
-    return with_options(vut, changed) if changed else vut

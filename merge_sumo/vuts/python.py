@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
 from merge_sumo.system.registry import entries_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.system.trust import check_code
@@ -31,11 +30,11 @@ from merge_sumo.vuts.base import (
     PerCorridor,
     Seen,
     Vut,
+    VutKind,
     VutOptions,
+    VutSpec,
     WrongAnswerError,
-    numbers_of,
     seen_at_start,
-    split_options,
     text_of,
 )
 from merge_sumo.vuts.blame_cell import ALL_CORRIDORS, NO_CORRIDOR, current_call
@@ -51,41 +50,30 @@ def installed_vuts() -> dict[str, EntryPoint]:
     return {name: entry for name, found in entries_of(GROUP).items() for entry in found.values()}
 
 
-def installed_vut(spec: str, options: VutOptions) -> Vut:
+def installed_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT that an installed package registers; `UserError` when it cannot be loaded."""
-    name, given = split_options(spec, spec)
     try:
-        target = installed_vuts()[name].load()
+        target = installed_vuts()[spec.argument].load()
     except (Exception, SystemExit) as error:
-        raise UserError(_cannot_load(name, error)) from error
+        raise UserError(_cannot_load(spec.argument, error)) from error
     module = sys.modules.get(getattr(target, "__module__", ""))
-    return _named_vut(target, spec, module, options, numbers_of(given, spec))
+    return _named_vut(target, spec, module, options)
 
 
-def python_vut(spec: str, options: VutOptions) -> Vut:
-    """Return the VUT `module:Name` or `file.py:Name`, with its parameters behind a "?".
-
-    Raises `UserError` when it cannot be loaded.
-    """
-    named, given = split_options(spec, spec)
-    source, _, name = named.rpartition(":")
+def python_vut(spec: VutSpec, options: VutOptions) -> Vut:
+    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when it cannot be loaded."""
+    source, _, name = spec.argument.rpartition(":")
     module = _load_file(Path(source)) if source.endswith(".py") else _load_module(source)
     target: Any = module
     for part in name.split("."):
         target = getattr(target, part, None)
     if target is None:
         raise UserError(f"{source} has no {name!r}: name a class or a function of it")
-    return _named_vut(target, spec, module, options, numbers_of(given, spec))
+    return _named_vut(target, spec, module, options)
 
 
-def _named_vut(
-    target: Any,
-    spec: str,
-    module: ModuleType | None,
-    options: VutOptions,
-    given: Mapping[str, float],
-) -> Vut:
-    vut = vut_of(target, spec, options, given) if is_code(target) else None
+def _named_vut(target: Any, spec: VutSpec, module: ModuleType | None, options: VutOptions) -> Vut:
+    vut = vut_of(target, spec, options, spec.numbers()) if is_code(target) else None
     if vut is None:
         raise UserError(
             f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a "
@@ -101,7 +89,7 @@ def is_code(target: Any) -> bool:
 
 
 def vut_of(
-    target: Any, name: str, options: VutOptions, given: Mapping[str, float] | None = None
+    target: Any, spec: VutSpec, options: VutOptions, given: Mapping[str, float]
 ) -> Vut | None:
     """Return the VUT that a class, a function or an object makes; None where it makes none.
 
@@ -117,16 +105,16 @@ def vut_of(
     batched, acts = (callable(getattr(target, method, None)) for method in ("act_batch", "act"))
     if not (batched or acts or (not is_class and callable(target) and fits(target, 1))):
         return None
-    parameters = Parameters.of(target, name, given or {}, in_order=int(not is_class or batched))
+    parameters = Parameters.of(target, spec, given, in_order=int(not is_class or batched))
 
-    def make(corridors: int, _world: World | None) -> Driver:
+    def make(corridors: int, _world: object) -> Driver:
         def new(*arguments: int) -> Any:
             if is_class:
-                made = _made(target, name, *arguments, **parameters.keywords)
+                made = _made(target, spec, *arguments, **parameters.keywords)
                 return parameters.set_in(made)
             if inspect.isroutine(target):
                 return parameters.bound(target)
-            return parameters.set_in(target if batched and not given else _copied(target, name))
+            return parameters.set_in(target if batched and not given else _copied(target, spec))
 
         if batched:
             return BatchedVut(corridors, lambda: new(corridors), options.deadline_s, parameters)
@@ -344,7 +332,7 @@ def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
     )
 
 
-def _made(target: type, spec: str, *arguments: int, **keywords: float) -> Any:
+def _made(target: type, spec: VutSpec, *arguments: int, **keywords: float) -> Any:
     current_call.note(NO_CORRIDOR)  # it goes on: each object may take its time
     try:
         return target(*arguments, **keywords)
@@ -362,13 +350,13 @@ def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
         reset(*arguments)
 
 
-def _copied(target: Any, name: str) -> Any:
+def _copied(target: Any, spec: VutSpec) -> Any:
     """Return a copy of an object as it was given, so that no episode changes that of another."""
     try:
         return copy.deepcopy(target)
     except Exception as error:
         raise UserError(
-            f"{name} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
+            f"{spec} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
             "its class, or a function that makes no difference between them"
         ) from error
 
@@ -403,6 +391,7 @@ def _load_module(name: str) -> ModuleType:
 
 
 def _load_file(path: Path) -> ModuleType:
+    check_code(path)
     try:
         return module_of_file(path)
     except OSError as error:
@@ -413,3 +402,13 @@ def _load_file(path: Path) -> ModuleType:
 
 def _cannot_load(what: str, error: BaseException) -> str:
     return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"
+
+
+KIND: Final = VutKind(
+    form="MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME",
+    what="a class with act(seen), a function of seen, or a batched class",
+    example="--vut my_vut.py:MyVut",
+    prepare=python_vut,
+    hosted=True,
+)
+INSTALLED_KIND: Final = VutKind(prepare=installed_vut, hosted=True)

@@ -21,8 +21,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, VUT
-from merge_sumo.vuts.base import Vut, VutOptions, numbers_of, split_options
-from merge_sumo.vuts.parameters import unknown_parameter
+from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 
 SHARED_OPTIONS: Final = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),
@@ -62,24 +61,23 @@ MODELS: Final[dict[str, tuple[set[str], dict[str, float]]]] = {
 noise all are deterministic."""
 
 
-def sumo_vut(argument: str, _options: VutOptions) -> Vut:
+def sumo_vut(spec: VutSpec, _options: VutOptions) -> Vut:
     """Return the VUT of `sumo:MODEL?NAME=VALUE&...`; `UserError` for what SUMO does not have."""
-    spec = f"sumo:{argument}"
-    model, given = split_options(argument, spec)
+    model = spec.argument
     if model not in MODELS:
-        raise UserError(f"--vut {spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
+        raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
     own, defaults = MODELS[model]
     known = SHARED_OPTIONS | own
-    chosen = numbers_of(given, spec)
+    chosen = spec.numbers()
     for name, value in chosen.items():
         if name not in known:
-            raise unknown_parameter(spec, name, known)
+            raise spec.has_no(name, known)
         if value < 0.0:
-            raise UserError(f"--vut {spec}: {name} is {value}: give a number from 0 up")
+            raise UserError(f"{spec}: {name} is {value}: give a number from 0 up")
 
-    def make(corridors: int, world: World | None) -> Driver:
-        if world is None:
-            raise UserError(f"--vut {spec} drives in a SUMO world only")
+    def make(corridors: int, world: object) -> Driver:
+        if not isinstance(world, World):
+            raise UserError(f"{spec} drives in a SUMO world only")
         return SumoVut(corridors, world)
 
     vut_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
@@ -123,3 +121,12 @@ class SumoVut(Driver):
         _, end_m = self.world.road.lane_m or (0.0, 0.0)
         next_m = self.world.x_m[VUT] + self.world.v_mps[VUT] * DT_S
         return stopping_mps(end_m - END_MARGIN_M - next_m, -self.world.scenario.a_min_mps2)
+
+
+KIND: Final = VutKind(
+    form="sumo:MODEL[?OPTION=VALUE&...]",
+    what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
+    example='--vut "sumo:IDM?tau=1.2"',
+    prepare=sumo_vut,
+    own_code=False,
+)

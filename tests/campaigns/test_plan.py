@@ -10,7 +10,7 @@ from campaigning import campaign_settings
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.errors import UserError
-from merge_sumo.vuts import registry
+from merge_sumo.vuts import factory
 from merge_sumo.vuts.host import hosted
 
 VUT = """
@@ -33,18 +33,18 @@ def spec(tmp_path):
 def calls(monkeypatch):
     """Count the processes of VUTs that start, and the factories of VUTs that look for theirs."""
     counts: Counter[str] = Counter()
-    start, find = hosted.Host._start, registry.find_vut
+    start, find = hosted.Host._start, hosted.hosted_vut
 
     def counted_start(self):
         counts["processes"] += 1
         start(self)
 
-    def counted_find(spec, options):
-        counts["found"] += spec.endswith("my.py:f")
-        return find(spec, options)
+    def counted_find(spec, options, alike):
+        counts["found"] += 1
+        return find(spec, options, alike)
 
     monkeypatch.setattr(hosted.Host, "_start", counted_start)
-    monkeypatch.setattr(registry, "find_vut", counted_find)
+    monkeypatch.setattr(factory, "hosted_vut", counted_find)
     return counts
 
 

@@ -19,7 +19,8 @@ from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import files_now
-from merge_sumo.vuts.registry import VutFactory, names_code
+from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.vuts.spec import names_code
 
 VUT = """
 import pathlib
@@ -190,18 +191,18 @@ class TestCodeThatOthersMayWrite:
         theirs.chmod(0o777)
         (mine / "link.py").symlink_to(theirs / "my_vut.py")
         with pytest.raises(UserError, match=r"link\.py is not run"):
-            VutFactory("link.py:Vut")
+            VutFactory.of("link.py:Vut")
         assert not ran(theirs)
 
     def test_in_a_folder_in_which_each_has_his_own_files_is_run(self, mine: Path) -> None:
         mine.chmod(0o1777)
-        assert VutFactory(SPEC).files
+        assert VutFactory.of(SPEC).files
 
     def test_of_another_user_is_not_run(self, mine: Path) -> None:
         require(os.geteuid() == 0, "needs root to give a file away")
         os.chown(mine / "my_vut.py", 12345, 12345)
         with pytest.raises(UserError, match=r"my_vut\.py belongs to the user 12345"):
-            VutFactory(SPEC)
+            VutFactory.of(SPEC)
         assert not ran(mine)
 
 

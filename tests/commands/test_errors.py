@@ -17,7 +17,7 @@ from merge_sumo.system.suggestions import either, meant, nearest
 from merge_sumo.values.case import Pool
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import US23
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.signatures import check_call, check_methods
 
 
@@ -83,10 +83,10 @@ def test_a_formula_is_refused_with_the_place_of_the_mistake():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: VutFactory("desgin2"), "did you mean design2"),
-        (lambda: VutFactory("Design2"), r"did you mean design2\? choose"),
-        (lambda: VutFactory("tracy"), "did you mean traci"),
-        (lambda: VutFactory(""), "name the vehicle under test, as in --vut design2: level0, "),
+        (lambda: VutFactory.of("desgin2"), "did you mean design2"),
+        (lambda: VutFactory.of("Design2"), r"did you mean design2\? choose"),
+        (lambda: VutFactory.of("tracy"), "did you mean traci"),
+        (lambda: VutFactory.of(""), "name the vehicle under test, as in --vut design2: careful, "),
         (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
         (lambda: named_scenario("us23-trafic"), "did you mean us23-traffic"),
         (lambda: Criterion("contat"), "did you mean contact"),

@@ -11,7 +11,8 @@ from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import US23
-from merge_sumo.vuts.registry import BUILT_IN_VUTS, VutFactory
+from merge_sumo.vuts.built_in import BUILT_IN_VUTS
+from merge_sumo.vuts.factory import VutFactory
 
 CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 DESIGN = RuleBasedDesign(x1_m=100.0, x2_m=40.0, gap_m=15.0, target_m=15.0, kp=0.2, ki=0.1, kd=0.05)
@@ -126,9 +127,9 @@ class TestRuleBased:
 
 def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
     for name in BUILT_IN_VUTS:
-        driver = VutFactory(name)(4)
+        driver = VutFactory.of(name)(4)
         for k in range(4):
             driver.begin(k, CASE)
         assert driver.act(scene(x_pov=[-300.0, -250.0, -200.0, -180.0])).shape == (4,)
     with pytest.raises(UserError, match=r"no VUT 'design9': did you mean design[12] or "):
-        VutFactory("design9")
+        VutFactory.of("design9")

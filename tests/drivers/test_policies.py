@@ -40,7 +40,7 @@ from merge_sumo.values.fmc import fmc, regions
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),
@@ -60,7 +60,7 @@ def uniform_cases(level, count, seed=0):
 def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors, scenario=US23) as world:
-        driver = VutFactory(vut)(corridors)
+        driver = VutFactory.of(vut)(corridors)
         got = dict(rollout(world, PovLibrary(corridors, POVS), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories
@@ -243,7 +243,7 @@ class TestTheLibraryOfPeople:
     def test_brakes_no_harder_than_people_did(self, level):
         cases = uniform_cases(level, 300, seed=4)
         with World(32, scenario=US23) as world:
-            pov, vut = PovLibrary(32, self.POVS), VutFactory("design2")(32)
+            pov, vut = PovLibrary(32, self.POVS), VutFactory.of("design2")(32)
             found = [measure(t) for _, t in rollout(world, pov, vut, cases)]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0

@@ -23,7 +23,7 @@ from merge_sumo.values.scenario import DT_S, US23, VUT
 from merge_sumo.values.score import FOLLOWED_UP, Outcome, measure
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 FOLLOWED = replace(US23, follow_up_s=3.0)
 CASES = Pool(levels=(0,), scenario=FOLLOWED).cases(np.random.default_rng(3).random((12, 2)), 0)
@@ -90,7 +90,7 @@ def test_a_car_behind_brakes_as_krauss_does():
 def run(vut, scenario):
     """Return the trajectories of the cases in a scenario."""
     cases = [replace(case, scenario=scenario) for case in CASES]
-    factory = VutFactory(vut, VutOptions(in_process=True))
+    factory = VutFactory.of(vut, VutOptions(in_process=True))
     with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
         return dict(ground.run(cases))
 

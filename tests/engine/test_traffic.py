@@ -19,7 +19,7 @@ from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scen
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_in
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 TRAFFIC = replace(
     US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
@@ -33,7 +33,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 
 
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
-    factory = VutFactory(vut, VutOptions(**options))
+    factory = VutFactory.of(vut, VutOptions(**options))
     with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
         ran = dict(ground.run(cases))
     return [ran[place] for place in range(len(cases))]

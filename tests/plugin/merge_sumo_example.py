@@ -18,7 +18,6 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.sumo.world import World
 from merge_sumo.system.folders import check_new, make_place, new_file
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import FloatArray
@@ -26,8 +25,7 @@ from merge_sumo.values.criteria import NamedCriterion
 from merge_sumo.values.measures import Measure
 from merge_sumo.values.scenario import POV, VUT
 from merge_sumo.values.trajectory import Trajectory
-from merge_sumo.vuts.base import Vut, VutOptions
-from merge_sumo.vuts.registry import VutKind
+from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 
 
 class MiddleSampler(LevelwiseSampler):
@@ -76,14 +74,14 @@ class ConstantDriver(Driver):
         return np.full(self.corridors, self._acceleration_mps2)
 
 
-def constant_vut(argument: str, _options: VutOptions) -> Vut:
+def constant_vut(spec: VutSpec, _options: VutOptions) -> Vut:
     """Return the VUT `constant:MPS2`; `UserError` where that is no number."""
     try:
-        acceleration_mps2 = float(argument)
+        acceleration_mps2 = float(spec.argument)
     except ValueError as error:
-        raise UserError(f"--vut constant:{argument}: give an acceleration in m/s2") from error
+        raise UserError(f"{spec}: give an acceleration in m/s2") from error
 
-    def make(corridors: int, _world: World | None) -> Driver:
+    def make(corridors: int, _world: object) -> Driver:
         return ConstantDriver(corridors, acceleration_mps2)
 
     return Vut(make=make)

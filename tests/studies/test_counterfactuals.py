@@ -38,7 +38,7 @@ from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 LONG = pytest.mark.long
 
@@ -150,7 +150,7 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_le
     run = run_campaign(settings, tmp_path / "run")
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= at_least
-    plan = replace(resolve(settings), vut=VutFactory("careful"))
+    plan = replace(resolve(settings), vut=VutFactory.of("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert run_counterfactuals(plan, failing) == in_sumo

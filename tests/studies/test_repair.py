@@ -18,8 +18,9 @@ from merge_sumo.studies.repair import BISECTIONS, RESERVE, Round, Trial
 from merge_sumo.values.case import MergeCase, to_unit
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import US23
+from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
-from merge_sumo.vuts.registry import values_of
+from merge_sumo.vuts.spec import parse
 
 pytest.importorskip("optuna")
 
@@ -211,12 +212,8 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
     with pytest.raises(UserError, match="--cost is 'money': choose time or braking"):
         repair(run, ["brake=0..4"], cost="money", **given)
     with pytest.raises(UserError, match="the parameters of a network are its weights"):
-        values_of(_Network(), (Range("gain", 0.0, 1.0),))  # type: ignore[arg-type]
+        VutFactory(parse("onnx:policy.onnx"), files={}).values_of((Range("gain", 0.0, 1.0),))
     assert not (tmp_path / "out").exists()
-
-
-class _Network:
-    spec = "onnx:policy.onnx"
 
 
 def test_nothing_that_is_there_is_overwritten(campaigns, tmp_path):

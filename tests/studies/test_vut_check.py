@@ -9,7 +9,8 @@ from typer.testing import CliRunner
 
 from merge_sumo import check_vut, cli
 from merge_sumo.road.scenario_file import shipped_scenarios
-from merge_sumo.vuts.registry import BUILT_IN_VUTS, KINDS, PYTHON
+from merge_sumo.vuts.built_in import BUILT_IN_VUTS
+from merge_sumo.vuts.registry import KINDS
 
 GOOD = "def Vut(seen):\n    return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)\n"
 CLASS = "class Vut:\n    shared = [0]\n    def reset(self, seen):\n        {reset}\n"
@@ -30,12 +31,12 @@ def check(tmp_path):
 
 def test_the_list_names_every_vut_and_every_kind_with_an_example():
     said = CliRunner().invoke(cli.app, ["vuts"]).stdout
-    for kind in (PYTHON, *KINDS.values()):
+    for kind in KINDS.values():
         assert kind.form in said
         assert kind.example in said
     assert all(name in said for name in BUILT_IN_VUTS)
     listed = json.loads(CliRunner().invoke(cli.app, ["vuts", "--json"]).stdout)
-    forms = [kind.form for kind in (PYTHON, *KINDS.values()) if kind.form]
+    forms = [kind.form for kind in KINDS.values() if kind.form]
     assert [kind["form"] for kind in listed["kinds"]] == forms
 
 

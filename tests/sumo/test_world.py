@@ -18,7 +18,7 @@ from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, MAX_STEPS, US23
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 EXACT = 1e-9
 
@@ -97,7 +97,7 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
     outcomes = []
     for corridors in (1, 32):
         with World(corridors, scenario=US23) as world:
-            vut = VutFactory("design2")(corridors)
+            vut = VutFactory.of("design2")(corridors)
             outcomes.append(run_all(world, PovLibrary(corridors, POVS), vut, cases))
     for one, many in zip(*outcomes, strict=True):
         assert np.array_equal(one.motion, many.motion)
@@ -108,7 +108,7 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
 def test_sumo_holds_the_very_speeds_that_it_was_told(model):
     """They are not read back: to the last bit it would give the same numbers."""
     rng = np.random.default_rng(2)
-    vut_type = None if model is None else VutFactory(model).vut.vut_type
+    vut_type = None if model is None else VutFactory.of(model).vut.vut_type
     with World(16, vut_type=vut_type, scenario=US23) as world:
         for case in random_cases(200):
             world.place(int(rng.integers(16)), case.starts())

@@ -10,7 +10,7 @@ import pytest
 from vut_contract import factory, run_cases
 
 from merge_sumo.values.case import Case
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 SUPPORT = Path(__file__).parent
 RAW_CLIENT = f"""import os, sys, time

@@ -12,7 +12,7 @@ from merge_sumo.studies.truth import TruthKey
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 PAPERS = Criterion()
 POVS = Povs(policies=policies_of(US23))
@@ -31,7 +31,7 @@ def plan_for(
     return SimulationPlan(
         scenario=scenario,
         road=road_for(scenario),
-        vut=vut if isinstance(vut, VutFactory) else VutFactory(vut, options),
+        vut=vut if isinstance(vut, VutFactory) else VutFactory.of(vut, options),
         povs=povs,
         criterion=criterion,
         corridors=corridors,

@@ -15,7 +15,7 @@ from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.registry import VutFactory
+from merge_sumo.vuts.factory import VutFactory
 
 LEVEL0_CLASS = """
 class Level0:
@@ -49,7 +49,7 @@ def cases_of(count: int, seed: int = 0) -> list[Case]:
 
 
 def factory(spec: object, **options: Any) -> VutFactory:
-    return VutFactory(str(spec), VutOptions(**options))
+    return VutFactory.of(str(spec), VutOptions(**options))
 
 
 def in_process(spec: object, **options: Any) -> VutFactory:

@@ -30,7 +30,7 @@ from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import Host, HostedVut
 from merge_sumo.vuts.host.wire import About, WireError
 from merge_sumo.vuts.output import KEPT_BYTES, MOST_BYTES, append
-from merge_sumo.vuts.registry import FINDER
+from merge_sumo.vuts.spec import parse
 
 OPTIONS = VutOptions(deadline_s=0.3)
 HANGS = f"""
@@ -87,7 +87,7 @@ def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
 
 
 def test_once_killed_its_descriptors_are_nobodys_business(spec, tmp_path):
-    host = Host(FINDER, spec(LEVEL0_CLASS.replace("Level0", "Vut")), OPTIONS)
+    host = Host(parse(spec(LEVEL0_CLASS.replace("Level0", "Vut"))), OPTIONS)
     host.kill()
     with (tmp_path / "others").open("wb") as others:
         # This file has the number that was the channel's or the lifeline's.
@@ -110,7 +110,7 @@ def Vut(seen):
     os._exit(3)
 """
     (tmp_path / "gains.txt").touch()
-    vut = HostedVut(2, FINDER, spec(source), OPTIONS)
+    vut = HostedVut(2, parse(spec(source)), OPTIONS)
     try:
         for _ in range(2):
             with pytest.raises(VutLostError, match="exit code 3") as lost:
@@ -139,7 +139,7 @@ def Vut(seen):
     (HERE / "log.txt").read_text()
     return 1.0
 """
-    vut = HostedVut(1, FINDER, spec(source), OPTIONS)
+    vut = HostedVut(1, parse(spec(source)), OPTIONS)
     try:
         loaded = {"my_vut.py", "helper.py", "gains.txt", "control.so"}
         assert {f.name for f in vut.files()} == loaded
@@ -158,7 +158,7 @@ def Vut(seen):
     pathlib.Path(__file__).with_name("where").write_text(str(file))
     return 1.0
 """
-    vut = HostedVut(1, FINDER, spec(source), OPTIONS)
+    vut = HostedVut(1, parse(spec(source)), OPTIONS)
     vut.act(scene(1))
     file = Path((tmp_path / "where").read_text())
     assert file.exists()
@@ -169,7 +169,7 @@ def Vut(seen):
 def test_a_host_that_cannot_start_is_a_sentence(spec, monkeypatch):
     monkeypatch.setattr(sys, "executable", "/no/such/python")
     with pytest.raises(UserError, match="cannot start a process for the VUT: No such file"):
-        Host(FINDER, spec(LEVEL0_CLASS), OPTIONS)
+        Host(parse(spec(LEVEL0_CLASS)), OPTIONS)
 
 
 def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):

@@ -14,7 +14,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
 from merge_sumo.vuts.host.hosted import HostedVut
-from merge_sumo.vuts.registry import FINDER
+from merge_sumo.vuts.spec import parse
 
 
 def begun(vut, corridors, **options):
@@ -195,7 +195,7 @@ wire.pack_answers = lambda answers, *more: answers.tobytes() + json.dumps(
 def Vut(seen):
     return 1.0, True
 """
-    driver = HostedVut(2, FINDER, spec(source), VutOptions(deadline_s=1.0))
+    driver = HostedVut(2, parse(spec(source)), VutOptions(deadline_s=1.0))
     try:
         begun(driver, 2)
         with pytest.raises(VutLostError, match="broke the channel to its process"):

@@ -17,8 +17,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.suggestions import meant
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
-from merge_sumo.vuts.base import Vut, VutOptions
-from merge_sumo.vuts.registry import KINDS, VutKind
+from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.registry import KINDS
 
 CRUISE_MPS: Final = 28.0
 
@@ -148,11 +148,12 @@ FROZEN_VUTS: Final[dict[str, Callable[[int], Driver]]] = {
 """The frozen VUTs by name."""
 
 
-def _frozen_vut(name: str, _options: VutOptions) -> Vut:
+def _frozen_vut(spec: VutSpec, _options: VutOptions) -> Vut:
     """Return the VUT of `frozen:NAME`; `UserError` for another name."""
+    name = spec.argument
     if name not in FROZEN_VUTS:
         raise UserError(f"there is no VUT frozen:{name}: {meant(name, FROZEN_VUTS)}")
-    return Vut(make=lambda corridors, _world: FROZEN_VUTS[name](corridors), by_arrays=True)
+    return Vut(make=lambda corridors, _world: FROZEN_VUTS[name](corridors))
 
 
-KINDS.register("frozen", VutKind(prepare=_frozen_vut, own_code=False))
+KINDS.register("frozen", VutKind(prepare=_frozen_vut, own_code=False, by_arrays=True))

@@ -17,25 +17,26 @@ import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.sumo.world import World
 from merge_sumo.system.blame import Blame, how_it_ended
 from merge_sumo.system.hashing import Files, changed, hashed
 from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.system.spawning import python_command
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.signals import Left
-from merge_sumo.vuts.base import Deadline, Vut, VutOptions
+from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
 from merge_sumo.vuts.host import wire
-from merge_sumo.vuts.host.wire import About, Frame, WireError
+from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, WireError
 from merge_sumo.vuts.output import Output
+
+T = TypeVar("T")
 
 HOSTING: Final = "merge_sumo.vuts.host.process:main"
 """What runs in the process of a VUT."""
@@ -50,39 +51,32 @@ LOOK_S: Final = 0.25
 ENDING_S: Final = 2.0
 
 
-def hosted_vut(finder: str, spec: str, options: VutOptions, alike: str | None = None) -> Vut:
-    """Return a VUT whose code runs in a process of its own; `UserError` where it cannot be opened.
-
-    `finder` is the "MODULE:FUNCTION" that prepares it there, from spec and options. VUTs that are
-    `alike`, by default those of the same spec, share their facts: only the first is opened for
-    them.
-    """
-    facts = _facts(finder, spec, options, alike or spec)
-
-    def make(corridors: int, _world: World | None) -> Driver:
-        return HostedVut(corridors, finder, spec, options)
-
-    return Vut(
-        make=make,
-        max_corridors=facts["max_corridors"],
-        max_workers=facts["max_workers"],
-        files=tuple(map(Path, facts["files"])),
-    )
-
-
-_known: dict[tuple[str, str, float], tuple[Mapping[str, Any], Files]] = {}
+_known: dict[tuple[VutSpec, str, float], tuple[Facts, Files]] = {}
 """Facts by what is alike, working folder and memory: no process is started where no file has
 changed."""
 
 
-def _facts(finder: str, spec: str, options: VutOptions, alike: str) -> Mapping[str, Any]:
-    """Return the facts of a VUT."""
+def hosted_vut(spec: VutSpec, options: VutOptions, alike: VutSpec) -> Vut:
+    """Return a VUT whose code runs in a process of its own; `UserError` where it cannot be opened.
+
+    VUTs that are `alike` share their facts: only the first is opened for them.
+    """
     key = alike, str(Path.cwd()), options.memory_gib
     if key not in _known or changed(_known[key][1]):
-        host = _first(lambda: Host(finder, spec, options))
+        host = _first(lambda: Host(spec, options))
         host.kill()
-        _known[key] = host.facts, hashed(map(Path, host.facts["files"]))
-    return _known[key][0]
+        _known[key] = host.facts, hashed(map(Path, host.facts.files))
+    facts = _known[key][0]
+
+    def make(corridors: int, _world: object) -> Driver:
+        return HostedVut(corridors, spec, options)
+
+    return Vut(
+        make=make,
+        max_corridors=facts.max_corridors,
+        max_workers=facts.max_workers,
+        files=tuple(map(Path, facts.files)),
+    )
 
 
 def _first(opened: Callable[[], Host]) -> Host:
@@ -124,32 +118,21 @@ class Host:
 
     Attributes:
         alive: whether it can be asked; a process that once gave no answer is killed.
-        facts: "max_corridors", "max_workers" and "files" of the VUT.
+        facts: what the VUT said of itself.
     """
 
-    def __init__(self, finder: str, spec: str, options: VutOptions) -> None:
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
         """Start the process and open the VUT; `UserError` when that cannot be."""
-        self._options = options
+        self._spec, self._options = spec, options
         self._number = 0
         self.alive = True
         self._buffer = bytearray()
         self._start()
-        question = {"finder": finder, "spec": spec, "deadline_s": options.deadline_s}
-        content = self._open(spec, About.OPEN, question)
-        try:
-            self.facts: Mapping[str, Any] = wire.from_json(content, dict)
-        except WireError:
-            self.kill()
-            raise
+        self.facts = self._open(About.OPEN, Opening(spec, options.deadline_s), Facts)
 
-    def make(self, spec: str, corridors: int) -> Mapping[str, float]:
+    def make(self, corridors: int) -> Mapping[str, float]:
         """Have the VUT's driver made, return its parameters; `UserError` when that cannot be."""
-        content = self._open(spec, About.MAKE, corridors)
-        try:
-            return wire.numbers_from_json(content)
-        except WireError:
-            self.kill()
-            raise UserError(f"the VUT {spec} broke the channel to its process") from None
+        return self._open(About.MAKE, corridors, dict[str, wire.Number])
 
     def ask(self, about: About, content: bytes = b"", *, patience_s: float | None = None) -> Frame:
         """Ask and return the answer; raises `HostDiedError` when there is none.
@@ -239,9 +222,9 @@ class Host:
         self._poll = select.poll()
         self._poll.register(self._from, select.POLLIN)
 
-    def _open(self, spec: str, about: About, question: Any) -> bytes:
+    def _open(self, about: About, question: Any, kind: type[T]) -> T:
         """Ask for a VUT to be opened or made; `UserError` when that cannot be."""
-        content = wire.to_json(question)
+        spec, content = self._spec, wire.to_json(question)
         try:
             answer = self.ask(about, content, patience_s=self._options.connect_s)
         except HostDiedError as died:
@@ -249,10 +232,16 @@ class Host:
             printed = f" (it printed: {line})" if line else ""
             sentence = f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
             raise OpeningDiedError(sentence, died) from died
-        if answer.about is About.REFUSED:
+        try:
+            if answer.about is About.REFUSED:
+                raise UserError(wire.from_json(answer.content, str))
+            return wire.from_json(answer.content, kind)
+        except WireError:
             self.kill()
-            raise UserError(wire.from_json(answer.content, str))
-        return answer.content
+            raise UserError(f"the VUT {spec} broke the channel to its process") from None
+        except UserError:
+            self.kill()
+            raise
 
     def _answer(self, patience_s: float) -> Frame:
         notes, clock = BlameCell.read(self._blame_cell)[0], AwakeClock(2.0 * LOOK_S)
@@ -306,10 +295,10 @@ def _end_strays(inherited: str) -> None:
 class HostedVut(Driver):
     """Passes every step on to the process of the VUT."""
 
-    def __init__(self, corridors: int, finder: str, spec: str, options: VutOptions) -> None:
+    def __init__(self, corridors: int, spec: VutSpec, options: VutOptions) -> None:
         """Start the process and make the VUT's driver there; `UserError` when that cannot be."""
         super().__init__(corridors)
-        self._finder, self._spec, self._options = finder, spec, options
+        self._spec, self._options = spec, options
         self._begun: list[tuple[int, Case]] = []
         self._reasons: dict[int, str] = {}
         self._signals: dict[int, Left] = {}
@@ -338,12 +327,12 @@ class HostedVut(Driver):
         try:
             answer = self._host.ask(About.ACT, content)
             if answer.about is About.LOST:
-                lost = wire.from_json(answer.content, dict)
-                raise VutLostError(lost["reason"], lost["corridor"], final=lost["final"])
+                lost = wire.from_json(answer.content, Lost)
+                raise VutLostError(lost.reason, lost.corridor, final=lost.final)
             if answer.about is not About.DONE:
                 # Not its driver, but what surrounds it failed: the VUT has changed that.
                 self._host.kill()
-                raise VutLostError(str(wire.from_json(answer.content, str)), final=True)
+                raise VutLostError(wire.from_json(answer.content, str), final=True)
             answers = wire.unpack_answers(answer.content, self.corridors)
             self._reasons, self._signals = answers.reasons, answers.signals
             self._wishes = answers.wishes
@@ -351,7 +340,7 @@ class HostedVut(Driver):
             own = died.corridor if (died.corridor or 0) < self.corridors else None
             how = {"final": died.hung, "killed": died.killed}
             raise VutLostError(died.reason, own, **how) from None
-        except (WireError, KeyError, ValueError, AttributeError):
+        except WireError:
             self._host.kill()
             raise VutLostError(how_it_ended(None)) from None
         return answers.a_mps2
@@ -376,8 +365,8 @@ class HostedVut(Driver):
         """Return the files that the VUT has loaded so far."""
         if self._host.alive:
             with suppress(HostDiedError, WireError):
-                listed = wire.from_json(self._host.ask(About.FILES).content, list)
-                self._files |= {Path(str(file)) for file in listed}
+                listed = wire.from_json(self._host.ask(About.FILES).content, list[str])
+                self._files |= set(map(Path, listed))
         return tuple(sorted(self._files))
 
     def close(self) -> None:
@@ -385,7 +374,7 @@ class HostedVut(Driver):
         self._host.close()
 
     def _started(self) -> Host:
-        host = Host(self._finder, self._spec, self._options)
-        self._files |= {Path(file) for file in host.facts["files"]}
-        self._parameters = host.make(self._spec, self.corridors)
+        host = Host(self._spec, self._options)
+        self._files |= set(map(Path, host.facts.files))
+        self._parameters = host.make(self.corridors)
         return host

@@ -18,12 +18,13 @@ import numpy as np
 from merge_sumo.drivers.base import Driver, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.system.limits import lower_limits
-from merge_sumo.system.spawning import end_with, named
+from merge_sumo.system.spawning import end_with
 from merge_sumo.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.vuts.blame_cell import BlameCell, current_call
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.file_audit import LoadedFiles
-from merge_sumo.vuts.host.wire import About, Frame
+from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening
+from merge_sumo.vuts.registry import KINDS
 
 
 def main(settings: Mapping[str, Any]) -> None:
@@ -86,7 +87,7 @@ class _Hosting:
             except UserError as error:
                 about, content = About.REFUSED, wire.to_json(str(error))
             except VutLostError as lost:
-                why = {"reason": lost.reason, "corridor": lost.corridor, "final": lost.final}
+                why = Lost(lost.reason, lost.corridor, lost.final)
                 about, content = About.LOST, wire.to_json(why)
             except Exception as error:
                 sentence = f"{type(error).__name__}: {text_of(error)}"
@@ -97,7 +98,7 @@ class _Hosting:
 
     def _answer(self, question: Frame) -> tuple[About, bytes]:
         if question.about is About.OPEN:
-            return About.DONE, wire.to_json(self._open(wire.from_json(question.content, dict)))
+            return About.DONE, wire.to_json(self._open(wire.from_json(question.content, Opening)))
         if question.about is About.MAKE:
             assert self._vut is not None, "opened first"  # noqa: S101
             self._driver = self._vut.make(wire.from_json(question.content, int), None)
@@ -110,17 +111,12 @@ class _Hosting:
             return About.DONE, b""
         return About.DONE, self._act(self._driver, question.content)
 
-    def _open(self, request: dict[str, Any]) -> dict[str, Any]:
-        find_vut = named(request["finder"])
-        options = VutOptions(deadline_s=request["deadline_s"], in_process=True)
+    def _open(self, asked: Opening) -> Facts:
+        options = VutOptions(deadline_s=asked.deadline_s, in_process=True)
+        kind = KINDS[asked.spec.kind]
         self._loaded = LoadedFiles()
-        vut: Vut = find_vut(request["spec"], options)
-        self._vut = vut
-        return {
-            "max_corridors": vut.max_corridors,
-            "max_workers": vut.max_workers,
-            "files": self._files(),
-        }
+        self._vut = kind.prepare(asked.spec, options)
+        return Facts(self._vut.max_corridors, self._vut.max_workers, self._files())
 
     def _files(self) -> list[str]:
         assert self._vut is not None, "opened first"  # noqa: S101

@@ -9,19 +9,24 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_SIGNALS, NO_WISH, STAY, Scene
+from merge_sumo.drivers.base import NO_SIGNALS, Scene
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import RANGES, US23, Bounds, Scenario, lane_of
 from merge_sumo.values.signals import Left, as_signals
+from merge_sumo.vuts.base import VutSpec
+
+T = TypeVar("T")
 
 
 class About(IntEnum):
@@ -75,32 +80,51 @@ def take(buffer: bytearray) -> Frame | None:
 
 
 def to_json(value: Any) -> bytes:
-    """Return a value as JSON."""
-    return json.dumps(value).encode()
+    """Return a value as JSON; texts may have surrogates, as names of files do."""
+    return json.dumps(msgspec.to_builtins(value, str_keys=True)).encode()
 
 
-def from_json(content: bytes, kind: type[Any]) -> Any:
+def from_json(content: bytes, kind: type[T]) -> T:
     """Return the value of a type that JSON says; `WireError` where it says another."""
     try:
-        value = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise WireError("it is no JSON") from error
-    if not isinstance(value, kind):
-        raise WireError(f"it is no {kind.__name__}")
-    return value
+        return msgspec.convert(json.loads(content), kind, str_keys=True)
+    except (msgspec.ValidationError, ValueError, RecursionError) as error:
+        raise WireError("it is not what was asked for") from error
 
 
-def numbers_from_json(content: bytes) -> dict[str, float]:
-    """Return finite numbers by name that JSON says; `WireError` where it says something else."""
-    numbers = from_json(content, dict)
-    for value in numbers.values():
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, int | float)
-            or not math.isfinite(value)
-        ):
-            raise WireError("it is no number")
-    return dict(numbers)
+Number = Annotated[float, msgspec.Meta(ge=-sys.float_info.max, le=sys.float_info.max)]
+"""A finite one."""
+
+
+class Opening(msgspec.Struct, frozen=True):
+    """The VUT that is to be opened."""
+
+    spec: VutSpec
+    deadline_s: float
+
+
+class Facts(msgspec.Struct, frozen=True):
+    """Facts of a VUT that was opened, as those of `Vut`."""
+
+    max_corridors: int | None
+    max_workers: int | None
+    files: list[str]
+
+
+class Lost(msgspec.Struct, frozen=True):
+    """Fields of a `VutLostError`."""
+
+    reason: str
+    corridor: int | None
+    final: bool
+
+
+class _Beside(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What an answer says besides accelerations, by corridor."""
+
+    reasons: dict[int, str] = {}
+    signals: dict[int, dict[str, Any]] = {}
+    wishes: list[Literal[-1, 0, 1]] | None = None
 
 
 _TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
@@ -182,39 +206,27 @@ def pack_answers(
     wishes: NDArray[np.int8] | None = None,
 ) -> bytes:
     """Return accelerations, (K,), the reasons of those that are not finite, signals and wishes."""
-    more: dict[str, Any] = {"reasons": reasons, "signals": signals}
-    if wishes is not None:
-        more["wishes"] = wishes.tolist()
-    return np.ascontiguousarray(answers, dtype=np.float64).tobytes() + (
-        to_json(more) if any(more.values()) else b""
-    )
+    numbers = np.ascontiguousarray(answers, dtype=np.float64).tobytes()
+    if not reasons and not signals and wishes is None:
+        return numbers
+    said = None if wishes is None else wishes.tolist()
+    return numbers + to_json(_Beside(dict(reasons), dict(signals), said))
 
 
 def unpack_answers(content: bytes, k: int) -> Answers:
     """Return what `pack_answers` packed for `k` corridors.
 
-    Raises `WireError`, KeyError, ValueError or AttributeError for what it did not.
+    Raises `WireError` for what it did not.
     """
     if len(content) < 8 * k:
         raise WireError("it has too few answers")
     answers = np.frombuffer(content, np.float64, k)
     if len(content) == 8 * k:
         return Answers(answers, {}, {})
-    said = from_json(content[8 * k :], dict)
-    reasons = {int(corridor): str(reason) for corridor, reason in said["reasons"].items()}
-    # Who wrote this runs a stranger's code: what it left is checked here, too.
-    left = {int(corridor): as_signals(values) for corridor, values in said["signals"].items()}
-    signals = {c: values for c, values in left.items() if 0 <= c < k}
-    return Answers(answers, reasons, signals, _wishes(said.get("wishes"), k))
-
-
-def _wishes(said: Any, k: int) -> NDArray[np.int8] | None:
-    """Return the wishes that JSON says; `WireError` for what are none of `k` corridors."""
-    if said is None:
-        return None
-    known = (NO_WISH, STAY, MERGE)
-    if not isinstance(said, list) or len(said) != k:
+    said = from_json(content[8 * k :], _Beside)
+    if said.wishes is not None and len(said.wishes) != k:
         raise WireError("it has another number of wishes")
-    if not all(type(wish) is int and wish in known for wish in said):
-        raise WireError("a wish is none")
-    return np.array(said, dtype=np.int8)
+    # Who wrote this runs a stranger's code: what it left is checked here, too.
+    signals = {c: as_signals(values) for c, values in said.signals.items() if 0 <= c < k}
+    wishes = None if said.wishes is None else np.array(said.wishes, dtype=np.int8)
+    return Answers(answers, said.reasons, signals, wishes)

@@ -33,7 +33,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
-from merge_sumo.vuts.base import Vut, VutOptions
+from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 from merge_sumo.vuts.process import Program, split_command
 from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door
@@ -47,30 +47,36 @@ WORK_S: Final = 10.0
 """Time that SUMO has for the questions of a controller in a step, besides the deadline."""
 
 
-def traci_vut(argument: str, options: VutOptions) -> Vut:
+def traci_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT of `traci`, `traci:PORT` or `traci:COMMAND`.
 
     A command gets its port as an argument: any free one will do, and several can run at a time.
     Raises `UserError` for a port or a command that is none, and for code that others may write.
     """
     command, port = None, 0
-    if is_port(argument):
-        port = int(argument or DEFAULT_PORT)
+    if is_port(spec.argument):
+        port = int(spec.argument or DEFAULT_PORT)
         if not 1 <= port <= 65535:
-            raise UserError(f"--vut traci:{argument}: the port is a number from 1 to 65535")
+            raise UserError(f"{spec}: the port is a number from 1 to 65535")
     else:
-        command = split_command(argument)
+        command = split_command(spec.argument)
     files = tuple(Path(word) for word in command or () if Path(word).is_file())
     for file in files:
         check_code(file)
 
-    def make(corridors: int, world: World | None) -> Driver:
-        if world is None:
-            raise UserError("--vut traci drives in a SUMO world only")
+    def make(corridors: int, world: object) -> Driver:
+        if not isinstance(world, World):
+            raise UserError(f"{spec} drives in a SUMO world only")
         return TraciVut(corridors, world.road, world.scenario, port, command, options)
 
-    workers = None if command else 1
-    return Vut(make=make, max_corridors=1, max_workers=workers, files=files, named_only=True)
+    return Vut(
+        make=make,
+        max_corridors=1,
+        max_workers=None if command else 1,
+        files=files,
+        no_pov="a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
+        "FMU, a network or sumo:MODEL",
+    )
 
 
 def is_port(argument: str) -> bool:
@@ -393,3 +399,16 @@ class Shadow:
         """End it."""
         self._child, self.listens = None, False
         self._opened.close()
+
+
+KIND: Final = VutKind(
+    form="traci:COMMAND or traci[:PORT]",
+    what="a program in any language that drives `vut` by TraCI; started by you where no "
+    "command is given",
+    example='--vut "traci:python my_controller.py {port}"',
+    prepare=traci_vut,
+    has_parameters=False,
+    no_parameters="a TraCI client is a program with parameters of its own",
+    files_are_known=False,
+    waits=is_port,
+)
