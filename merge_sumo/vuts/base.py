@@ -147,7 +147,9 @@ class VutKind:
     """Whether to test it is to run code that is neither of this package nor of SUMO."""
     files_are_known: bool = True  # whether `Vut.files` are all of which it is made before it drives
     by_arrays: bool = False
-    """Whether its drivers need nothing of SUMO, take any number of corridors, and never fail."""
+    """Whether its drivers need nothing of SUMO, and take any number of corridors."""
+    file_of: Callable[[str], str] = lambda _: ""
+    """Returns the file of code that an argument names; "" for none."""
     waits: Callable[[str], bool] = lambda _: False
     """Returns whether the controller of an argument is a program that a person starts."""
 

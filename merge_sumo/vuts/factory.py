@@ -14,6 +14,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.suggestions import meant
+from merge_sumo.system.trust import check_code
 from merge_sumo.system.workers import workers_or_cores
 from merge_sumo.vuts.base import INSTALLED, Vut, VutKind, VutOptions, VutSpec
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
@@ -58,6 +59,8 @@ class VutFactory:
         spec, kind = self.spec, self.kind
         if spec.kind == INSTALLED and spec.argument not in installed_vuts():
             raise UserError(_why_unknown(spec.argument))
+        if file := kind.file_of(spec.argument):
+            check_code(Path(file))
         if not kind.hosted or self.options.in_process or not SUPPORTED:
             return kind.prepare(spec, self.options)
         if kind.no_parameters:

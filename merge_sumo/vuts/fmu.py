@@ -11,7 +11,6 @@ from typing import Any, Final
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
 from merge_sumo.system.suggestions import either
-from merge_sumo.system.trust import check_code
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
 from merge_sumo.vuts.blame_cell import current_call
@@ -28,7 +27,6 @@ _BOOLEAN: Final = "Boolean"
 def fmu_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT of `fmu:FILE?x_vut_m=NAME&...`; `UserError` for one that cannot be."""
     file, names = Path(spec.argument), dict(spec.parameters)
-    check_code(file)
     if unknown := set(names) - set(NAMES):
         raise UserError(
             f"{spec}: there is no variable {unknown.pop()!r} to name: choose from "
@@ -223,4 +221,5 @@ KIND: Final = VutKind(
     no_parameters="the options of an FMU are the names of its variables",
     prepare=fmu_vut,
     hosted=True,
+    file_of=str,
 )

@@ -13,7 +13,6 @@ import numpy as np
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
-from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
@@ -34,7 +33,6 @@ _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 def onnx_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT of `onnx:FILE?decision_period_s=...`; `UserError` for one that cannot be."""
     file, given = Path(spec.argument), dict(spec.parameters)
-    check_code(file)
     if unknown := set(given) - {PERIOD}:
         raise UserError(f"{spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
     network = Network(file, given.get(PERIOD))
@@ -189,4 +187,5 @@ KIND: Final = VutKind(
     no_parameters="the parameters of a network are its weights",
     prepare=onnx_vut,
     hosted=True,
+    file_of=str,
 )

@@ -391,7 +391,6 @@ def _load_module(name: str) -> ModuleType:
 
 
 def _load_file(path: Path) -> ModuleType:
-    check_code(path)
     try:
         return module_of_file(path)
     except OSError as error:
@@ -404,11 +403,17 @@ def _cannot_load(what: str, error: BaseException) -> str:
     return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"
 
 
+def _file_of(argument: str) -> str:
+    source = argument.rpartition(":")[0]
+    return source if source.endswith(".py") else ""
+
+
 KIND: Final = VutKind(
     form="MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME",
     what="a class with act(seen), a function of seen, or a batched class",
     example="--vut my_vut.py:MyVut",
     prepare=python_vut,
     hosted=True,
+    file_of=_file_of,
 )
 INSTALLED_KIND: Final = VutKind(prepare=installed_vut, hosted=True)

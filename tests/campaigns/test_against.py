@@ -219,4 +219,4 @@ def test_a_case_that_passed_and_ends_with_an_error_broke(command_line):
 def test_a_parameter_that_the_old_version_lacks_is_said_of_it(command_line):
     asked = ("--vut", "design1", "--against", "design1?gap=2", "--cases", 5, "--out", "run")
     said = command_line("campaign", *asked, "-q")
-    assert_refused(said, "--against design1?gap=2: it has no parameter")
+    assert_refused(said, "design1?gap=2: it has no parameter")

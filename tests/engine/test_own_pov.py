@@ -261,9 +261,9 @@ class TestACampaign:
             (("--level", "0", "--pov", "my_pov.py:Pov"), "--pov drives at --level own or all"),
             (("--level", "3", "--pov", "my_pov.py:Pov"), "there is no POV level '3'"),
             (("--pov", "traci"), "a TraCI client drives the vehicle `vut` and no other"),
-            (("--pov", "level1"), "--level chooses the POVs"),
-            (("--pov", "nowhere.py:Pov"), "--pov nowhere.py:Pov: cannot read"),
-            (("--pov", "onnx:nowhere.onnx"), "--pov onnx:nowhere.onnx"),
+            (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
+            (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot read"),
+            (("--pov", "onnx:nowhere.onnx"), "the POV onnx:nowhere.onnx"),
         ],
     )
     def test_is_refused_in_one_sentence(self, call, arguments, said):

@@ -128,14 +128,6 @@ def test_workers_need_no_main_guard_and_no_file(tmp_path):
 
 
 class TestTheOtherFunctions:
-    @pytest.mark.parametrize(
-        ("values", "part"),
-        [({"x": -300}, "a case has no x"), ({"x_pov0_m": -300}, "v_pov0_mps"), ({"level": 7}, "7")],
-    )
-    def test_one_case_is_refused(self, values, part):
-        with pytest.raises(ms.UserError, match=part):
-            ms.run("design2", **values)
-
     def test_the_truth_of_an_object_is_not_kept(self, tmp_path, monkeypatch):
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
         with warnings.catch_warnings():

@@ -6,13 +6,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from campaigning import campaign_settings, run_campaign
 from vut_contract import cases_of, factory, run_cases, run_on
 
-from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.world import World
 from merge_sumo.values.case import MergeCase
 from merge_sumo.values.scenario import DT_S, US23, VUT
@@ -37,15 +34,6 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
         x, v, a = one.motion[:, VUT].T
         assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
         assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)
-
-
-def test_a_campaign_finds_failures_that_replay_identically(model, tmp_path):
-    settings = campaign_settings(vut=model, sampler="uniform", cases=120, batch=40, seed=2)
-    run = run_campaign(settings, tmp_path / "run")
-    assert {o.measures.end for o in run.outcomes} <= {End.MERGED}
-    (worst, *_) = failures(run.outcomes)
-    result = replay(tmp_path / "run" / "scenarios" / f"case-{worst.index:05d}")
-    assert result.diverged_at_s is None
 
 
 def test_a_free_driver_follows_what_sumo_drives_by_itself(model):

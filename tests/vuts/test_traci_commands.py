@@ -12,18 +12,11 @@ import traci
 from traci_pair import Drive
 
 from merge_sumo.sumo.traci_names import DUMMIES, named
-from merge_sumo.values.scenario import US23
 from merge_sumo.vuts.traci.commands import Effect, NotFiniteError, effect_of
 from merge_sumo.vuts.traci.session import QUESTIONS
 
 V, T = "vehicle", "vehicletype"
 SCRIPTS: dict[str, list[tuple]] = {
-    "a limit of deceleration": [(0, V, "setDecel", 1.0), (0, V, "setSpeed", 17.0)],
-    "a maximum speed above, and lifted": [
-        (0, V, "setMaxSpeed", 18.1),
-        (0, V, "setSpeed", 25.0),
-        (5, V, "setMaxSpeed", 40.0),
-    ],
     "all three": [
         (0, V, "setAccel", 0.7),
         (0, V, "setDecel", 1.3),
@@ -33,18 +26,9 @@ SCRIPTS: dict[str, list[tuple]] = {
         (12, V, "setMaxSpeed", 17.9),
     ],
     "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
-    "slowing down at once": [(0, V, "slowDown", 17.95, 0.0), (1, V, "setSpeed", 18.1)],
-    "speeding up beyond a limit": [(0, V, "setAccel", 0.5), (0, V, "slowDown", 20.0, 1.5)],
     "an acceleration after another": [
         (0, V, "setAcceleration", 1.0, 0.5),
         (3, V, "setAcceleration", -2.0, 1.5),
-    ],
-    "one limit in mode 4": [
-        (0, V, "setAccel", 0.5),
-        (0, V, "setDecel", 0.5),
-        (0, V, "setSpeedMode", 4),
-        (0, V, "setSpeed", 18.2),
-        (4, V, "setSpeed", 17.9),
     ],
     "numbers of the car-following model": [
         (0, V, "setTau", 3.0),
@@ -134,19 +118,6 @@ class TestWhatWasSet:
         drive.step()
         assert drive.speeds()[0] == pytest.approx(18.1)
 
-    def test_of_looks_and_parameters_can_be_read_back(self, drive):
-        drive.begin()
-        c = drive.ours
-        assert c.vehicle.getColor("vut") == (26, 89, 230, 255)
-        c.vehicle.setColor("vut", (1, 2, 3, 4))
-        c.vehicle.setParameter("vut", "mine", "7")
-        c.vehicle.setSpeedMode("vut", 31)
-        c.vehicle.setLaneChangeMode("vut", 512)
-        assert c.vehicle.getColor("vut") == (1, 2, 3, 4)
-        assert c.vehicle.getParameter("vut", "mine") == "7"
-        assert c.vehicle.getSpeedMode("vut") == 31
-        assert c.vehicle.getLaneChangeMode("vut") == 512
-
 
 class TestWhatSumoDecides:
     """What the emulation of commands could not do: SUMO's own models drive the VUT."""
@@ -175,32 +146,6 @@ class TestWhatSumoDecides:
         assert max(apart) < (2.0 if name == "a stop" else 0.4)
         assert ours != pytest.approx(18.0, abs=1e-3)
 
-    def test_stops_before_a_car_that_stands(self, drive):
-        drive.begin()
-        drive.place([100.0, 10.0], [0.0, 18.0])
-        drive.ours.vehicle.setSpeedMode("vut", 31)
-        drive.ours.vehicle.setSpeed("vut", -1.0)
-        for _ in range(120):
-            drive.step()
-        assert drive.v_mps[1] == pytest.approx(0.0, abs=0.1)
-        assert 0.0 < drive.x_m[0] - US23.pov_length_m - drive.x_m[1] < 5.0
-
-
-@pytest.mark.parametrize(
-    ("function", "values", "name"),
-    [
-        ("changeLane", (0, 1.0), "vehicle.changeLane or vehicle.changeLaneRelative"),
-        ("setLaneChangeMode", (0,), "vehicle.setLaneChangeMode"),
-        ("updateBestLanes", (), "vehicle.updateBestLanes"),
-        ("rerouteTraveltime", (False,), "vehicle.rerouteTraveltime"),
-    ],
-)
-def test_what_can_change_nothing_here_is_noted_once(drive, function, values, name):
-    drive.begin()
-    for _ in range(2):
-        getattr(drive.ours.vehicle, function)("vut", *values)
-    assert drive.session.notes == [f"{name} is accepted and changes nothing here"]
-
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("function", ["setSpeed", "slowDown", "setAcceleration"])
@@ -216,8 +161,6 @@ def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
     [
         ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
         ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
-        ("vehicle", "moveTo", ("vut", "main_out_0", 5.0), "as the scenario says"),
-        ("vehicle", "setRoute", ("vut", ["ramp"]), "the route is the scenario's"),
         ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
         ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
         ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
@@ -225,7 +168,6 @@ def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
         ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
         ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
         ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
-        ("simulation", "loadState", ("x.xml",), "the campaign runs the simulation"),
         ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
     ],
 )

@@ -25,7 +25,7 @@ from controllers import (
     program,
     raw_client,
 )
-from processes import none_left, ports_of
+from processes import none_left
 from raw_traci import Client, GoneError
 from vut_contract import cases_of, factory, run_cases
 
@@ -192,39 +192,6 @@ class TestAnotherUser:
             f"import runpy, sys; sys.argv = ['x', '{port}']\n"
             f"runpy.run_path({str(RAW)!r}, run_name='__main__')"
         )
-
-
-@pytest.mark.slow
-def test_the_sumo_that_a_controller_asks_has_no_port(tmp_path):
-    """Of all sockets by TCP or UDP, its process has the client's connection alone."""
-    seen, stopped = list[list[str]](), threading.Event()
-    asks = (
-        f"{STOCK_CLIENT}"
-        "while traci.simulation.getMinExpectedNumber() > 0:\n"
-        "    traci.simulationStep()\n"
-        "    if 'vut' in traci.vehicle.getIDList():\n"
-        "        traci.vehicle.getNextLinks('vut')\n"
-        "        time.sleep(0.02)\n"
-        "traci.close()\n"
-    )
-
-    def look() -> None:
-        while not stopped.is_set():
-            for process in shadows():
-                with suppress(OSError):
-                    seen.append(ports_of(process))
-            time.sleep(0.02)
-
-    thread = threading.Thread(target=look)
-    thread.start()
-    try:
-        vut = factory("traci:" + program(tmp_path, asks))
-        (trajectory,) = run_cases(vut, cases_of(1))
-    finally:
-        stopped.set()
-        thread.join()
-    assert trajectory.error is None
-    assert {len(found) for found in seen} == {0, 1}
 
 
 @pytest.mark.skipif(not door.KNOWN_HERE, reason="needs /proc/net/tcp")

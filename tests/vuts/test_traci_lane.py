@@ -94,23 +94,6 @@ while traci.simulation.getMinExpectedNumber() > 0:
     assert not log.exists()
 
 
-@pytest.mark.slow
-def test_sumo_checks_the_gap_in_mode_512_and_not_in_mode_0(tmp_path):
-    source = (
-        DRIVES
-        + """
-    traci.vehicle.setLaneChangeMode("vut", {mode})
-    if traci.vehicle.getRoadID("vut") == "lane" and traci.vehicle.getLaneIndex("vut") == 0:
-        traci.vehicle.changeLane("vut", 1, 0.0)
-"""
-    )
-    by_mode = [drive(tmp_path, source.format(mode=mode)) for mode in (0, 512)]
-    (near, far), (near_checked, far_checked) = ([t.x_vut_m[-1] for t in ran] for ran in by_mode)
-    assert near < -65.0
-    assert near_checked > -60.0, "the POV is 17 m behind and faster"
-    assert far_checked == far
-
-
 class TestTheShadow:
     """The SUMO that decides, step by step."""
 

@@ -19,11 +19,8 @@ Call = tuple[str, list[Any]]
 
 OF_SHARED_VARIABLES: Final = {
     "trafficlight.getNemaPhaseCalls": "trafficlight.getParameter",
-    "trafficlight.getRedYellowGreenState": "trafficlight.getRedYellowGreenState",
-    "trafficlight.getAllProgramLogics": "trafficlight.getAllProgramLogics",
     "vehicle.couldChangeLane": "vehicle.getLaneChangeState",
     "vehicle.getLeftFollowers": "vehicle.getNeighbors",
-    "person.getRemainingStages": "person.getRemainingStages",
 }
 """Of several functions that read one variable, by the first: the one that SUMO's server calls."""
 WITHOUT_OBJECT: Final = (
@@ -32,7 +29,9 @@ WITHOUT_OBJECT: Final = (
 )
 NOT_ANSWERED: Final = {
     *("trafficlight.getConstraints", "trafficlight.getConstraintsByFoe"),
-    *("trafficlight.swapConstraints", "simulation.findIntermodalRoute"),
+    *("trafficlight.swapConstraints", "trafficlight.getAllProgramLogics"),
+    *("trafficlight.getControlledLinks", "simulation.findIntermodalRoute", "simulation.findRoute"),
+    *("person.getRemainingStages", "person.getStage", "person.getTaxiReservations"),
 }
 """Their answers have a layout that no car needs."""
 COMPOUND_HEAD_BYTES: Final = 5
@@ -166,40 +165,6 @@ def _neighbours(answer: Sequence[tuple[str, float]]) -> bytes:
     return compound(len(answer), b"".join(items))
 
 
-def _stage(answer: Any) -> bytes:
-    return _fields("isssldddsddds")(attrgetter(*_STAGE)(answer))
-
-
-def _controlled_links(answer: Sequence[Sequence[Sequence[str]]]) -> bytes:
-    groups = (pack("i", len(links)) + pack("l" * len(links), *links) for links in answer)
-    count = 1 + sum(1 + len(links) for links in answer)
-    return compound(count, pack("i", len(answer)) + b"".join(groups))
-
-
-def _logics(answer: Sequence[Any]) -> bytes:
-    content = b""
-    for logic in answer:
-        phases = b"".join(map(_phase, logic.phases))
-        own = logic.subParameter.items()
-        content += compound(
-            5,
-            pack("sii", logic.programID, logic.type, logic.currentPhaseIndex)
-            + compound(len(logic.phases), phases)
-            + compound(len(own), pack("l" * len(own), *own)),
-        )
-    return compound(len(answer), content)
-
-
-def _phase(phase: Any) -> bytes:
-    following = compound(len(phase.next), pack("i" * len(phase.next), *phase.next))
-    times = pack("dsdd", phase.duration, phase.state, phase.minDur, phase.maxDur)
-    return compound(6, times + following + pack("s", phase.name))
-
-
-_STAGE: Final = (
-    *("type", "vType", "line", "destStop", "edges", "travelTime", "cost", "length", "intended"),
-    *("depart", "departPos", "arrivalPos", "description"),
-)
 _NEXT_STOP: Final = ("lane", "endPos", "stoppingPlaceID", "stopFlags", "duration", "until")
 _STOP: Final = (
     *(*_NEXT_STOP, "startPos", "intendedArrival", "arrival", "depart", "split", "join", "actType"),
@@ -223,10 +188,5 @@ _LAYOUTS: Final[dict[str, Callable[[Any], bytes]]] = {
     "lane.getLinks": _links,
     "simulation.convertRoad": lambda answer: pack("r", answer),
     "simulation.getCollisions": _objects("ssssddssd", *_COLLISION),
-    "simulation.findRoute": _stage,
-    "person.getStage": _stage,
-    "person.getTaxiReservations": lambda _: compound(0, b""),
-    "trafficlight.getControlledLinks": _controlled_links,
-    "trafficlight.getAllProgramLogics": _logics,
 }
 """Answers whose layout does not follow from their type in Python."""
