@@ -135,7 +135,7 @@ def test_a_scenario_with_a_lag_of_its_own_skips_the_rungs_that_add_one(tmp_path)
 def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
     own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
     skipped = {one.name: one.skipped for one in ms.stress(own).rungs if one.skipped}
-    assert skipped == {"step": "--vut sumo:Krauss drives in a SUMO world only"}
+    assert skipped == {"step": "sumo:Krauss drives in a SUMO world only"}
 
 
 class TestAShorterStep:
