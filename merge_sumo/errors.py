@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
+from types import FrameType
 from typing import Final
 
 MOST_CHARACTERS: Final = 10_000
@@ -22,3 +25,12 @@ class UserError(Exception):
 
 class Notice(UserWarning):
     """What a person should know of a result; the command line prints it as a sentence."""
+
+
+def notice(sentence: str, category: type[Warning] = Notice) -> None:
+    """Warn whoever called the package, however many calls above."""
+    frame: FrameType | None = sys._getframe(1)
+    level = 2
+    while frame is not None and frame.f_globals.get("__name__", "").startswith("merge_sumo."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(sentence, category, stacklevel=level - 1)

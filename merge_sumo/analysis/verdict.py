@@ -237,7 +237,7 @@ def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
             )
         if text == REGRESSIONS and not against:
             raise UserError(
-                f"the gate {text} needs an earlier version that the campaign is against"
+                f"the gate {text} needs an earlier version of the VUT: name it with `against`"
             )
         try:
             above = 0.0 if text in NUMBERS else float(number)

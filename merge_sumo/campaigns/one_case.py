@@ -9,6 +9,7 @@ from typing import Any, Final
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
+from merge_sumo.options import COORDINATES
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.sumo.live import Window
 from merge_sumo.sumo.replay_folder import case_line, verdict_line
@@ -25,14 +26,6 @@ ONE: Final[dict[str, Any]] = {
     "repeat": 1,
 }
 """Settings of a campaign that is one case."""
-OPTIONS: Final = {
-    "x_pov0_m": "--x",
-    "v_pov0_mps": "--v",
-    "svo_rad": "--psi",
-    "headway_ahead_s": "--headway-ahead",
-    "headway_behind_s": "--headway-behind",
-}
-"""Options for coordinates of a case, by the names of their fields; --at sets any of them."""
 
 
 def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
@@ -71,7 +64,7 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
 
 def _option(name: str) -> str:
     """Return how a person gives a coordinate."""
-    return f"{OPTIONS[name]} ({name})" if name in OPTIONS else f"--at {name}=NUMBER"
+    return f"`{name}`" if name in COORDINATES else f"{name}, which `at` gives,"
 
 
 def run_one(

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
@@ -15,7 +15,7 @@ from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
-from merge_sumo.samplers import DEFAULT_SAMPLER
+from merge_sumo.options import Limits, Search
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -24,30 +24,18 @@ from merge_sumo.system.records import RecordError, check_fields, to_plain
 from merge_sumo.values.case import Pool
 from merge_sumo.values.chance import check_tolerated
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB, OWN, US23, Scenario, level_name
+from merge_sumo.values.scenario import OWN, US23, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.spec import is_built_in, names_code, waits_for_client
 
-DEFAULT_CASES: Final = 800
 
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class CampaignSettings:
+@dataclass(frozen=True, kw_only=True)
+class CampaignSettings(Search, Limits):
     """Everything that decides what a campaign does; `UserError` for values that make none."""
 
     vut: str
     levels: tuple[int, ...]
-    sampler: str = DEFAULT_SAMPLER
-    cases: int = DEFAULT_CASES
-    batch: int | None = None
-    in_flight: int | None = None
-    repeat: int | Literal["auto"] = 1
-    tolerated: float = 0.0
-    seed: int = 0
-    stop_when_converged: bool = False
-    deadline_s: float = DEADLINE_S
-    vut_memory_gib: float = MEMORY_GIB
     policies: str | None = None
     pov: str | None = None
     against: str | None = None
@@ -75,11 +63,10 @@ class CampaignSettings:
         for name in ("cases", "batch", "in_flight", "repeat"):
             number = getattr(self, name)
             if isinstance(number, int) and number < 1:
-                option = name.replace("_", "-")
-                raise UserError(f"--{option} is {number}: it must be 1 or more")
+                raise UserError(f"`{name}` is {number}: it must be 1 or more")
         if self.batch is not None and self.batch > self.cases:
             raise UserError(
-                f"batch is {self.batch} and --cases is {self.cases}: a batch cannot have more "
+                f"batch is {self.batch} and `cases` is {self.cases}: a batch cannot have more "
                 "cases than the campaign"
             )
         if self.in_flight is not None:
@@ -87,20 +74,20 @@ class CampaignSettings:
         if self.against is not None:
             self._check_against(self.against)
         if self.seed < 0:
-            raise UserError(f"--seed is {self.seed}: it must be 0 or more")
+            raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
         check_tolerated(self.tolerated)
         if isinstance(self.repeat, int) and self.repeat > self.cases:
             raise UserError(
-                f"--repeat is {self.repeat} and --cases is {self.cases}: runs of a case are among "
+                f"`repeat` is {self.repeat} and `cases` is {self.cases}: runs of a case are among "
                 "the cases of the campaign, and cannot be more"
             )
 
     def _check_texts(self) -> None:
         for option, text in (
-            ("--vut", self.vut),
-            ("--policies", self.policies),
-            ("--pov", self.pov),
-            ("--against", self.against),
+            ("`vut`", self.vut),
+            ("`policies`", self.policies),
+            ("`pov`", self.pov),
+            ("`against`", self.against),
         ):
             if text is not None and not _is_text(text):
                 raise UserError(
@@ -111,38 +98,38 @@ class CampaignSettings:
     def _check_in_flight(self, in_flight: int) -> None:
         if self.batch is not None:
             raise UserError(
-                f"--in-flight is {in_flight} and batch is {self.batch}: a search runs in batches "
+                f"`in_flight` is {in_flight} and batch is {self.batch}: a search runs in batches "
                 "or with cases in flight; leave one of them away"
             )
         if in_flight > self.cases:
             raise UserError(
-                f"--in-flight is {in_flight} and --cases is {self.cases}: no more cases can be in "
+                f"`in_flight` is {in_flight} and `cases` is {self.cases}: no more cases can be in "
                 "flight than the campaign has"
             )
         if not SAMPLERS[self.sampler].learns:
             raise UserError(
-                f"--in-flight is for samplers that learn from outcomes: --sampler {self.sampler} "
+                f"`in_flight` is for samplers that learn from outcomes: `sampler` {self.sampler} "
                 "waits for none, and keeps all workers busy without it"
             )
 
     def _check_against(self, against: str) -> None:
         for option, given in (
-            ("--in-flight", self.in_flight),
-            ("--repeat", None if self.repeat == 1 else self.repeat),
-            ("--tolerate", self.tolerated or None),
+            ("`in_flight`", self.in_flight),
+            ("`repeat`", None if self.repeat == 1 else self.repeat),
+            ("`tolerated`", self.tolerated or None),
         ):
             if given is not None:
                 raise UserError(
-                    f"{option} does not go with --against, which runs each batch with two "
+                    f"{option} does not go with `against`, which runs each batch with two "
                     "versions: leave one of them away"
                 )
         if waits_for_client(against):
             raise UserError(
-                f"--against is {against}: a client that a person starts drives one VUT; name an "
+                f"`against` is {against}: a client that a person starts drives one VUT; name an "
                 "earlier version that needs none"
             )
         if against == self.vut:
-            raise UserError(f"--against is {against}, and so is --vut: name two versions")
+            raise UserError(f"`against` is {against}, and so is `vut`: name two versions")
 
     @property
     def earlier(self) -> CampaignSettings:
@@ -151,7 +138,7 @@ class CampaignSettings:
         Raises `UserError` where the campaign is against none.
         """
         if self.against is None:
-            raise UserError("the campaign has no --against")
+            raise UserError("the campaign is against no earlier version")
         return replace(self, vut=self.against, against=None)
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
@@ -265,7 +252,7 @@ def settings_of(
         if name not in given:
             raise UserError(
                 f"{folder} was run with {name} {printable(spec)[:MOST_SHOWN]}, and a run folder "
-                f"names no code to run: name it again, --{name} SPEC"
+                f"names no code to run: name it again with `{name}`"
             )
     known = {
         spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
@@ -307,5 +294,5 @@ def _check_still_there(folder: Path, policies: str) -> None:
     except UserError:
         raise UserError(
             f"{folder} was run with the policies in {policies}, and there are none any more: name "
-            "the folder where they are now with --policies"
+            "the folder where they are now with `policies`"
         ) from None

@@ -5,37 +5,40 @@ from __future__ import annotations
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from merge_sumo.commands import gone
-from merge_sumo.commands.options import (
-    GROUP_OF,
-    GROUPS,
-    KEYWORDS,
-    OPTIONS,
-    PANEL_OF,
-    Shared,
-)
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
-from merge_sumo.system.spawning import named
-from merge_sumo.system.suggestions import either
+from merge_sumo.help_texts import with_names
+from merge_sumo.options import (
+    GROUPS,
+    WHERE,
+    Asked,
+    Execution,
+    Option,
+    flags_of,
+    options_of,
+)
 
 if TYPE_CHECKING:
     from merge_sumo.analysis.result import Result
 
 
-REGISTRIES: Final = {
-    "{samplers}": "merge_sumo.samplers.registry:SAMPLERS",
-    "{criteria}": "merge_sumo.values.criteria:CRITERIA",
-    "{formats}": "merge_sumo.reports.formats:FORMATS",
+PANELS: Final[Mapping[str, tuple[str, ...]]] = {
+    "Search": ("campaign", "run", "probability"),
+    "Look": ("report", "explain", "replay", "export"),
+    "Change": ("rerun", "compare", "repair"),
+    "Bring your own": ("vuts", "check-vut", "scenario", "train"),
+    "Research": ("truth", "benchmark", "reproduce"),
 }
-"""Registries whose names stand in help texts: they are imported where a command is used."""
+"""Commands by panel of the help, the most used first."""
+PANEL_OF: Final = {name: panel for panel, names in PANELS.items() for name in names}
 
 
 def unwrapped(text: str) -> str:
@@ -45,24 +48,19 @@ def unwrapped(text: str) -> str:
 
 
 class GroupedCommand(TyperCommand):
-    """A command whose options are grouped by `GROUPS`; it prints the notices of the API."""
+    """A command whose options stand in `GROUPS`; it prints the notices of the API."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         order = {group: place for place, group in enumerate(GROUPS)}
-        for parameter in self.params:
-            if isinstance(parameter, TyperOption):
-                parameter.rich_help_panel = GROUP_OF.get(parameter.name or "")
         # Arguments stay in front, in their order.
         self.params.sort(key=lambda p: order.get(getattr(p, "rich_help_panel", None) or "", -1))
 
     def get_params(self, ctx: Any) -> list[Any]:
         """Return the options; `{samplers}` in a help text becomes the names of a registry."""
         for parameter in self.params:
-            for placeholder, registry in REGISTRIES.items():
-                if isinstance(parameter, TyperOption) and placeholder in (parameter.help or ""):
-                    names = either(named(registry))
-                    parameter.help = (parameter.help or "").replace(placeholder, names)
+            if isinstance(parameter, TyperOption):
+                parameter.help = with_names(parameter.help or "")
         return super().get_params(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -125,64 +123,84 @@ class Given:
 
 
 JSON: Final = Annotated[
-    bool, typer.Option("--json", help="Print the result as one JSON object on standard output.")
+    bool,
+    typer.Option(
+        "--json",
+        help="Print the result as one JSON object on standard output.",
+        rich_help_panel=WHERE,
+    ),
 ]
+IN_ANY_CASE: Final = frozenset(one.name for one in fields(Execution))
+"""Keywords that decide nothing, which are passed on whether or not they were written."""
 
 
 class Commands(typer.Typer):
-    """An application whose commands are `GroupedCommand`s, with options of `OPTIONS` and --json."""
+    """An application of `GroupedCommand`s, with the options of records and --json."""
 
     def __init__(self, *, help: str, **options: Any) -> None:
         super().__init__(cls=CommandGroup, help=unwrapped(help), **options)
 
     def verb(
-        self,
-        name: str | None = None,
-        *,
-        options: Sequence[str] = (),
-        own: Mapping[str, Shared] | None = None,
+        self, record: type[Asked] | None = None, name: str | None = None
     ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-        """Register a function as a command; its docstring is the help.
+        """Register a function as a command; the docstring of the record is the help.
 
-        Its first parameter is `Given`, which has the options that are passed on to the API: shared
-        `options`, and its `own`. The other parameters are options that the function reads.
+        Its first parameter is `Given`, which has the options of the record. The other parameters
+        are arguments and options that the function reads.
         """
-        passed = {**(own or {}), **{option: OPTIONS[option] for option in options}}
-        keywords = {option: KEYWORDS.get(option, option) for option in passed}
+        passed = {} if record is None else options_of(record)
 
         def register(function: Callable[..., None]) -> Callable[..., None]:
             _, *read = inspect.signature(function, eval_str=True).parameters.values()
 
             def command(context: typer.Context, as_json: bool, **values: Any) -> None:
-                written = {
-                    name
-                    for name in passed
-                    if (source := context.get_parameter_source(name)) is not None
-                    and source.name == "COMMANDLINE"
+                given = {
+                    keyword: values.pop(keyword) or default
+                    if default == ()
+                    else values.pop(keyword)
+                    for keyword, (_, default) in passed.items()
                 }
-                given = {keywords[name]: values.pop(name) for name in passed}
-                named = {keywords[name]: given[keywords[name]] for name in written}
-                if "workers" in given:
-                    named["workers"] = given["workers"]
-                if "quiet" in given:
-                    given["progress"] = named["progress"] = not given.pop("quiet")
-                    named.pop("quiet", None)
-                function(Given(given, named, as_json), **values)
+                written = {
+                    keyword: value
+                    for keyword, value in given.items()
+                    if keyword in IN_ANY_CASE or _is_written(context, keyword)
+                }
+                function(Given(given, written, as_json), **values)
 
             parameters = [
                 _parameter("context", typer.Context),
                 *(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in read),
-                *(_parameter(name, *shared) for name, shared in passed.items()),
+                *(_of_option(keyword, *known) for keyword, known in passed.items()),
                 _parameter("as_json", JSON, default=False),
             ]
             command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
             command.__name__, command.__annotations__ = function.__name__, {}
             panel = PANEL_OF.get(name or function.__name__)
-            text = unwrapped(function.__doc__ or "")
+            text = unwrapped((function if record is None else record).__doc__ or "")
             self.command(name, cls=GroupedCommand, help=text, rich_help_panel=panel)(command)
             return function
 
         return register
+
+
+def _is_written(context: typer.Context, keyword: str) -> bool:
+    source = context.get_parameter_source(keyword)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+def _of_option(keyword: str, known: Option, default: Any) -> inspect.Parameter:
+    """Return a parameter of a command for a field of a record."""
+    shown = typer.Option(
+        *flags_of(keyword, known),
+        help=known.help,
+        metavar=known.metavar,
+        show_default=known.shown or True,
+        callback=known.parse,
+        rich_help_panel=known.group,
+    )
+    default = None if default == () else default
+    kind = known.kind if default is not None else known.kind | None
+    return _parameter(keyword, Annotated[kind, shown], default)
 
 
 def _parameter(

@@ -3,90 +3,57 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from merge_sumo import options
 from merge_sumo.commands.application import Given, app
-from merge_sumo.commands.options import (
-    HOSTING,
-    RUNNING,
-    SETUP,
-    VUT_AGAIN,
-    RunArgument,
-    flag,
-    option,
-    optional,
-)
 from merge_sumo.commands.printing import folder_of, print_json, quoted, say, show, stoppable
 from merge_sumo.errors import UserError
+from merge_sumo.options import TESTED, WHERE
 
 if TYPE_CHECKING:
     from merge_sumo.api import CaseRun
 
-SETTINGS: Final = (*("vut", "against", "level", "sampler", "cases", "in_flight", "seed"),)
-COORDINATES: Final = ("x", "v", "psi", "headway_ahead", "headway_behind")
+VutOption = Annotated[
+    str,
+    typer.Option(
+        metavar="SPEC",
+        help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
+        "`merge-sumo vuts` lists the kinds.",
+        rich_help_panel=TESTED,
+    ),
+]
+RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
-@app.verb(
-    options=(
-        *(
-            *SETTINGS,
-            "stop_when_converged",
-            "repeat",
-            "tolerate",
-            *SETUP,
-        ),
-        *RUNNING,
-    )
-)
+@app.verb(options.Campaign)
 def campaign(
     given: Given,
-    out: Annotated[
-        Path | None, typer.Option(help="New folder to write.", show_default="runs/VUT-DATE")
-    ] = None,
+    vut: VutOption = "",
     resume: Annotated[
         Path | None,
         typer.Option(
-            metavar="RUN", help="Go on with the campaign in this folder; --cases may be more."
+            metavar="RUN",
+            help="Go on with the campaign in this folder; --cases may be more.",
+            rich_help_panel=WHERE,
         ),
-    ] = None,
-    gate: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="GATE",
-            help='Exit with 1 if there are failures, errors, timeouts, "fmc>X": an FMC above X at '
-            "some level, or, with --against, regressions. May be given several times.",
-        ),
-    ] = None,
-    junit: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="New file to write for CI: JUnit XML.")
     ] = None,
 ) -> None:
-    """Test a VUT: run cases in SUMO, find failures, write a report and replayable scenarios.
-
-    Ctrl-C lets the running batch end and says how to go on; twice stops at once.
-
-    Exit code 1 when a --gate is met, and always when the VUT merged in no case: then
-    nothing was tested. 2 for bad use, 130, 141 or 143 when it was stopped, else 0.
-
-    Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
-
-    Example:  merge-sumo campaign --vut design1 --against design2 --level 0 --cases 40
-    """
     from merge_sumo import api
 
-    folder, gates = folder_of(out, resume, given.keywords["vut"]), gate or []
-    for_ci: dict[str, Any] = {"gates": gates, "junit": junit}
+    asked = given.keywords
+    folder = folder_of(asked["out"], resume, vut)
 
     def how_to_go_on() -> str:
-        return _how_to_go_on(folder, gates, junit)
+        return _how_to_go_on(folder, list(asked["gates"]), asked["junit"])
 
     with stoppable("batch", how_to_go_on) as check:
         if resume is None:
-            run = api.campaign(**given.keywords, **for_ci, out=folder, check=check)
+            run = api.campaign(vut, **{**asked, "out": folder, "check": check})
         else:
-            run = api.resume(folder, **given.written, **for_ci, check=check)
+            run = api.resume(folder, **{**given.written, "vut": vut or None, "check": check})
     given.print(run)
     for remark in run.remarks():
         say(remark)
@@ -106,46 +73,29 @@ def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
 
 
-@app.verb(
-    options=(*COORDINATES, *SETUP),
-    own={
-        "vut": VUT_AGAIN,
-        "level": optional(
-            str, "POV level: 0, 1, 2 or own.", show_default="0, with --case the campaign's"
-        ),
-        "debug": flag(
-            "Run the VUT in this process without a deadline: breakpoints work.", "--debug"
-        ),
-    },
-)
+@app.verb(options.Case)
 def run(
     given: Given,
     case: Annotated[
         tuple[Path, int] | None,
         typer.Option(
-            metavar="RUN INDEX", help="A case of a campaign instead; options given beside it win."
+            metavar="RUN INDEX",
+            help="A case of a campaign instead; options given beside it win.",
+            rich_help_panel=TESTED,
         ),
     ] = None,
     at: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=NUMBER", help="Any coordinate of the case, by its name in outcomes.jsonl."
+            metavar="NAME=NUMBER",
+            help="Any coordinate of the case, by its name in outcomes.jsonl.",
+            rich_help_panel=TESTED,
         ),
     ] = None,
-    gui: Annotated[
-        bool, typer.Option("--gui", help="Show it in sumo-gui while it runs, in real time.")
-    ] = False,
-    out: Annotated[
-        Path | None, typer.Option(help="New folder to keep it in, for `replay` and sumo-gui.")
-    ] = None,
 ) -> None:
-    """Run one case and show what happens: verdict, measures, and the motion second by second.
-
-    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use.
-
-    Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
-    """
     from merge_sumo import api
+
+    out, gui = given.keywords["out"], given.keywords["gui"]
 
     def ended(result: CaseRun) -> None:
         if given.as_json:
@@ -157,9 +107,8 @@ def run(
         if gui:
             say("close the window to go on")
 
-    options = given.keywords if case is None else given.written
-    options = {**options, **_coordinates(at or [])}
-    result = api.run(recorded=case, gui=gui, out=out, on_end=ended, **options)
+    asked = given.keywords if case is None else given.written
+    result = api.run(**{**asked, "recorded": case, "at": _coordinates(at or []), "on_end": ended})
     raise typer.Exit(0 if result.passed else 1)
 
 
@@ -175,10 +124,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
     return values
 
 
-@app.verb(
-    options=("level", *HOSTING, "pov", "policies", *RUNNING),
-    own={"vut": VUT_AGAIN},
-)
+@app.verb(options.Rerun)
 def rerun(
     given: Given,
     run: RunArgument,
@@ -193,20 +139,10 @@ def rerun(
             help="Change the simulation and not the VUT: a shorter step, an actuator that lags, "
             "limited power, a start that is off by the error of a sensor, longer cars. Failures "
             "that fail every time are robust.",
+            rich_help_panel=options.CASES,
         ),
     ] = False,
 ) -> None:
-    """Run recorded cases again with a changed VUT, and say which broke and which are fixed.
-
-    The cases are those of the old version's search: `campaign --against` searches where the new one
-    alone fails.
-
-    Exit code 1 when a case broke: it passed, and does not pass now.
-
-    Example:  merge-sumo rerun runs/design2 3 7 --vut design2
-
-    Example:  merge-sumo rerun runs/design2 --stress
-    """
     from merge_sumo import api
 
     if stress:
@@ -219,55 +155,22 @@ def rerun(
     raise typer.Exit(1 if result.worse else 0)
 
 
-@app.verb()
+@app.verb(options.Compare)
 def compare(
     given: Given,
     runs: Annotated[
         list[Path],
         typer.Argument(help="Folders of campaigns, the oldest first."),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="New HTML page to write: what changed, in which cases, and both motions.",
-        ),
-    ] = None,
-    junit: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="New file to write for CI: JUnit XML.")
-    ] = None,
 ) -> None:
-    """Compare recorded versions of a VUT: what broke, and what was fixed.
-
-    Everything is read from the records. Cases that two campaigns share are paired; where each has
-    cases of its own, regions of failures are compared, as a hint.
-
-    Exit code 1 when a case broke, or the last version was tested in no case.
-
-    Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
-    """
     from merge_sumo import api
 
-    result = api.compare(runs, out=out, junit=junit)
-    given.print(result, page=out)
+    result = api.compare(runs, **given.keywords)
+    given.print(result, page=given.keywords["out"])
     raise typer.Exit(1 if result.worse else 0)
 
 
-@app.verb(
-    own={
-        "file_format": option(
-            str,
-            "sumo",
-            "Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
-            "OpenSCENARIO and OpenDRIVE. csv: "
-            "one table of motion.",
-            "--format",
-        ),
-        "out": optional(
-            Path, "Folder to write into.", show_default="RUN/scenarios for sumo, else RUN/exports"
-        ),
-    },
-)
+@app.verb(options.Export)
 def export(
     given: Given,
     run: RunArgument,
@@ -276,10 +179,6 @@ def export(
         typer.Argument(help="Indices of cases in outcomes.jsonl; csv: all if left out."),
     ] = None,
 ) -> None:
-    """Write cases of a campaign for SUMO, for other simulators, or as a table.
-
-    Example:  merge-sumo export runs/design2 17 42
-    """
     from merge_sumo import api
 
     paths = api.export(run, case or None, **given.keywords)
@@ -300,20 +199,22 @@ def replay(
     case: Annotated[
         int | None, typer.Argument(help="Index of the campaign's case in outcomes.jsonl.")
     ] = None,
-    gui: Annotated[bool, typer.Option("--gui", help="Open it in sumo-gui.")] = False,
+    gui: Annotated[
+        bool, typer.Option("--gui", help="Open it in sumo-gui.", rich_help_panel=WHERE)
+    ] = False,
 ) -> None:
     """Replay a scenario in SUMO and check every position and speed against its record.
 
-    A case of a campaign that was not exported yet is exported first. Prints "identical" (exit
-    code 0) or "diverged at t = ..." (exit code 1).
+    A case of a campaign is exported first. Says "identical" (exit code 0) or
+    "diverged at t = ..." (exit code 1).
 
     Example:  merge-sumo replay scenarios/stalemate --gui
     """
     from merge_sumo import api
 
     if gui:
-        raise typer.Exit(api.open_in_gui(folder, case, **given.keywords))
-    result = api.replay(folder, case, **given.keywords)
+        raise typer.Exit(api.open_in_gui(folder, case))
+    result = api.replay(folder, case)
     given.print(result)
     raise typer.Exit(0 if result.identical else 1)
 

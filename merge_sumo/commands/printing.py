@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
+from merge_sumo import options
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Interrupt, Stopped
@@ -30,7 +34,25 @@ def show(line: object) -> None:
 
 def say(line: str) -> None:
     """Print a line for a person on standard error."""
-    typer.echo(printable(line), err=True)
+    typer.echo(printable(_in_flags(line)), err=True)
+
+
+@cache
+def _flags() -> dict[str, str]:
+    """Return the option of the command line by the keyword of Python."""
+    records = [one for one in vars(options).values() if is_dataclass(one) and isinstance(one, type)]
+    known = {
+        name: max(options.flags_of(name, one), key=len)
+        for record in records
+        if issubclass(record, options.Asked)
+        for name, (one, _) in options.options_of(record).items()
+    }
+    return {**known, "vut": "--vut", "recorded": "--case"}
+
+
+def _in_flags(sentence: str) -> str:
+    """Return a sentence of the API with options of the command line in the place of keywords."""
+    return re.sub(r"`(\w+)`", lambda found: _flags().get(found[1], found[0]), sentence)
 
 
 def print_json(record: dict[str, Any]) -> None:

@@ -67,7 +67,7 @@ def policies_in(folder: str | Path) -> Path:
         if shipped is not None:
             if (Path(folder) / MANIFEST).is_file() and Path(folder).resolve() != shipped.resolve():
                 raise UserError(
-                    f"--policies: {folder} is a shipped library and a folder here: name the folder "
+                    f"`policies`: {folder} is a shipped library and a folder here: name the folder "
                     "by its whole path, or another folder to run in"
                 )
             return shipped

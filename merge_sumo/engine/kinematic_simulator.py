@@ -125,7 +125,7 @@ class KinematicSimulator(Simulator):
         where = ", ".join(f"{name} {getattr(case, name)!r}" for name in fields)
         raise UserError(
             f"the case {where} at level {case.level} ends otherwise in SUMO ({_said(sumo)}) than "
-            f"by the equations of motion alone ({_said(kinematic)}): choose --engine sumo"
+            f"by the equations of motion alone ({_said(kinematic)}): choose `engine` sumo"
         )
 
     def _close_sumo(self) -> None:

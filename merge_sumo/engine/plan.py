@@ -86,8 +86,8 @@ class SimulationPlan:
         """
         if not self.scenario.sense.is_perfect and self.vut.vut.vut_type is not None:
             raise UserError(
-                f"the VUT {self.vut.spec} sees other cars in SUMO itself, where --sense does not "
-                "reach: leave it away (--act is for every VUT)"
+                f"the VUT {self.vut.spec} sees other cars in SUMO itself, where `sense` does not "
+                "reach: leave it away (`act` is for every VUT)"
             )
         if not self.policies_sha256:
             object.__setattr__(self, "policies_sha256", self.povs.sha256())
@@ -123,7 +123,7 @@ class SimulationPlan:
         if engine not in list(Engine):
             raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
         if engine == Engine.KINEMATIC and self.needs_sumo is not None:
-            raise UserError(f"--engine kinematic: {self.needs_sumo}; choose --engine sumo")
+            raise UserError(f"`engine` kinematic: {self.needs_sumo}; choose `engine` sumo")
         return replace(self, engine=Engine(engine))
 
     @property

@@ -165,7 +165,7 @@ class RepairSettings:
     def __post_init__(self) -> None:
         """Raise `UserError` for values that make no search."""
         if not self.ranges:
-            raise UserError("name what may change: --param NAME=LOW..HIGH")
+            raise UserError("name what may change: `params` NAME=LOW..HIGH")
         least = 1 + 2 * len(self.ranges)
         for option, number, lowest in (
             ("trials", self.trials, least),
@@ -378,7 +378,7 @@ def require_optuna() -> None:
 ASKED: Final = {
     "cases_sha256": "the record of the campaign",
     "vut_files": "a file of the controller",
-    "parameters": "--param",
+    "parameters": "`params`",
     "versions": "the version of a package",
 }
 """What a setting of a repair is called where it differs; others are options of that name."""
@@ -681,7 +681,7 @@ class Search:
             ends = found[1 + 2 * place : 3 + 2 * place]
             if not any(trial.differs or trial.refused for trial in ends):
                 raise UserError(
-                    f"--param {one.name} has no effect on any case, be it {one.low:g} or "
+                    f"`params` {one.name} has no effect on any case, be it {one.low:g} or "
                     f"{one.high:g}: leave it out, or name what the controller reads"
                 )
 

@@ -97,7 +97,7 @@ class Scale:
 
     def __post_init__(self) -> None:
         if self.seeds < 1:
-            raise UserError(f"--seeds is {self.seeds}: it must be 1 or more")
+            raise UserError(f"`seeds` is {self.seeds}: it must be 1 or more")
 
 
 def quick(seeds: int) -> Scale:

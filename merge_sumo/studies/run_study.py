@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import UserError, notice
 from merge_sumo.system.hashing import files_now
 from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
@@ -45,7 +44,7 @@ class RunStudy:
         today, run = self.record(), self.run
         for name, difference in (
             ("net_sha256", f"another net than {self.plan.road.path} is now: put that back"),
-            ("policies_sha256", "other policies: name what it was run with, --policies"),
+            ("policies_sha256", "other policies: name what it was run with, `policies`"),
         ):
             if run.settings.get(name) != today[name]:
                 raise UserError(f"{run.folder} was run with {difference}")
@@ -78,9 +77,7 @@ def notice_changes(run: Run, plan: SimulationPlan) -> None:
             continue
         now = files_now(known, files)
         if differing := [file for file, sha256 in known.items() if now[file] != sha256]:
-            warnings.warn(
+            notice(
                 f"note: {printable(differing[0])} is not as it was in {run.folder}: {spec} may "
-                "drive otherwise than it did there",
-                Notice,
-                stacklevel=4,
+                "drive otherwise than it did there"
             )

@@ -151,7 +151,7 @@ class Repeats:
         """Check that the numbers mean something."""
         check_tolerated(self.tolerated)
         if self.most < 1:
-            raise UserError(f"--repeat is {self.most}: it must be 1 or more")
+            raise UserError(f"`repeat` is {self.most}: it must be 1 or more")
 
 
 OnCases = Callable[[int], None]

@@ -2,54 +2,24 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Final, Unpack
-
-from merge_sumo import api
+from merge_sumo import api, options
 from merge_sumo.analysis.coordinates import described
-from merge_sumo.api.keywords import Settings
 from merge_sumo.api.results import CampaignRun
+from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.reports.motion import verdict_of
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
-from merge_sumo.vuts.in_memory import AnyVut
-
-DEFAULT_CASES: Final = 200
-"""Cases of an assertion: seconds for a controller that answers at once."""
 
 
-def assert_no_failures(
-    vut: AnyVut,
-    *,
-    out: Path | str | None = None,
-    workers: int = 1,
-    **settings: Unpack[Settings],
-) -> CampaignRun:
-    """Test a VUT in a campaign, and raise `AssertionError` where a case fails or ends in an error.
-
-    Args:
-        vut: vehicle under test: a spec, a class, a function, or an object.
-        out: new folder to write; `runs/<vut>-<date>` by default.
-        workers: processes that run cases; the outcomes are the same.
-        settings: as of `merge_sumo.campaign`, with 200 `cases` by default; `fail_when` says what
-            counts as a failure.
-
-    Returns:
-        The campaign, where nothing fails. A timeout is no failure, unless `fail_when` says so.
-
-    Raises:
-        AssertionError: where a case fails, ends in an error, or no case reaches the merge point.
-            The message names the counts, the worst case, the report, and the command that
-            replays the case.
-        UserError: for values that make no campaign.
-    """
+@verb(options.NoFailures)
+def assert_no_failures(asked: options.NoFailures) -> CampaignRun:
+    """Test a VUT in a campaign, and raise where a case fails or ends in an error."""
     __tracebackhide__ = True
-    settings.setdefault("cases", DEFAULT_CASES)
-    run = api.campaign(vut, out=out, workers=workers, progress=False, **settings)
-    message = _message(run, settings.get("seed", 0))
+    run = api.campaign(**{**asked.values(), "progress": False})
+    message = _message(run, asked.seed)
     if message is not None:
         raise AssertionError(message)
     return run

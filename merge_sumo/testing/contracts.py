@@ -311,13 +311,13 @@ class ExportContract:
     def test_replaces_nothing(self) -> None:
         with tempfile.TemporaryDirectory() as scratch:
             path = self.written(Path(scratch) / "new")
-            before = path.read_bytes()
+            path.write_bytes(b"of somebody else")
             try:
                 self.written(Path(scratch) / "new")
             except UserError:
-                assert path.read_bytes() == before
+                assert path.read_bytes() == b"of somebody else"
             else:
-                raise AssertionError("an existing file is a UserError")
+                raise AssertionError("another file in its place is a UserError")
 
 
 class ReportSectionContract:

@@ -155,7 +155,7 @@ def train_library(
     if a_min_mps2 is not None and not scenario.a_min_mps2 <= a_min_mps2 < 0.0:
         raise UserError(
             f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose a number from "
-            f"{scenario.a_min_mps2:g} to below 0, such as --a-min {scenario.a_min_mps2 / 2:g}"
+            f"{scenario.a_min_mps2:g} to below 0, such as `a_min` {scenario.a_min_mps2 / 2:g}"
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road = road_for(scenario)
@@ -174,7 +174,7 @@ def train_library(
                 if known:
                     raise UserError(
                         f"{folder} has a {name} of another scenario, seed, opponent or setting: "
-                        "choose another folder with --out, or remove it first"
+                        "choose another folder with `out`, or remove it first"
                     )
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
@@ -203,7 +203,7 @@ def _take(folder: Path) -> None:
     try:
         if any(folder.iterdir()):
             raise UserError(
-                f"{folder} holds other things than policies: choose another folder with --out"
+                f"{folder} holds other things than policies: choose another folder with `out`"
             )
     except OSError as error:
         raise cannot_write(folder, error) from error
@@ -239,7 +239,7 @@ def _plan(
         if not plays_as(scenario_of(entry), scenario):
             raise UserError(
                 f"the {opponent} of {folder} was trained for another scenario, "
-                f"{scenario_of(entry).name}: choose another folder with --out"
+                f"{scenario_of(entry).name}: choose another folder with `out`"
             )
         opponent_sha256 = entry["sha256"]
     return {

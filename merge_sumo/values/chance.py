@@ -156,7 +156,7 @@ def check_tolerated(tolerated: float) -> None:
     """Raise `UserError` for what is no share of runs that may fail."""
     if not 0.0 <= tolerated < 1.0:
         raise UserError(
-            f"--tolerate is {tolerated}: choose the share of its runs in which a case may fail, "
+            f"`tolerated` is {tolerated}: choose the share of its runs in which a case may fail, "
             "from 0 to below 1, say 0.1"
         )
 

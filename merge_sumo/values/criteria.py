@@ -36,4 +36,4 @@ CRITERIA: Final[Registry[NamedCriterion]] = Registry(
     accepts=lambda item: isinstance(item, NamedCriterion),
     contract="a merge_sumo.values.criteria.NamedCriterion",
 )
-"""Criteria by the name that a person writes after `--fail-when`."""
+"""Criteria by the name that a person writes after `fail_when`."""

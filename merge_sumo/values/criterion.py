@@ -67,12 +67,12 @@ class Criterion:
         name = self.fail_when.strip()
         if name not in CRITERIA:
             if name.isidentifier() and (near := nearest(name, CRITERIA)):
-                raise UserError(f"--fail-when is {printable(name)!r}: did you mean {near[0]}?")
-            _, name = parse_condition(self.fail_when, vocabulary(), "--fail-when", _conditions())
+                raise UserError(f"`fail_when` is {printable(name)!r}: did you mean {near[0]}?")
+            _, name = parse_condition(self.fail_when, vocabulary(), "`fail_when`", _conditions())
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
             if name != PAPER:
-                raise UserError("--fail-when and --require both say what a failure is: choose one")
+                raise UserError("`fail_when` and `require` both say what a failure is: choose one")
             object.__setattr__(self, "require", check_formula(self.require))
 
     def check(self, scenario: Scenario) -> None:
@@ -82,7 +82,7 @@ class Criterion:
         """
         if self.is_papers and not isinstance(scenario, MergeScenario):
             raise UserError(
-                f"--fail-when {PAPER} is of merges, and {scenario.name} is of kind "
+                f"`fail_when` {PAPER} is of merges, and {scenario.name} is of kind "
                 f"{scenario.kind}: choose {scenario.criterion}, or a condition"
             )
         if self.require is not None:
@@ -92,12 +92,12 @@ class Criterion:
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
             where = scenario.said("behind M")
             raise UserError(
-                f"--fail-when speaks of {min(named)}, which is measured {where}: say how long "
-                "with --follow-up SECONDS"
+                f"`fail_when` speaks of {min(named)}, which is measured {where}: say how long "
+                "with `follow_up_s` SECONDS"
             )
         if lane_of(scenario) is None and (named := spoken.intersection(ON_LANE)):
             raise UserError(
-                f"--fail-when speaks of {min(named)}, and {scenario.name} has no acceleration "
+                f"`fail_when` speaks of {min(named)}, and {scenario.name} has no acceleration "
                 "lane: choose a scenario with one, such as us23-lane"
             )
 
@@ -181,7 +181,7 @@ PAPER_CRITERION: Final = Criterion()
 @lru_cache
 def condition_of(text: str) -> Condition:
     """Return the condition that a criterion states, by its words."""
-    return parse_condition(text, vocabulary(), "--fail-when", _conditions())[0]
+    return parse_condition(text, vocabulary(), "`fail_when`", _conditions())[0]
 
 
 def vocabulary() -> Vocabulary:

@@ -49,9 +49,9 @@ def check_formula(text: str) -> str:
 
     Whether it is one as a whole, `try_formula` says.
     """
-    what = f"--require {printable(text[:80])!r}"
+    what = f"`require` {printable(text[:80])!r}"
     if len(text) > MOST_CHARACTERS:
-        raise UserError(f"--require has {len(text)} characters: {MOST_CHARACTERS} are the most")
+        raise UserError(f"`require` has {len(text)} characters: {MOST_CHARACTERS} are the most")
     place = depth = 0
     while place < len(text):
         token = _TOKEN.match(text, place)
@@ -87,16 +87,16 @@ def try_formula(text: str) -> None:
     except ImportError as error:
         how = "pip install 'merge-sumo[stl]'"
         if sys.version_info[:2] > LAST_PYTHON:
-            how = "it runs up to Python {}.{}; use that, or a condition with --fail-when".format(
+            how = "it runs up to Python {}.{}; use that, or a condition with `fail_when`".format(
                 *LAST_PYTHON
             )
-        raise UserError(f"--require needs rtamt: {how}") from error
+        raise UserError(f"`require` needs rtamt: {how}") from error
     except UserError:
         raise
     # A parser that is not ours.
     except Exception as error:
         raise UserError(
-            f"--require {text[:80]!r} is no formula of signal temporal logic such as 'always "
+            f"`require` {text[:80]!r} is no formula of signal temporal logic such as 'always "
             f"((x_vut_m > -20) implies (bumper_gap_m > 2))': {printable(str(error))[:200]}"
         ) from error
 
@@ -137,7 +137,7 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
     for node, part in specification.ast.offline_results.items():
         if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
             raise UserError(
-                f"--require {printable(text[:80])!r} calculates with infinity: prev and next are "
+                f"`require` {printable(text[:80])!r} calculates with infinity: prev and next are "
                 "infinite where no step is, so put them around a comparison, not into it; and "
                 "write no number that large"
             )

@@ -7,11 +7,11 @@ here under a name of its own, `here:Name`, and drives in the process that runs t
 from __future__ import annotations
 
 import sys
-import warnings
 from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final, Protocol, SupportsFloat
 
+from merge_sumo.errors import notice
 from merge_sumo.system.workers import AnyWorkers, workers_or_cores
 from merge_sumo.vuts.base import HERE, Seen, VutOptions, VutSpec
 from merge_sumo.vuts.here import object_of, objects, vut_of_object
@@ -82,9 +82,7 @@ def travels(spec: VutSpec) -> bool:
     return not any(name.encode() in content for name in MAINS)
 
 
-def drivers_of(
-    vut: Any, pov: Any, workers: AnyWorkers, *, stacklevel: int = 3
-) -> tuple[str, str | None, AnyWorkers]:
+def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None, AnyWorkers]:
     """Return the specs of what drives, and which workers can have it.
 
     Says in a sentence where something drives in this process that could do it harm.
@@ -108,7 +106,7 @@ def drivers_of(
                 "does wrong may end everything; put its class or function into a module for a "
                 "process of its own"
             )
-        warnings.warn(why, stacklevel=stacklevel)
+        notice(why, UserWarning)
     return *specs, workers
 
 

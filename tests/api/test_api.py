@@ -76,7 +76,7 @@ class TestACampaign:
         assert (again.folder / "report.html").is_file()
 
     def test_with_values_that_make_none_is_refused(self, tmp_path):
-        with pytest.raises(ms.UserError, match="--cases"):
+        with pytest.raises(ms.UserError, match="`cases`"):
             ms.campaign("level0", level=0, cases=0, out=tmp_path / "r")
         assert not (tmp_path / "r").exists()
 

@@ -149,7 +149,7 @@ class TestRefuses:
     @pytest.mark.parametrize(
         ("changes", "sentence"),
         [
-            ({"in_flight": 4}, "--in-flight does not go with --against"),
+            ({"in_flight": 4}, "`in_flight` does not go with `against`"),
             ({"against": "traci"}, "name an earlier version that needs none"),
             ({"against": "new.py:f"}, "name two versions"),
         ],

@@ -66,8 +66,8 @@ class TestTheCommand:
         [
             (SAFE, "say with --vut who drives"),
             (("--vut", "my_vut.py", *SAFE), "my_vut.py:NAME"),
-            (("--vut", "design2", "--x", "-300"), "--v (v_pov0_mps) is missing"),
-            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi (svo_rad) is none of"),
+            (("--vut", "design2", "--x", "-300"), "--v is missing"),
+            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi is none of"),
             (("--vut", "design2", *SAFE, "--headway-ahead", "2"), "--headway-ahead"),
             (("--vut", "design2", "--level", "2", "--x", "-300", "--v", "34"), "--psi"),
             (("--vut", "design9", *SAFE), "design9"),

@@ -256,7 +256,7 @@ class TestTheCommand:
             (("--seed", "9"), "seed differs"),
             (("--level", "1"), "levels differs"),
             (("--out", "elsewhere"), "leave --out away"),
-            (("--cases", "0"), "--cases is 0"),
+            (("--cases", "0"), "`cases` is 0"),
         ],
     )
     def test_refuses_in_a_sentence(self, folder, options, sentence):

@@ -86,7 +86,7 @@ class TestARunFolder:
     ) -> None:
         for command in verbs(mine / "run", tmp_path):
             said = command_line(*command)
-            assert_refused(said, "a run folder names no code to run: name it again, --vut SPEC")
+            assert_refused(said, "a run folder names no code to run: name it again with --vut")
         for command in (("report", "run"), ("replay", "run", 0)):
             assert command_line(*command)[0] == 0
         assert command_line("compare", "run", "run")[0] == 0
@@ -132,7 +132,7 @@ class TestARunFolder:
             few = {"cases": 4, "batch": 2, "sampler": "uniform"}
             run_campaign(campaign_settings(**given, **few), Path(name))
             ran(mine)
-            assert_refused(command_line("campaign", "--resume", name, "-q"), f"--{name} SPEC")
+            assert_refused(command_line("campaign", "--resume", name, "-q"), f"again with --{name}")
             assert not ran(mine)
             again = shlex.split(named_again(read_settings(Path(name))))
             assert command_line("rerun", name, 0, *again, "-q")[0] == 0

@@ -285,10 +285,10 @@ class TestAhead:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"in_flight": 0}, "--in-flight is 0: it must be 1 or more"),
+        ({"in_flight": 0}, "`in_flight` is 0: it must be 1 or more"),
         ({"in_flight": 8, "batch": 4}, "leave one of them away"),
         ({"in_flight": 90, "cases": 80}, "no more cases can be in flight"),
-        ({"in_flight": 8, "sampler": "uniform"}, "--sampler uniform waits for none"),
+        ({"in_flight": 8, "sampler": "uniform"}, "`sampler` uniform waits for none"),
     ],
 )
 def test_nonsense_is_refused_in_a_sentence(changes, sentence):

@@ -16,8 +16,8 @@ import typer
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.commands.application import unwrapped
-from merge_sumo.commands.options import GROUP_OF, GROUPS, PANELS
+from merge_sumo.commands.application import PANELS, unwrapped
+from merge_sumo.options import GROUPS
 
 ENDS = ".", ":", "!", "?"
 
@@ -64,27 +64,20 @@ class TestOptions:
     @pytest.mark.parametrize("name", COMMANDS)
     def test_stand_in_groups(self, name):
         options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
-        assert [p.name for p in options if p.name != "help" and p.name not in GROUP_OF] == []
         groups = [p.rich_help_panel for p in options if p.name != "help"]
-        order = list(GROUPS)
-        assert groups == sorted(groups, key=order.index)
-
-    def test_have_one_group_and_are_somewhere(self):
-        used = {p.name for command in COMMANDS.values() for p in command.params}
-        assert sum(map(len, GROUPS.values())) == len(GROUP_OF)
-        assert set(GROUP_OF) - used == set()
+        assert groups == sorted(groups, key=GROUPS.index)
 
     def test_are_the_same_wherever_they_make_sense(self):
         has = {
             option: {name for name, c in COMMANDS.items() if option in {p.name for p in c.params}}
-            for option in ("as_json", "quiet", "workers", "level")
+            for option in ("as_json", "progress", "workers", "level")
         }
         assert set(COMMANDS) == has["as_json"]
         again = {"explain", "repair"}
         fresh = {*again, "probability"}
         runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
         assert has["workers"] == {*runs_cases, "reproduce"}
-        assert has["quiet"] == {*runs_cases, "reproduce", "train"}
+        assert has["progress"] == {*runs_cases, "reproduce", "train"}
         assert has["level"] == {*runs_cases, "run"} - fresh
 
 
