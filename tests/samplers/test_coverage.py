@@ -221,3 +221,11 @@ class TestTheTrust:
 
     def test_is_small_where_they_did_not(self):
         assert Calibration(self.history(failing_late=False)).factors.min() < 0.5
+
+
+def test_a_margin_fails_with_the_mass_of_a_normal_between_its_limits():
+    points = np.array([[0.0], [0.5], [1.0]])
+    margin = Margin(points, np.array([-2.0, 0.0, 2.0]), -1.0, 1.0, rough=False)
+    # P(-1 < N(1, 0.5^2) < 1) = Phi(0) - Phi(-4), and the same below 0
+    chances = margin.probability(np.array([1.0, -1.0]), np.array([0.25, 0.25]))
+    assert chances == pytest.approx([0.5 - 3.167124e-5] * 2, abs=1e-9)

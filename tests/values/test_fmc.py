@@ -327,3 +327,9 @@ class TestTheBoundOfGrowth:
             growths.append(after - before)
         assert np.mean(growths) <= np.mean(bounds)
         assert np.mean(growths) >= 0.4 * np.mean(bounds)
+
+
+def test_points_far_apart_about_the_middle_are_refused_and_near_ones_far_out_are_not():
+    with pytest.raises(ValueError, match="span"):
+        fmc(np.array([[-1e6], [1e6]]), radius=1.0)
+    assert fmc(np.array([[1e7]]), radius=1.0) == pytest.approx(2.0)
