@@ -12,14 +12,15 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.records import Record, convert, decode, replaced, to_plain
+from merge_sumo.system.records import Record, decode, record_type, replaced, to_plain
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import Dimension, Scenario
 
+Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[
-    tuple[Annotated[float, Meta(ge=0.0)], ...],
-    Meta(min_length=1, description="weights, numbers of 0 or more"),
+    tuple[Weight, ...], Meta(min_length=1, description="weights, numbers of 0 or more")
 ]
+ByLevel = Annotated[dict[str, Weight], Meta(description="weights, numbers of 0 or more, by level")]
 
 
 class Uniform(Record, frozen=True, tag_field="kind", tag="uniform"):
@@ -147,69 +148,46 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
     A normal distribution is cut off at the pool's bounds. Raises `UserError` with the place in the
     file where it is no distribution over the cases of `levels`.
     """
-    stated: dict[str, Any] = {}
+    coordinates = scenario.dimensions(2)
+    fields = [(d.field, Marginal, Uniform()) for d in coordinates]
+    even = dict.fromkeys(map(str, levels), 1.0)
+    kind = record_type("distribution", [("levels", ByLevel | None, None), *fields])
     try:
-        if path is not None:
-            stated = decode(path.read_bytes(), dict[str, Any])
-        coordinates = {d.field: d for d in scenario.dimensions(2)}
-        for name in stated.keys() - {"levels", *coordinates}:
-            known = ", ".join(["levels", *coordinates])
-            raise UserError(f"it has {name!r}: it may have {known}")
-        weights = _level_weights(stated.get("levels"), levels)
-        marginals = {
-            name: _marginal(stated.get(name, {"kind": "uniform"}), d)
-            for name, d in coordinates.items()
-        }
+        stated = kind() if path is None else decode(path.read_bytes(), kind)
+        marginals = {d.field: _in_pool(getattr(stated, d.field), d) for d in coordinates}
+        weights = even if stated.levels is None else stated.levels
+        if not weights or not weights.keys() <= even.keys():
+            known = ", ".join(sorted(even))
+            raise UserError(f"levels must give weights to levels of the campaign: {known}")
+        total = sum(weights.values())
+        if not 0.0 < total < math.inf:
+            raise UserError("levels must have weights that are not all 0, and finite")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    return Distribution(weights, marginals, scenario)
+    shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
+    return Distribution(shares, marginals, scenario)
 
 
-def _level_weights(stated: object, levels: Sequence[int]) -> dict[int, float]:
-    """Return the chance of each level that has one; they add up to 1."""
-    if stated is None:
-        return {level: 1.0 / len(levels) for level in levels}
-    try:
-        weights = convert(stated, dict[str, Annotated[float, Meta(ge=0.0)]])
-    except UserError as error:
-        raise UserError("levels must be weights, numbers of 0 or more, by level") from error
-    able = {str(level) for level in levels}
-    if not weights or not weights.keys() <= able:
-        known = ", ".join(sorted(able))
-        raise UserError(f"levels must give weights to levels of the campaign: {known}")
-    total = sum(weights.values())
-    if not 0.0 < total < math.inf:
-        raise UserError("levels must have weights that are not all 0, and finite")
-    return {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
+def _in_pool(stated: Marginal, d: Dimension) -> Marginal:
+    """Return a distribution of a coordinate with the bounds of the pool where it has none.
 
-
-def _marginal(stated: object, d: Dimension) -> Marginal:
-    """Return a distribution of a coordinate that lies within the pool."""
-    try:
-        found: Marginal = convert(stated, Marginal)  # type: ignore[arg-type]
-        return _bins_within(found, d) if isinstance(found, Histogram) else _bounded(found, d)
-    except UserError as error:
-        raise UserError(f"{d.field}: {error}") from error
-
-
-def _bounded(stated: Uniform | Normal, d: Dimension) -> Marginal:
+    Raises `UserError` where it reaches out of the pool, or never comes to it.
+    """
+    if isinstance(stated, Histogram):
+        stated.check()
+        if stated.edges[0] < d.low or stated.edges[-1] > d.high:
+            raise UserError(f"{d.field}: edges must be within the pool, {d.low:g} to {d.high:g}")
+        return stated
     low = d.low if stated.low is None else stated.low
     high = d.high if stated.high is None else stated.high
     if not d.low <= low < high <= d.high:
         raise UserError(
-            f"low is {low:g} and high {high:g}: choose low < high within the pool, "
+            f"{d.field}: low is {low:g} and high {high:g}: choose low < high within the pool, "
             f"{d.low:g} to {d.high:g}"
         )
     bounded = replaced(stated, low=low, high=high)
     if not np.isfinite(bounded.quantile(np.array([0.01, 0.5, 0.99]))).all():
-        raise UserError("such a normal distribution never comes to the pool")
+        raise UserError(f"{d.field}: such a normal distribution never comes to the pool")
     return bounded
-
-
-def _bins_within(stated: Histogram, d: Dimension) -> Histogram:
-    stated.check()
-    if stated.edges[0] < d.low or stated.edges[-1] > d.high:
-        raise UserError(f"edges must be within the pool, {d.low:g} to {d.high:g}")
-    return stated

@@ -4,26 +4,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from campaigning import run_campaign
 from lxml import html
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.values.case import from_unit
 from merge_sumo.values.scenario import US23
 
 CONTROLLERS = Path(__file__).parents[2] / "tools" / "chance_vuts.py"
@@ -113,29 +107,3 @@ def tail(chance: float, failures: int, *, upper: bool) -> float:
         math.comb(RUNS, number) * chance**number * (1.0 - chance) ** (RUNS - number)
         for number in numbers
     )
-
-
-def test_controllers_of_the_comparison_fail_as_their_closed_form_says():
-    spec = importlib.util.spec_from_file_location("chance_vuts", CONTROLLERS)
-    known = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(known)
-    plan = resolve(CampaignSettings(vut=f"{CONTROLLERS}:Slope", levels=(0,), scenario=US23))
-    # Along the line on which both arrive together, at nine speeds of the POV, and beside it.
-    v_mps = np.repeat(np.linspace(26.0, 34.0, 9), 3)
-    x_m = -known.usual_gap_m(0.0, v_mps, np.array(-182.0), np.array(18.0))
-    x_m = x_m + np.tile([0.0, 7.5, -8.5], 9)
-    points = np.column_stack([(x_m + 340.0) / 160.0, (v_mps - 25.0) / 10.0])
-    chance = known.Slope.chance(x_m, v_mps)
-    expected = np.outer(np.linspace(0.1, 0.9, 9), [1.0, 1.0, 0.0])
-    assert chance.reshape(9, 3) == pytest.approx(expected)
-    cases = from_unit(points, 0, scenario=US23)
-    draws = [replace(case, draw=draw) for case in cases for draw in range(20)]
-    ran = list(run_cases(plan.for_cases(len(draws)), draws))
-    share = np.array([one.outcome.measures.is_close for one in ran]).reshape(-1, 20).mean(axis=1)
-    assert share[chance == 0.0].max() == 0.0
-    inside = chance > 0.0
-    # 18 cases with 20 runs each: the mean lies within three standard deviations.
-    off = share[inside].mean() - chance[inside].mean()
-    assert abs(off) < 3.0 * math.sqrt((chance * (1 - chance))[inside].mean() / (20 * inside.sum()))
-    by_speed = share[inside].reshape(9, 2).mean(axis=1)
-    assert by_speed[-2:].mean() > by_speed[:2].mean() + 0.4

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
-from PIL import Image
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
@@ -66,9 +65,8 @@ class TestTheMaps:
         assert axes.get_title("right") == "1 of 2 fail, FMC 0.0079"
 
     def test_of_no_failures_are_drawn_too(self, tmp_path):
-        for dims, level in ((2, 1), (3, 2)):
-            safe = Panel(np.full((3, dims), 0.5), np.zeros(3, dtype=bool), 0.0)
-            figures.save(figures.maps("t", {"gpr": safe}, level), tmp_path / f"{level}.png")
+        safe = Panel(np.full((3, 3), 0.5), np.zeros(3, dtype=bool), 0.0)
+        figures.save(figures.maps("t", {"gpr": safe}, 2), tmp_path / "2.png")
 
 
 @pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])
@@ -101,12 +99,6 @@ class TestAFile:
         for path in (first, second):
             figures.save(curves(), path)
         assert first.read_bytes() == second.read_bytes()
-
-    def test_can_be_looked_at(self, tmp_path):
-        figures.save(curves(), tmp_path / "f.png")
-        with Image.open(tmp_path / "f.png") as image:
-            assert image.size[0] > 1000
-            assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50, "it is not one colour"
 
     def test_without_matplotlib_is_refused_in_a_sentence(self, tmp_path, monkeypatch):
         def refuse(name: str):

@@ -346,8 +346,8 @@ class TestWhatIsSaid:
             assert (impact is None) == (word != "contact")
 
     def test_in_words_is_true_of_the_cases_that_it_counts(self, campaign):
-        facts = ReportModel(campaign)
-        for box in facts.boxes:
+        model = ReportModel(campaign)
+        for box in model.boxes:
             inside = [
                 o
                 for o in campaign.outcomes
@@ -356,5 +356,5 @@ class TestWhatIsSaid:
             ]
             failing = [o for o in inside if abs(o.measures.dx_m or NEAR_M) < NEAR_M]
             assert (len(failing), len(inside)) == (box.failures, box.cases)
-        for index, kind in facts.kinds.items():
+        for index, kind in model.kinds.items():
             check_kind(kind.value, Told(campaign.trajectory(index)))

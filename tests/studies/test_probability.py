@@ -190,7 +190,7 @@ class TestADistribution:
             ({"levels": {"0": -1, "1": 2}}, "0 or more"),
             ({"levels": {"0": 0}}, "not all 0"),
             ({"levels": {"0": True}}, "numbers of 0 or more"),
-            ({"x_pov0_m": 3}, "x_pov0_m: it is 3: it must be a table"),
+            ({"x_pov0_m": 3}, "x_pov0_m is 3: it must be a table"),
             ({"x_pov0_m": {"kind": "beta"}}, "'beta'"),
             ({"x_pov0_m": {"kind": "uniform", "min": 0}}, "'min'"),
             ({"x_pov0_m": {"kind": "uniform", "low": -400}}, "-340 to -180"),
