@@ -60,7 +60,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """When VUT and POV began to brake, if they did, and otherwise whether they gained speed.
+    """The course of an episode: when VUT and POV began to brake, or whether they gained speed.
 
     A failure under the paper's rule has a kind; no other episode has one.
     """
@@ -149,7 +149,7 @@ def _due_s(row: int, case: Case) -> float:
 
 
 def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
-    """Return what regions of a level are bounded in.
+    """Return the axes in which regions of a level are bounded.
 
     Of a merge it is beside the coordinates the time at which a car would reach M at constant speed:
     failures lie in bands along which it is the same.

@@ -1,4 +1,4 @@
-"""How often cases occur, as somebody states it: levels and coordinates, each by itself."""
+"""The distribution of cases that somebody states: levels and coordinates, each by itself."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ Marginal = Uniform | Normal | Histogram
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """What is said about how often cases occur: weights of levels, and independent coordinates.
+    """The probabilities of cases: weights of levels, and independent coordinates.
 
     Attributes:
         levels: probability of each level; they add up to 1.

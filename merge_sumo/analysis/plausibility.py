@@ -20,7 +20,7 @@ _THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?
 
 
 def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
-    """Return what is odd about the outcomes of a campaign; nothing for most.
+    """Return sentences on what is odd about the outcomes of a campaign; none for most.
 
     Of a criterion that says the same of all cases, a neighbour that would not.
     """

@@ -16,7 +16,7 @@ from merge_sumo.values.trajectory import End
 
 @dataclass(frozen=True, slots=True)
 class LevelSummary:
-    """What was found at one POV level.
+    """The findings at one POV level.
 
     Attributes:
         cases: cases that ran.
@@ -38,7 +38,7 @@ class LevelSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What was found in all: totals, ends and severities of episodes by name, and each level."""
+    """The findings of a campaign: totals, ends and severities by name, and each level."""
 
     cases: int
     failures: int

@@ -60,7 +60,7 @@ class Trouble:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What became of the cases of a campaign.
+    """The outcome of the cases of a campaign in numbers.
 
     Attributes:
         cases: cases that ran.
@@ -106,7 +106,7 @@ class Verdict:
         return f"{counts}{contacts} in {counted(self.cases, 'case')}"
 
     def trouble_lines(self) -> list[str]:
-        """Return what ended in an error or a timeout, by message; empty where nothing did."""
+        """Return lines on errors and timeouts by message; none where there are none."""
         said = [
             f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
             f"{trouble.message}"
@@ -119,7 +119,7 @@ class Verdict:
         return said
 
     def to_record(self) -> dict[str, Any]:
-        """Return what JSON shows of contacts, errors and timeouts."""
+        """Return contacts, errors and timeouts as JSON has them."""
         return {
             "contacts": self.contacts,
             "errors": self.errors,
@@ -210,7 +210,7 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
-    """Whether a campaign meets a gate, and what it shows."""
+    """The result of a gate: whether a campaign meets it, and the number found."""
 
     name: str
     met: bool

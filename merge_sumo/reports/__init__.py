@@ -1,1 +1,1 @@
-"""What people see: verdicts, pages, figures, tables, files for other tools."""
+"""Pages, figures, tables, and files for other tools: read from files, nothing is simulated."""

@@ -23,21 +23,10 @@ SHOWN: Final = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
 MOST_REGIONS: Final = 20
 """Regions of a level that are listed."""
-MEANING: Final = {
-    Change.BROKE: "It passes with the earlier version, and does not with the later one",
-    Change.WITHIN_CHANCE: "Its runs differ between the versions by no more than chance",
-    Change.NEITHER: "It passes with neither version",
-    Change.STILL_CONTACT: "The criterion is met with the later version, and bodies touch",
-    Change.FIXED: "It passes with the later version, and does not with the earlier one",
-}
-"""The sections of a step with both motions."""
-MARKS: Final = {
-    Change.BROKE: "broke",
-    Change.FIXED: "fixed",
-    Change.NEITHER: "safe",
-    Change.STILL_CONTACT: "unknown",
-    Change.WITHIN_CHANCE: "unknown",
-}
+DRAWN: Final = (
+    *(Change.BROKE, Change.WITHIN_CHANCE, Change.NEITHER, Change.STILL_CONTACT, Change.FIXED),
+)
+"""Changes of which a section has both motions of each case; the template says what they mean."""
 AGAINST_PAGE: Final = f"{AGAINST}.html"
 """Page in the folder of a campaign against an earlier version."""
 STYLES: Final = ("report.css", "comparison.css")
@@ -61,7 +50,6 @@ def comparison_page(compared: Comparison, runs: Sequence[Run | None]) -> str:
         counts=[judge(version.cases).counts for version in compared.versions],
         steps=[(step, _maps(step), _sections(step, runs)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
-        meaning=MEANING,
         most=MOST_REGIONS,
         cut=cut,
     )
@@ -71,10 +59,10 @@ def _maps(step: Step) -> dict[int, Any]:
     """Return by level its coordinates, and where cases changed; what broke lies on top."""
     maps: dict[int, Any] = {}
     for one in reversed(step.cases):
-        if one.change in MARKS:
+        if one.change in DRAWN:
             case = one.a.case
             axes = coordinates(case.scenario, (case.level,))
-            maps.setdefault(case.level, (axes, []))[1].append((MARKS[one.change], case))
+            maps.setdefault(case.level, (axes, []))[1].append((one.change, case))
     return dict(sorted(maps.items()))
 
 
@@ -86,7 +74,7 @@ def _sections(step: Step, runs: Sequence[Run | None]) -> list[tuple[Change, int,
     """
     sections, left = [], SHOWN
     of_versions = runs[step.before - 1], runs[step.after - 1]
-    for change in MEANING:
+    for change in DRAWN:
         cases = [case for case in step.cases if case.change is change]
         shown = cases[:left]
         left -= len(shown)

@@ -1,4 +1,4 @@
-"""What a format of `merge-sumo export` is."""
+"""The type of a format of `merge-sumo export`."""
 
 from __future__ import annotations
 

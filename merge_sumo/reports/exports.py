@@ -38,7 +38,7 @@ SIGNAL: Final = "signal_"
 MERGED: Final = "merged"
 """Column of scenarios with an acceleration lane: 1 where the VUT has left it, else 0."""
 FORMULA: Final = ("=", "+", "-", "@")
-"""What begins a formula for a spreadsheet."""
+"""Beginnings of a formula for a spreadsheet."""
 ROAD: Final = "road.xodr"
 _EPOCH: Final = datetime(2000, 1, 1)
 MINOR_VERSION: Final = 2
@@ -208,7 +208,7 @@ def _scenario(
 
 
 def _afterwards(xosc: Any, trajectory: Trajectory, row: int) -> list[tuple[str, Any]]:
-    """Return what a car does behind its trajectory, as names and actions."""
+    """Return the actions of a car behind its trajectory, each with a name."""
     who = VEHICLES[row]
     actions = [(f"{who} keeps its speed", _speed(xosc, float(trajectory.motion[-1, row, 1])))]
     if row == VUT:
@@ -233,7 +233,7 @@ def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list
 def _follow(
     xosc: Any, who: str, places: Sequence[Any], afterwards: Sequence[tuple[str, Any]]
 ) -> Any:
-    """Return what lets a car follow its places, and then do what is given, if anything."""
+    """Return the maneuvers of a car: to follow its places, and then the actions afterwards."""
     times = np.round(np.arange(len(places)) * DT_S, 1).tolist()
     track = xosc.Trajectory(f"{who} recorded", closed=False)
     track.add_shape(xosc.Polyline(times, list(places)))

@@ -54,8 +54,8 @@ STYLE: Final[Any] = {
 def check_figure(path: Path) -> None:
     """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
     if path.suffix not in KINDS:
-        raise UserError(f"--figure is {path}: end it in {' or '.join(KINDS)}")
-    check_new_file(path, "--figure")
+        raise UserError(f"`figure` is {path}: end it in {' or '.join(KINDS)}")
+    check_new_file(path, "`figure`")
     require_matplotlib()
 
 
@@ -76,7 +76,7 @@ def save(figure: Figure, path: Path) -> None:
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
     with io.BytesIO() as picture, matplotlib.rc_context(STYLE):
         figure.savefig(picture, format=kind, dpi=DPI, metadata=metadata)
-        write_new(path, picture.getvalue(), "--figure")
+        write_new(path, picture.getvalue(), "`figure`")
 
 
 @contextmanager

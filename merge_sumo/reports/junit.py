@@ -40,11 +40,11 @@ REGRESSION: Final = "regression"
 def check_junit(path: Path, folder: Path) -> None:
     """Raise `UserError` where a campaign in `folder` cannot write this JUnit file later."""
     if path.absolute() == folder.absolute():
-        raise UserError(f"--junit is {path}, the folder of the campaign: choose a file")
+        raise UserError(f"`junit` is {path}, the folder of the campaign: choose a file")
     if path.parent.absolute() == folder.absolute():
-        check_new(path, "--junit")
+        check_new(path, "`junit`")
     else:
-        check_new_file(path, "--junit")
+        check_new_file(path, "`junit`")
 
 
 def write_junit(
@@ -85,7 +85,7 @@ def _write(path: Path, root: etree._Element) -> None:
         part.set("errors", str(len(list(part.iter("error")))))
         part.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")
     text = etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
-    write_new(path, text, "--junit")
+    write_new(path, text, "`junit`")
 
 
 def _gates(

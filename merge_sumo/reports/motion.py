@@ -30,7 +30,7 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
 
 
 def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
-    """Return what became of an episode in a sentence."""
+    """Return the verdict on an episode as a sentence."""
     found, place = outcome.measures, outcome.case.scenario.place
     met, speed = _met(found), found.impact_speed_mps
     at = f"{found.end.value} at {found.t_end_s:g} s"

@@ -59,7 +59,7 @@ Axes = tuple[int, int]
 
 
 def page_data(model: ReportModel) -> dict[str, Any]:
-    """Return what the script draws from: plain JSON."""
+    """Return the data of a page as JSON has it."""
     scenario, lane_m = model.run.scenario, lane_of(model.run.scenario)
     speeds, offsets = packed(model.motion)
     columns = [m for m in measures_in(scenario) if m.column]
@@ -104,7 +104,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
 
 
 def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]) -> dict[str, Any]:
-    """Return what the page has of a case; it has no rows where its motion is not known."""
+    """Return a case by column; it has no rows where its motion is not known."""
     motion, measures = model.motion.get(o.index), o.measures
     avoidance = model.avoidance.get(o.index)
     row = {
@@ -235,7 +235,7 @@ def pairs_of(dims: int) -> list[Axes]:
 def map_data(
     scenario: Scenario, level: int, others: Sequence[Outcome], surface: Surface | None
 ) -> dict[str, Any]:
-    """Return what the script draws the map of a level from.
+    """Return the data of the map of a level.
 
     A level with two coordinates has one map; with a third, the reader moves through it. Of more, a
     map shows a pair, and the chance to fail is a mean over all values of the others. `others` are

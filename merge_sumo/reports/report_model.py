@@ -141,12 +141,12 @@ class ReportModel:
 
     @property
     def notes(self) -> list[str]:
-        """What a reader should know before all else, in sentences."""
+        """Doubts about the outcomes, in sentences."""
         return doubts(self.cases, self.run.criterion)
 
     @property
     def unrepeatable(self) -> str | None:
-        """How many cases did not repeat; None where each did."""
+        """A sentence on the cases that did not repeat; None where each did."""
         return unrepeatable(read_repeats(self.run))
 
     @property

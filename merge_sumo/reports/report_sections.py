@@ -42,7 +42,7 @@ class ReportSection:
 
 
 def shared(model: ReportModel) -> dict[str, Any]:
-    """Return what every template of the report has."""
+    """Return the values that every template of the report has."""
     scenario = model.run.scenario
     return {
         "model": model,

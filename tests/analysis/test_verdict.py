@@ -274,7 +274,7 @@ class TestACampaignWithGates:
         ):
             said = invoke("campaign", *words, "--junit", file)
             assert isinstance(said.exception, UserError)
-            assert "choose another name with --junit" in str(said.exception)
+            assert "choose another name with `junit`" in str(said.exception)
         assert not (tmp_path / "other").exists()
         assert file.read_bytes() == before
 
