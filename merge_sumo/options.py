@@ -521,7 +521,7 @@ class Case(Test):
         "--debug",
     )
     gui: bool = option(
-        False, bool, "Show it in sumo-gui while it runs, in real time.", WHERE, "--gui"
+        False, bool, "Play it in sumo-gui when it has run, in real time.", WHERE, "--gui"
     )
     out: AnyPath | None = _out("New folder to keep it in, for `replay` and sumo-gui.")
     on_end: Callable[[Any], None] | None = keyword(
@@ -761,13 +761,7 @@ class NewScenario(Asked):
 
     file: AnyPath = field(metadata={"help": "New TOML file to write."})
     _: KW_ONLY
-    net: AnyPath = field(
-        metadata=_required(
-            Path,
-            "SUMO net, or a map of which netconvert makes one beside FILE: .osm, .xodr.",
-            TESTED,
-        )
-    )
+    net: AnyPath = field(metadata=_required(Path, "SUMO net.", TESTED))
     mainline: str = field(
         metadata=_required(str, 'Edges of the mainline, past M: "e1 e2".', TESTED)
     )

@@ -72,9 +72,7 @@ from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.road.drawing import road_svg
-from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_for, road_of
-from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies import (
@@ -94,7 +92,7 @@ from merge_sumo.studies.sampler_study import SamplerStudy, Study
 from merge_sumo.studies.truth import Repeats
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
-from merge_sumo.sumo.conversion import command_for, is_map, net_of_map
+from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
@@ -107,12 +105,11 @@ from merge_sumo.system.folders import (
     make_folder,
     write_new,
 )
-from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.chance import MOST_RUNS
-from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import LEVELS, US23, MergeScenario, Scenario, level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.base import Car, Seen
@@ -305,19 +302,24 @@ def run(asked: options.Case) -> CaseRun:
         raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
     if asked.out is not None:
         check_new(Path(asked.out))
+    if asked.gui:
+        replayer.check_display()
     for sentence in outside_of_the_pool(one):
         notice(sentence)
     plan = resolve(settings, debug=asked.debug)
     if asked.recorded is not None:
         notice_changes(_opened(asked.recorded[0]).run, plan)
 
-    def ended(result: Episode) -> None:
-        if asked.out is not None:
-            write_scenario(Path(asked.out), plan.road, result.outcome, result.trajectory)
+    result = run_one(plan, one)
+    with stopping_in_order(), scratch_folder() as scratch:
+        folder = scratch / "case" if asked.out is None else Path(asked.out)
+        if asked.gui or asked.out is not None:
+            write_scenario(folder, plan.road, result.outcome, result.trajectory)
         if asked.on_end is not None:
             asked.on_end(CaseRun(result))
-
-    return CaseRun(run_one(plan, one, live=asked.gui, on_end=ended))
+        if asked.gui:
+            replayer.open_gui(folder)
+    return CaseRun(result)
 
 
 def _coordinates(asked: options.Case) -> dict[str, float]:
@@ -763,19 +765,8 @@ def new_scenario(asked: options.NewScenario) -> Shown:
         raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
     picture = file.with_suffix(".svg")
     edges = tuple(asked.mainline.split()), tuple(asked.ramp.split())
-    written, map_file = [file, picture], net if is_map(net) else None
-    if map_file is not None:
-        net = file.with_suffix(".net.xml")
-        written.append(net)
-    for path in written:
+    for path in (file, picture):
         check_new_file(path, "FILE")
-    if map_file is not None:
-        converted = net_of_map(map_file)
-        try:
-            find_corridor(NetFile(map_file, converted), *edges)
-        except UserError as error:
-            raise UserError(f"{error}; to look at its edges: `{command_for(map_file)}`") from error
-        write_new(net, converted, "FILE")
     road = road_of(net, *edges)
     if not asked.point:
         road = road_of(net, *edges, lane_m=suggested_lane_m(road))
@@ -784,9 +775,8 @@ def new_scenario(asked: options.NewScenario) -> Shown:
     write_new(picture, road_svg(road, scenario), "FILE")
     text = to_toml(replace(scenario, net=relative), found)
     write_new(file, text.encode(), "FILE")
-    made_of = "" if map_file is None else f", and its net {net}, made of {map_file}"
-    lines = [*found, f"written: {file}, and its picture {picture}{made_of}"]
-    return Shown({"about": found, "written": list(map(str, written))}, lines)
+    lines = [*found, f"written: {file}, and its picture {picture}"]
+    return Shown({"about": found, "written": [str(file), str(picture)]}, lines)
 
 
 @verb(options.CheckScenario)

@@ -26,6 +26,8 @@ JUNCTION_TYPES: Final = (
     *("right_before_left", "left_before_right", "traffic_light", "traffic_light_unregulated"),
     *("traffic_light_right_on_red", "rail_signal", "rail_crossing"),
 )
+MAP_OPTIONS: Final = {"osm": "--osm-files", "OpenDRIVE": "--opendrive-files"}
+"""Options by which netconvert reads a map, by the root of its file."""
 
 Point = tuple[float, float, float]
 
@@ -94,8 +96,9 @@ class NetFile:
         except etree.XMLSyntaxError as error:
             raise UserError(f"the net {path} is not readable XML: {error!s:.200}") from error
         if self._root.tag != "net":
-            made = str(self._root.tag) in ("osm", "OpenDRIVE")
-            how = "; `merge-sumo scenario new` makes one of such a map" if made else ""
+            option = MAP_OPTIONS.get(str(self._root.tag))
+            made = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
+            how = made if option else ""
             raise UserError(f"{path} is no SUMO net: it does not begin with <net>{how}")
         self._edges = {str(edge.get("id")): edge for edge in self._root.iterfind("edge")}
         self._known: dict[str, Lane] = {}

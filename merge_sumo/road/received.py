@@ -10,7 +10,6 @@ road or the record.
 
 from __future__ import annotations
 
-import codecs
 import os
 import re
 import stat
@@ -33,9 +32,6 @@ MAX_CHARS: Final = 2**16
 MAX_NUMBER_CHARS: Final = 64
 
 _NUMBER: Final = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?", re.ASCII)
-_PLAIN_DECLARATION: Final = re.compile(
-    rb"""<\?xml version=["']1\.0["'] encoding=["'](?:UTF|utf)-8["'] ?\?>"""
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,20 +109,16 @@ def check_text(content: bytes, name: str) -> None:
 
 def parse(
     content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
-) -> tuple[etree._Element, bool]:
-    """Return what is allowed of an XML file as a tree, and whether that is all of it.
-
-    Where it is all, the bytes themselves mean the same to every reader as the tree does: comments
-    and spaces are the only things that are in the one and not in the other.
+) -> etree._Element:
+    """Return what is allowed of an XML file as a tree.
 
     Raises `UserError` when it is no UTF-8, is no XML, declares a document type, has more elements
     than `max_elements`, or has a value that its attribute does not take; `name` is what the
     sentence calls it.
     """
     check_text(content, name)
-    cleaner = _Cleaner(allowed, name, max_elements)
     parser = etree.XMLParser(
-        target=cleaner,  # type: ignore[arg-type] # the stubs know parsers of bytes, too
+        target=_Cleaner(allowed, name, max_elements),  # type: ignore[arg-type] # the stubs know parsers of bytes, too
         # Whatever the file declares: another encoding could hide what is looked for above.
         encoding="utf-8",
         resolve_entities=False,
@@ -135,21 +127,17 @@ def parse(
         huge_tree=False,
     )
     try:
-        root = etree.fromstring(content, parser)
+        return etree.fromstring(content, parser)
     except etree.XMLSyntaxError as error:
         reason = str(error.msg).encode("ascii", "backslashreplace").decode()
         raise UserError(f"{name} is not readable XML: {reason:.200}") from error
-    text = content.removeprefix(codecs.BOM_UTF8)
-    plain = not text.startswith(b"<?xml") or _PLAIN_DECLARATION.match(text) is not None
-    return root, plain and cleaner.intact
 
 
 def cleaned(
     content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
 ) -> bytes:
-    """Return an XML file, or what is allowed of it where that is not all; raises as `parse`."""
-    root, intact = parse(content, allowed, name, max_elements)
-    return content if intact else serialize(root)
+    """Return what is allowed of an XML file; raises as `parse`."""
+    return serialize(parse(content, allowed, name, max_elements))
 
 
 def serialize(root: etree._Element) -> bytes:
@@ -162,7 +150,6 @@ class _Cleaner:
     """Builds the tree of what is allowed while the parser reads, and holds nothing else."""
 
     def __init__(self, allowed: Mapping[str, Allowed], name: str, max_elements: int) -> None:
-        self.intact = True
         self._name, self._max_elements = name, max_elements
         self._elements = 0
         self._dropped = 0
@@ -179,11 +166,9 @@ class _Cleaner:
             if parent is None:
                 raise UserError(f"{self._name} has another root than <{next(iter(expected))}>")
             self._dropped += 1
-            self.intact = False
             return
         allowed = expected[tag]
         kept = {name: text for name, text in attributes.items() if name in allowed.attributes}
-        self.intact &= len(kept) == len(attributes)
         for name, text in kept.items():
             values = allowed.attributes[name]
             if not (len(text) <= MAX_CHARS and values.include(text)):
@@ -205,15 +190,6 @@ class _Cleaner:
             self._dropped -= 1
         else:
             self._open.pop()
-
-    def data(self, data: str) -> None:
-        self.intact &= not data.strip()
-
-    def pi(self, target: str, data: str | None = None) -> None:
-        self.intact = False
-
-    def comment(self, text: str) -> None:
-        pass
 
     def close(self) -> etree._Element | None:
         return self._root

@@ -19,7 +19,6 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.received import Allowed
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.live import check_display
 from merge_sumo.sumo.replay_folder import (
     CONFIG,
     HOLD_STEPS,
@@ -95,7 +94,7 @@ def replay(folder: Path) -> Replay:
             raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
         written = received.read_bytes(stage / REPLAYED, "the replay", follow_links=False)
     name = f"SUMO's replay of {folder}"
-    replayed = _rows(received.parse(written, allowed.REPLAYED, name)[0], name)
+    replayed = _rows(received.parse(written, allowed.REPLAYED, name), name)
     fault = _difference(episode, replayed) or _fault_of_record(episode)
     return Replay(len(episode.rows), *(fault or (None, "")))
 
@@ -149,9 +148,8 @@ def _received(folder: Path) -> _Episode:
     net = received.cleaned(_bytes(path), schema, f"the net {path}")
     drawn = _read(folder / SURROUNDINGS, allowed.SURROUNDINGS) if hosted else None
     road = Road(net, find(net, path), drawn)
-    types = _checked_types(_bytes(folder / TYPES), folder / TYPES)
-    record = _bytes(folder / RECORD)
-    root, rows = _checked_record(record, folder / RECORD, _vehicles(types))
+    types = _checked_types(folder / TYPES)
+    root, rows = _checked_record(folder / RECORD, _vehicles(types))
     # Folders of older versions have no labels.
     has_labels = os.path.lexists(folder / LABELS)
     labels = _read(folder / LABELS, allowed.LABELS) if has_labels else None
@@ -163,11 +161,11 @@ def _bytes(path: Path) -> bytes:
 
 
 def _read(path: Path, schema: Mapping[str, Allowed]) -> etree._Element:
-    return received.parse(_bytes(path), schema, f"the file {path}")[0]
+    return received.parse(_bytes(path), schema, f"the file {path}")
 
 
-def _checked_types(content: bytes, path: Path) -> etree._Element:
-    root, _ = received.parse(content, allowed.TYPES, f"the file {path}")
+def _checked_types(path: Path) -> etree._Element:
+    root = _read(path, allowed.TYPES)
     if sorted(_vehicles(root)) not in map(sorted, (VEHICLES[:2], VEHICLES)):
         raise UserError(
             f"the file {path} must have one vType pov and one vType vut, and in traffic one ahead "
@@ -180,10 +178,8 @@ def _vehicles(types: etree._Element) -> tuple[str, ...]:
     return tuple(str(vtype.get("id")) for vtype in types)
 
 
-def _checked_record(
-    content: bytes, path: Path, vehicles: Sequence[str]
-) -> tuple[etree._Element, Rows]:
-    root, _ = received.parse(content, allowed.RECORD, f"the record {path}")
+def _checked_record(path: Path, vehicles: Sequence[str]) -> tuple[etree._Element, Rows]:
+    root = received.parse(_bytes(path), allowed.RECORD, f"the record {path}")
     if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
         raise UserError(
             f"the record {path} must have from {MIN_TIMESTEPS} to {MAX_TIMESTEPS} timesteps"
@@ -282,6 +278,14 @@ def _places(record: etree._Element, road: Corridor) -> Places:
             position_m = float(vehicle.get("pos", ""))
             found[time, who] = begin and _OnPath(begin.path, begin.x_m + position_m)
     return found
+
+
+def check_display() -> None:
+    """Raise `UserError` when there is no display."""
+    if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError(
+            "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
+        )
 
 
 def open_gui(folder: Path) -> int:

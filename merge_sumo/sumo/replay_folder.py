@@ -64,10 +64,6 @@ EXAGGERATED: Final = 1.0 / 175.0
 """How much larger cars are drawn than they are, for a metre of the picture's width."""
 MOST_BESIDE: Final = 1.7
 """At most, with an acceleration lane: cars side by side do not look as if they touched."""
-MOVING_INK: Final = "0.85,0.30,0.05"
-"""Of labels at cars: it is read on a black road and beside it."""
-LETTERS: Final = "60"
-"""Size of the labels."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
@@ -274,50 +270,27 @@ def _picture(road: Road, record: etree._Element) -> Picture:
 
 
 def _view(picture: Picture) -> etree._Element:
-    viewport = picture.zoom, f"{picture.x_m:g}", f"{picture.y_m:g}"
-    return view_settings(picture.exaggeration, viewport, borders=picture.borders)
-
-
-def view_settings(
-    exaggeration: str,
-    viewport: tuple[str, str, str],
-    label: str | None = None,
-    *,
-    borders: bool = False,
-) -> etree._Element:
-    """Return the settings of a view with large cars, labelled by one of their parameters.
-
-    `viewport` is zoom, x and y. Without a `label` cars have none. `borders` draws lines between
-    lanes.
-    """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": exaggeration}
-    if label is not None:
-        vehicles |= {"vehicleTextParam": label, **_text("vehicleText", "70", MOVING_INK)}
-    if borders:
+    if picture.borders:
         etree.SubElement(scheme, "edges", laneShowBorders="1")
-    etree.SubElement(scheme, "vehicles", vehicles)
+    exaggeration = picture.exaggeration
+    etree.SubElement(scheme, "vehicles", vehicleQuality="3", vehicle_exaggeration=exaggeration)
     etree.SubElement(
         scheme,
         "pois",
-        {"poiTextParam": TEXT, **_text("poiText", LETTERS, INK), "poiText_bgColor": PALE},
+        poiTextParam=TEXT,
+        poiText_show="1",
+        poiText_size="60",
+        poiText_color=INK,
+        poiText_constantSize="1",
+        poiText_bgColor=PALE,
     )
     etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
-    zoom, x, y = viewport
-    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
+    x, y = f"{picture.x_m:g}", f"{picture.y_m:g}"
+    etree.SubElement(root, "viewport", zoom=picture.zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
-
-
-def _text(of: str, size: str, colour: str) -> dict[str, str]:
-    """Return how a text is shown; its size is that on the screen."""
-    return {
-        f"{of}_show": "1",
-        f"{of}_size": size,
-        f"{of}_color": colour,
-        f"{of}_constantSize": "1",
-    }
 
 
 def _picture_of(road: Corridor, record: etree._Element) -> Picture:
@@ -372,16 +345,6 @@ def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Ele
         for name, value in values.items():
             etree.SubElement(parent, name, value=value)
     return root
-
-
-def beside(text: str, *, ahead: bool) -> str:
-    """Return the label of a car that moves, pushed ahead of it or behind it by spaces.
-
-    Labels stand over the middle of their cars, and at M these are in one place. A space is half as
-    wide as a letter.
-    """
-    room = " " * (round(2.6 * len(text)) + 8)
-    return room + text if ahead else text + room
 
 
 def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:

@@ -248,9 +248,10 @@ class TestAScenario:
 
     @here
     @given(data=st.data())
-    def test_with_spoilt_types(self, scenario, data):
-        types = data.draw(some((scenario / replay_folder.TYPES).read_bytes()))
-        answer(lambda: replay._checked_types(types, Path(replay_folder.TYPES)))
+    def test_with_spoilt_types(self, scenario, tmp_path, data):
+        path = tmp_path / replay_folder.TYPES
+        path.write_bytes(data.draw(some((scenario / replay_folder.TYPES).read_bytes())))
+        answer(lambda: replay._checked_types(path))
 
     @here
     @given(data=st.data())
@@ -269,10 +270,8 @@ class TestAScenario:
         path.write_text(f"{bomb}]><net><edge id='&a11;'/></net>")
         with pytest.raises(UserError):
             road_of(path)
-        assert (
-            answer(lambda: replay._checked_record(path.read_bytes(), path, ("pov", "vut"))) is None
-        )
-        assert answer(lambda: replay._checked_types(path.read_bytes(), path)) is None
+        assert answer(lambda: replay._checked_record(path, ("pov", "vut"))) is None
+        assert answer(lambda: replay._checked_types(path)) is None
 
 
 words = st.text(max_size=12) | st.integers().map(str) | st.floats().map(str)

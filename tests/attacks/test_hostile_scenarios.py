@@ -543,14 +543,6 @@ def cleaned(net: bytes) -> bytes:
 
 
 class TestAnHonestNet:
-    def test_is_passed_on_as_the_very_bytes_of_the_file(self):
-        text = default_net_path().read_bytes()
-        assert cleaned(text) == text
-
-    def test_keeps_its_bytes_with_comments_in_them(self):
-        text = default_net_path().read_bytes().replace(b"<edge", b"<!-- surveyed -->\n<edge")
-        assert cleaned(text) == text
-
     def test_loses_what_is_not_allowed(self):
         text = added('<param key="a" value="b"/>')(default_net_path().read_text()).encode()
         assert b"param" not in cleaned(text)
@@ -563,7 +555,7 @@ class TestAnHonestNet:
         text = instead('projParameter="!"', f'projParameter="{projection}"')(
             default_net_path().read_text()
         )
-        assert cleaned(text.encode()) == text.encode()
+        assert f'"{projection}"'.encode() in cleaned(text.encode())
 
     def test_of_another_make_of_netconvert_is_taken(self, tmp_path):
         """With roads, types and attributes that the shipped net has not."""
@@ -594,9 +586,8 @@ class TestAnHonestNet:
         ended = run_program("netgenerate", arguments, tmp_path)
         assert ended.code == 0, ended.reason
         content = (tmp_path / "made.net.xml").read_bytes()
-        root, intact = received.parse(content, allowed.NET, "it")
+        root = received.parse(content, allowed.NET, "it")
         assert len(root.findall("edge")) == content.count(b"<edge ")
-        assert not intact, "internal links go, and traffic lights"
 
 
 class TestTheProgramsThatAreStarted:
@@ -654,8 +645,7 @@ def runs(pid: int) -> bool:
 
 def test_what_is_read_is_bounded_in_elements_and_in_bytes(tmp_path):
     most = b"<net>" + b"<a/>" * (received.MAX_ELEMENTS - 1) + b"</net>"
-    root, intact = received.parse(most, allowed.NET, "it")
-    assert (len(root), intact) == (0, False)
+    assert len(received.parse(most, allowed.NET, "it")) == 0
     with pytest.raises(UserError, match="more than 5000 elements"):
         received.parse(most.replace(b"</net>", b"<a/></net>"), allowed.NET, "it")
     file = tmp_path / "file"

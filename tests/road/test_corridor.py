@@ -219,6 +219,7 @@ def edited(old: str, new: str):
     [
         (lambda text: text[:500], "not readable XML"),
         (lambda text: "<routes/>", "is no SUMO net: it does not begin with <net>"),
+        (lambda text: "<osm/>", "make one of it: `netconvert --osm-files .* -o NAME.net.xml`"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "is no number"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),
