@@ -687,7 +687,7 @@ def explain(asked: options.Explain) -> explanation.ExplanationResult:
     """Find the smallest changes with which a failure passes."""
     before = _opened(asked.run).run
     target = before.folder / explanation.EXPLANATIONS
-    check_own(target)
+    check_ours(target, explanation.Explanation.__struct_fields__)
     failure = explanation.failure_of(before, asked.case)
     ranges = tuple(map(Range.parsed, asked.params))
     with _study_of(before, asked, "explained", 1, "failures", engine=None) as study:

@@ -3,67 +3,49 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import signal
 import stat
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from unicodedata import category
 
-import numpy as np
 import pytest
 from campaigning import resume_campaign
-from handmade import write_run
-from matplotlib.figure import Figure
-from typer.testing import CliRunner
+from conftest import some
+from writers import INTO_FOLDERS, PLACES, WRITERS
 
 import merge_sumo as ms
-from merge_sumo import cli
-from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
+from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
-from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.studies import probability
-from merge_sumo.studies import stress as ladder
+from merge_sumo.road.merge import default_net_path
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.workers import Workers
 from merge_sumo.training import helix
 from merge_sumo.values.scenario import US23
 
-NAMELESS = [
-    *("", ".", "./", ".//", "./.", "..", "../", "../.", "./..", "../..", "../../."),
-    *("full/..", "full/../", "full/inner/..", "missing/..", "missing/../..", "./full/./.."),
-]
-THERE = [
-    *("file.txt", "empty", "empty/", "full", "full/", "full/.", "./full", "full/notes.txt"),
-    *("full/inner", "full/../empty", "dangling", "to-full", "to-file", "loop", "pipe"),
-    *("../beside", "../beside/kept", "to-full/inner", "vut1.onnx", "figure.svg", "table.json"),
-]
-FOLDERS = [
-    *("empty", "empty/", "full", "full/", "full/.", "./full", "full/inner", "full/../empty"),
-    *("to-full", "../beside", "../beside/kept", "to-full/inner"),
-]
-NOWHERE = [
-    *("file.txt/new", "file.txt/a/b", "to-file/new", "dangling/new", "loop/new", "pipe/new"),
-    *("x" * 256, "é" * 128, "x" * 5000, "a/" + "y" * 256, "/".join(["d" * 200] * 30)),
-]
-NO_ARGUMENTS = ["nul\0byte", "half\ud800", "\0"]
-"""What only Python can say."""
+NAMELESS = ["", ".", "./", "..", "../.", "./..", "../..", "theirs/..", "missing/../..", "here/.."]
+BELOW = ["file/new", "file/a/b", "to-file/new", "dangling/new", "loop/new", "pipe/new"]
+TOO_LONG = ["x" * 256, "é" * 128, "x" * 5000, "a/" + "y" * 256, "/".join(["d" * 200] * 30)]
+NOT_SAYABLE = ["nul\0byte", "half\ud800"]
+"""Only Python can say these."""
 ODD = [
     *("x" * 255, "é" * 127, " ", "a b", " lead", "trail ", "a%b", "%41", "100%s", "${HOME}"),
     *("$HOME", "$(id)", "`id`", ";ls", "a&b", "|", ">x", "<x>", "*", "?", "[a]", "{a,b}", "a:b"),
     *("a=b", "#a", "!a", "~", "~root", "-", "--", "-rf", "--help", "a'b", 'a"b', "a\\b", "\\"),
     *("\n", "a\nb", "\r", "\t", "\x1b[31mred", "\x07", "\x7f", "日本", "é", "e\u0301", "\u202eabc"),
     *("\u200b", "\xa0", "😀", "...", ". .", ".hidden", "..a", "a..", os.fsdecode(b"\xff\xfe")),
-    *("new/sub", "new/deep/er", "./new3", "full/new4", "empty/new5", "to-full/new6"),
-    *("../beside/new7", "missing/../new8", "report.html", "campaign.json", "scenarios"),
+    *("new/sub", "new/deep/er", "./new3", "theirs/new4", "missing/../new8", "campaign.json"),
 ]
-NAMES = [*NAMELESS, *THERE, *NOWHERE, *ODD]
 
 
 def tree(root: Path) -> dict[str, tuple[str, object]]:
@@ -80,208 +62,101 @@ def tree(root: Path) -> dict[str, tuple[str, object]]:
     return found
 
 
-@pytest.fixture
-def world(tmp_path, monkeypatch) -> Path:
-    """Return a folder with planted files and links, and start in a folder inside of it."""
-    here = tmp_path / "world" / "deep" / "cwd"
-    for folder in (here / "full" / "inner", here / "empty", here.parent / "beside" / "kept"):
-        folder.mkdir(parents=True)
-    for name in ("file.txt", "full/notes.txt", "full/manifest.json", "full/inner/a", "vut1.onnx"):
-        (here / name).write_text(f"mine: {name}")
-    for name in ("figure.svg", "table.json", "../beside/kept/pov1.training.jsonl", "../../top"):
-        (here / name).write_text(f"mine: {name}")
-    for name, target in {"dangling": "nowhere", "to-full": "full", "to-file": "file.txt"}.items():
-        (here / name).symlink_to(target)
-    (here / "loop").symlink_to("loop")
-    os.mkfifo(here / "pipe")
-    monkeypatch.chdir(here)
-    return tmp_path / "world"
-
-
-@pytest.fixture
-def guarded(world, monkeypatch):
-    """Let what removes or renames tell first; what was planted is not touched, even for real."""
-    planted = [Path(name) for name in tree(world)]
-
-    def guard(name: str, module) -> None:
-        real = getattr(module, name)
-
-        def checked(path, *rest, **options):
-            if options.get("dir_fd") is None and not isinstance(path, int):
-                place = Path(os.path.abspath(os.fsdecode(path)))  # noqa: PTH100 (links stay)
-                for other in planted:
-                    assert not other.is_relative_to(place), f"{name} of {place}"
-                for target in rest[:1] if name in ("rename", "replace") else ():
-                    assert Path(os.path.abspath(target)) not in planted  # noqa: PTH100
-            return real(path, *rest, **options)
-
-        monkeypatch.setattr(module, name, checked)
-
-    for name in ("unlink", "remove", "rmdir", "rename", "replace", "truncate"):
-        guard(name, os)
-    guard("rmtree", shutil)
-
-
-@pytest.fixture
-def call(guarded, command_line):
-    """Return a function that runs the command line; it returns the exit code and the errors."""
-
-    def main(*arguments: object) -> tuple[int, str]:
-        code, _, err = command_line(*arguments)
-        return code, err
-
-    return main
-
-
-BASH = shutil.which("bash") or "bash"
-STOP = "this test runs no cases"
+def no_case(*_: object, **_options: object) -> None:
+    raise AssertionError("a case was to run before the name was looked at")
 
 
 @pytest.fixture
 def no_cases(monkeypatch) -> None:
-    """Stop campaigns and reproductions where their first case would run."""
-
-    def stop(*_: object, **_options: object) -> None:
-        raise UserError(STOP)
-
-    monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: None)
-    for name in ("evaluate", "evaluate_chunks"):
-        monkeypatch.setattr(conductor, name, stop)
-    monkeypatch.setattr("merge_sumo.studies.sampler_study.Study.compare", stop)
+    monkeypatch.setattr(Workers, "_submit", no_case)
+    monkeypatch.setattr(Simulator, "__init__", no_case)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
-    return write_run(tmp_path_factory.mktemp("made") / "run", per_level=20)
+@pytest.fixture
+def world(run, tmp_path, monkeypatch) -> Path:
+    """Return a folder with a run, a net and things of somebody, in which commands start."""
+    here = tmp_path / "world" / "deep" / "cwd"
+    (here / "theirs").mkdir(parents=True)
+    (here / "here").mkdir()
+    shutil.copytree(run.folder, here / "run")
+    shutil.copy(default_net_path(), here / "us23.net.xml")
+    (here / "theirs" / "thesis").write_text("theirs")
+    for name, make in {"file": "a file", "dangling": "a dangling link", "pipe": "a pipe"}.items():
+        PLACES[make](here / name)
+    PLACES["a link to a file"](here / "to-file")
+    PLACES["a link to itself"](here / "loop")
+    monkeypatch.chdir(here)
+    return here
 
 
-def assert_nothing_was_touched(world: Path, write, names=NAMES) -> list[str]:
-    """Write to every name; return those at which something new appeared, or in which it did.
+def assert_refused(said: tuple[int, str, str], what: object) -> None:
+    code, out, err = said
+    assert (code, out) == (2, ""), (what, said)
+    assert err.startswith("merge-sumo: "), what
+    assert err.count("\n") == 1, said
+    assert not any(category(letter)[0] == "C" for letter in err[:-1]), said
 
-    What appeared is removed before the next name.
-    """
-    appeared, before = [], tree(world)
-    for name in names:
-        code, said = write(name)
+
+@pytest.mark.parametrize("writer", WRITERS)
+def test_nothing_at_the_place_of_an_output_is_touched(
+    world, no_cases, monkeypatch, command_line, writer
+):
+    monkeypatch.setattr(helix, "_train_in_parallel", lambda *_: [])
+    command, suffix = WRITERS[writer]
+    before = tree(world)
+    for name, make in PLACES.items():
+        make(world / f"there{suffix}")
+        planted = tree(world)
+        said = command_line(*shlex.split(command), f"there{suffix}")
         after = tree(world)
-        assert before.items() <= after.items(), repr(name)
-        assert code in (0, 2), (name, said)
-        if after != before:
-            appeared.append(name)
-        elif code == 2 and STOP not in said:
-            assert said.startswith("merge-sumo: "), repr(name)
-            assert said.count("\n") == 1, said
-            assert not any(category(letter)[0] == "C" for letter in said[:-1]), said
-        assert not [path for path in after if folders.TEMPORARY in path]
+        assert planted.items() <= after.items(), name
+        added = writer in INTO_FOLDERS and name in (
+            *("a folder", "an empty folder", "a link to a folder"),
+        )
+        if added or (writer, name) == ("train", "an empty folder"):
+            assert said.code in (0, 2), said
+        else:
+            assert_refused(said, name)
+            assert after == planted, name
         for path in sorted(after.keys() - before.keys(), reverse=True):
-            (Path(path).rmdir if Path(path).is_dir() else Path(path).unlink)()
-    assert not set(appeared) & {*NAMELESS, *NOWHERE, *NO_ARGUMENTS}
-    return appeared
+            is_folder = Path(path).is_dir() and not Path(path).is_symlink()
+            (Path(path).rmdir if is_folder else Path(path).unlink)()
+    for name in (*NAMELESS, *BELOW, *TOO_LONG):
+        assert_refused(command_line(*shlex.split(command), name), name)
+        assert tree(world) == before, name
 
 
-def test_there_are_a_hundred_names_and_more():
-    assert len(NAMES) == len(set(NAMES)) > 100
+@pytest.mark.parametrize("name", some(ODD, "a b", "$(id)", "-rf", "\x1b[31mred", "日本", "new/sub"))
+def test_an_odd_name_is_a_name(world, command_line, name):
+    before = tree(world)
+    code, _, err = command_line("export", "run", 0, f"--out={name}")
+    assert code == 0, err
+    new = tree(world).keys() - before.keys()
+    assert before.items() <= tree(world).items()
+    folder = Path(os.path.abspath(name)) / case_name(0)  # noqa: PTH100 (as the system does it)
+    assert str(folder / "replay.sumocfg") in new
+    assert not [path for path in new if folders.TEMPORARY in path]
 
 
-@pytest.fixture(params=["some", pytest.param("all", marks=pytest.mark.long)])
-def names(request) -> list[str]:
-    """Return every name, or each twelfth one of a kind: all writers ask `folders`."""
-    kinds = (NAMELESS, THERE, NOWHERE, ODD)
-    return [name for kind in kinds for name in kind[:: 12 if request.param == "some" else 1]]
+@pytest.mark.parametrize("name", NOT_SAYABLE)
+def test_a_name_that_no_file_can_have_is_refused(world, no_cases, name):
+    before = tree(world)
+    with pytest.raises(UserError) as refused:
+        ms.campaign("design1", level=0, cases=2, sampler="uniform", out=name)
+    assert printable(str(refused.value))
+    assert tree(world) == before
 
 
-class TestAHundredNames:
-    def test_of_a_campaign_touch_nothing(self, world, call, no_cases, names):
-        options = ("--vut", "design1", "--level", 0, "--cases", 2, "--sampler", "uniform", "-q")
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call("campaign", *options, f"--out={name}"), names
-        )
-        assert set(appeared) == {*ODD} & {*names}
-
-    def test_of_a_campaign_from_python_touch_nothing(self, world, guarded, no_cases, names):
-        def write(name: str) -> tuple[int, str]:
-            with pytest.raises(UserError) as error:
-                ms.campaign("design1", level=0, cases=2, sampler="uniform", out=name)
-            return 2, f"merge-sumo: {printable(str(error.value))}\n"
-
-        appeared = assert_nothing_was_touched(world, write, [*names, *NO_ARGUMENTS])
-        assert set(appeared) == {*ODD} & {*names}
-
-    def test_of_an_export_touch_nothing(self, world, call, made, names):
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call("export", made.folder, 1, f"--out={name}"), names
-        )
-        assert set(appeared) == {*ODD, *FOLDERS} & {*names}
-
-    def test_of_a_table_touch_nothing(self, world, call, made, names):
-        arguments = ("export", made.folder, 1, "--format", "csv")
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call(*arguments, f"--out={name}"), names
-        )
-        assert set(appeared) >= {*ODD} & {*names}
-
-    def test_of_openscenario_touch_nothing(self, world, call, made, names):
-        names = [*(name for name in names if name not in ODD), "a:b", "${HOME}", "a%b", "a,b"]
-        arguments = ("export", made.folder, 1, "--format", "openscenario")
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call(*arguments, f"--out={name}"), names
-        )
-        assert {"a:b", "${HOME}", "a%b", "a,b"} <= set(appeared)
-
-    def test_of_a_reproduction_touch_nothing(self, world, call, no_cases, names):
-        arguments = ("reproduce", "--quick", "--workers=1")
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call(*arguments, f"--out={name}"), names
-        )
-        assert set(appeared) == {*ODD} & {*names}
-
-    def test_of_a_figure_touch_nothing(self, world, guarded):
-        figure = Figure(figsize=(0.1, 0.1))
-
-        def write(name: str) -> tuple[int, str]:
-            try:
-                figures.check_figure(Path(name))
-                figures.save(figure, Path(name))
-            except UserError as error:
-                return 2, f"merge-sumo: {printable(str(error))}\n"
-            return 0, ""
-
-        assert assert_nothing_was_touched(world, write) == []
-        named = [f"{name}.{kind}" for name in NAMES for kind in ("svg", "png")]
-        appeared = assert_nothing_was_touched(world, write, named)
-        assert {"a b.svg", "-rf.png", "日本.svg"} <= set(appeared)
-
-    def test_of_fresh_cases_touch_nothing(self, world, call, run, monkeypatch, names):
-        def ran(_plan, cases, *_):
-            return (*np.ones((2, len(cases)), dtype=bool), 0)
-
-        monkeypatch.setattr(probability, "run_fresh", ran)
-        arguments = ("probability", run.folder, "--cases", 10)
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call(*arguments, f"--out={name}"), names
-        )
-        assert {"a b", "-rf", "日本", "full/new4"} & {*names} <= set(appeared)
-        assert not {"table.json", "new/sub"} & set(appeared)
-
-    def test_of_a_training_touch_nothing(self, world, call, monkeypatch, names):
-        monkeypatch.setattr(helix, "_train_in_parallel", lambda *_: [])
-        appeared = assert_nothing_was_touched(
-            world, lambda name: call("train", "--only", "pov1", f"--out={name}"), names
-        )
-        assert set(appeared) == {*ODD, "empty", "empty/", "full/../empty"} & {*names}
+@pytest.mark.parametrize("name", ["/", "//", "///", "/.", "/..", "/../.."])
+def test_a_name_of_the_root_is_refused_by_its_looks(name):
+    with pytest.raises(UserError, match="write the name of what is to be made"):
+        folders.check_new(Path(name))
 
 
-class TestANameOfNothing:
-    @pytest.mark.parametrize("name", [*NAMELESS, "/", "//", "///", "/.", "/..", "/../.."])
-    def test_is_refused_by_its_looks(self, name):
-        with pytest.raises(UserError, match="write the name of what is to be made"):
-            folders.check_new(Path(name))
-
-    def test_is_refused_before_the_vut_is_opened(self, world, guarded, monkeypatch):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
-        for name in NAMELESS:
-            with pytest.raises(UserError, match="--out is"):
-                ms.campaign("design1", level=0, cases=2, out=name)
+def test_a_figure_of_no_known_kind_is_refused(tmp_path):
+    for name in ("figure", "figure.pdf", "figure.json"):
+        with pytest.raises(UserError):
+            figures.check_figure(tmp_path / name)
 
 
 FILES = {"first": b"12345", "empty": b"", "last": b"67"}
@@ -298,6 +173,10 @@ def killed(*_):
 os.fsync = killed
 api.export(sys.argv[1], [59], out=Path(sys.argv[2]).parent)
 """
+
+
+def full(_: int) -> None:
+    raise OSError(28, "No space left on device")
 
 
 class TestAFolderOfFiles:
@@ -321,19 +200,15 @@ class TestAFolderOfFiles:
         for name, content in begun.items():
             (tmp_path / name).write_bytes(content)
         folders.write_folder(tmp_path, FILES)
-        before = {path: path.stat() for path in tmp_path.iterdir()}
+        before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
         assert {path.name: path.read_bytes() for path in before} == FILES
         folders.write_folder(tmp_path, FILES)
-        assert {path: path.stat().st_mtime_ns for path in before} == {
-            path: found.st_mtime_ns for path, found in before.items()
-        }
+        assert {path: path.stat().st_mtime_ns for path in before} == before
 
     @pytest.mark.parametrize(
         "make",
         [
-            lambda out: out.symlink_to("nowhere"),
-            lambda out: out.write_text("theirs"),
-            lambda out: (out.mkdir(), (out / "theirs").touch()),
+            *(PLACES[name] for name in ("a dangling link", "a file", "a folder")),
             lambda out: (out.mkdir(), (out / "first").mkdir()),
             lambda out: (out.mkdir(), (out / "first").write_text("124")),
             lambda out: (out.mkdir(), (out / "first").write_text("123456")),
@@ -355,10 +230,6 @@ class TestAFolderOfFiles:
         assert list(tmp_path.iterdir()) == []
 
 
-def full(_: int) -> None:
-    raise OSError(28, "No space left on device")
-
-
 class TestAFileOfOurs:
     def test_is_whole_or_as_it_was(self, tmp_path, monkeypatch):
         (tmp_path / "report").write_text("old")
@@ -370,16 +241,12 @@ class TestAFileOfOurs:
     @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
     def test_whose_writer_is_killed_has_no_name_yet(self, tmp_path, share):
         content = b"x" * 100_000
-
-        def write() -> None:
+        pid = os.fork()
+        if pid == 0:
             with folders.new_file(tmp_path / "table.csv") as file:
                 file.write(content[: int(share * len(content))])
                 file.flush()
                 os._exit(0)
-
-        pid = os.fork()
-        if pid == 0:
-            write()
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
         (left,) = tmp_path.iterdir()
         assert left.name.startswith(folders.TEMPORARY)
@@ -387,12 +254,31 @@ class TestAFileOfOurs:
         assert (tmp_path / "table.csv").read_bytes() == content
 
 
+def avoided(folder: Path) -> None:
+    write_avoidance(folder, [Avoidance(0, ("fsm",), None, True)])
+
+
+OURS = {
+    "report.html": ms.report,
+    "stress.json": lambda folder: ms.stress(folder, workers=1),
+    "explanations.jsonl": lambda folder: ms.explain(folder, workers=1),
+    "probability.json": lambda folder: ms.probability(folder, cases=4),
+    "avoidance.jsonl": avoided,
+    "scenarios": lambda folder: ms.export(folder, 59),
+    "exports": lambda folder: ms.export(folder, 59, file_format="csv"),
+}
+"""Of the names that commands write in a run folder: what does so."""
+THEIRS: dict[str, Callable[[Path], object]] = {
+    "a page": lambda path: path.write_text("<!doctype html><title>notes on merge-sumo</title>"),
+    "a record": lambda path: path.write_text('{"mine": 1}\n'),
+    **{name: make for name, make in PLACES.items() if name not in ("a file", "a link to itself")},
+}
+
+
 @pytest.fixture
-def received(run, tmp_path) -> Path:
-    """Return a finished campaign that somebody sent, beside a folder of ours with a file."""
-    (tmp_path / "ours").mkdir()
-    (tmp_path / "ours" / "bashrc").write_text("ours")
-    return Path(shutil.copytree(run.folder, tmp_path / "received"))
+def received(world) -> Path:
+    """Return a finished campaign that somebody sent."""
+    return world / "run"
 
 
 def cut_to_one_batch(folder: Path) -> None:
@@ -400,141 +286,92 @@ def cut_to_one_batch(folder: Path) -> None:
     (folder / OUTCOMES).write_bytes(b"".join(lines[:20]))
 
 
-def moved_behind_a_link(path: Path, elsewhere: Path) -> None:
-    path.rename(elsewhere / path.name)
-    path.symlink_to(elsewhere / path.name)
-
-
-def replaced_as(place: str, content: bytes):
-    """Return what writes a file as a command does."""
-    return (lambda folder: folders.replace_own(folder / place, content)), place
-
-
-def stressed(folder: Path) -> None:
-    """Write what `rerun --stress` does; what is there is looked at before any case runs."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "RUNGS", ())
-        ms.stress(folder, workers=1)
-
-
-PAGE_OF_OURS = b'<!doctype html><head><meta name="generator" content="merge-sumo">'
-WRITERS = {
-    "report": (lambda folder: write_report(Run(folder)), REPORT),
-    "against": replaced_as("against.html", PAGE_OF_OURS),
-    "stress": (stressed, "stress.json"),
-    "avoidance": (
-        lambda folder: write_avoidance(folder, [Avoidance(0, ("fsm",), None, True)]),
-        "avoidance.jsonl",
-    ),
-    "repeats": replaced_as("repeats.jsonl", b'{"index": 1, "same": true}\n'),
-    "repair": replaced_as("repair.html", PAGE_OF_OURS),
-    "search": replaced_as("benchmark.json", b'{"number_is": "a mean", "cases": 3}'),
-    "explanation": (lambda folder: ms.explain(folder, workers=1), "explanations.jsonl"),
-    "probability": (
-        lambda folder: ms.probability(folder, out=folder / "probability.json", cases=4),
-        "probability.json",
-    ),
-}
-"""Of every file with a name of ours: what writes it into a run folder, and where."""
-KINDS = {
-    "page": lambda path: path.write_text("<!doctype html><title>notes on merge-sumo</title>"),
-    "record": lambda path: path.write_text('{"mine": 1}\n'),
-    "folder": Path.mkdir,
-    "link": lambda path: path.symlink_to("../ours/bashrc"),
-    "dangling link": lambda path: path.symlink_to("../ours/new"),
-    "pipe": os.mkfifo,
-}
+def moved_behind_a_link(path: Path) -> None:
+    elsewhere = path.parents[1] / "theirs" / path.name
+    path.rename(elsewhere)
+    path.symlink_to(elsewhere)
 
 
 class TestAReceivedFolder:
-    @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, TRAJECTORIES, SCENARIOS])
-    def test_with_a_link_is_not_gone_on_with(self, received, tmp_path, name, monkeypatch):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
+    @pytest.mark.parametrize(
+        ("name", "make"),
+        [
+            *((name, moved_behind_a_link) for name in (SETTINGS, OUTCOMES, TRAJECTORIES)),
+            (SCENARIOS, moved_behind_a_link),
+            (f"{TRAJECTORIES}/00002.npz", lambda path: path.symlink_to("../../theirs/thesis")),
+            (f"{TRAJECTORIES}/00002.npz", lambda path: path.symlink_to("../../theirs/nowhere")),
+        ],
+    )
+    def test_with_a_link_is_not_gone_on_with(self, received, no_cases, name, make):
         cut_to_one_batch(received)
-        moved_behind_a_link(received / name, tmp_path / "ours")
-        before = tree(tmp_path)
-        with pytest.raises(UserError, match=f"{name}: it is a link"):
+        if make is not moved_behind_a_link:
+            (received / name).unlink()
+        make(received / name)
+        before = tree(received.parent)
+        with pytest.raises(UserError, match=f"{Path(name).name}: it is a link"):
             resume_campaign(received)
-        assert tree(tmp_path) == before
+        assert tree(received.parent) == before
 
-    @pytest.mark.parametrize("target", ["../../ours/bashrc", "../../ours/new"])
-    def test_with_a_link_among_its_trajectories_is_not_gone_on_with(
-        self, received, tmp_path, monkeypatch, target
-    ):
-        monkeypatch.setattr(conductor, "open_simulators", lambda *_, **__: 1 / 0)
-        cut_to_one_batch(received)
-        (received / TRAJECTORIES / "00002.npz").unlink()
-        (received / TRAJECTORIES / "00002.npz").symlink_to(target)
-        before = tree(tmp_path)
-        with pytest.raises(UserError, match=r"00002\.npz: it is a link"):
-            resume_campaign(received)
-        assert tree(tmp_path) == before
-
-    def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received, tmp_path):
-        (received / f".{SETTINGS}").symlink_to("../ours/bashrc")
+    def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received):
+        (received / f".{SETTINGS}").symlink_to("../theirs/thesis")
         with Journal.reopen(received)[0] as journal:
             journal.rewrite_settings(settings := {**Run(received).settings, "cases": 70})
-        assert (tmp_path / "ours" / "bashrc").read_text() == "ours"
+        assert (received.parent / "theirs" / "thesis").read_text() == "theirs"
         assert read_settings(received) == settings
 
-    @pytest.mark.parametrize("kind", KINDS)
-    @pytest.mark.parametrize("name", WRITERS)
-    def test_keeps_what_is_somebodys_in_every_place(self, received, tmp_path, name, kind):
-        write, place = WRITERS[name]
-        path = received / place
+    @pytest.mark.parametrize("kind", THEIRS)
+    @pytest.mark.parametrize("name", OURS)
+    def test_keeps_what_is_somebodys_in_every_place(self, received, no_cases, name, kind):
+        path = received / name
+        if path.is_dir():
+            shutil.rmtree(path)
         path.unlink(missing_ok=True)
-        KINDS[kind](path)
-        before = tree(tmp_path)
-        with pytest.raises(UserError, match=place):
-            write(received)
-        assert tree(tmp_path) == before
+        THEIRS[kind](path)
+        before = tree(received.parent)
+        if name in ("scenarios", "exports") and kind in ("a folder", "an empty folder"):
+            OURS[name](received)
+            assert before.items() <= tree(received.parent).items()
+        else:
+            with pytest.raises(UserError, match=name):
+                OURS[name](received)
+            assert tree(received.parent) == before
 
-    @pytest.mark.parametrize("name", ["report", "stress", "avoidance", "search", "repair"])
+    @pytest.mark.parametrize("name", ["report.html", "avoidance.jsonl"])
     def test_has_what_is_ours_replaced(self, received, name):
-        write, place = WRITERS[name]
-        (received / place).unlink(missing_ok=True)
-        write(received)
-        first = (received / place).read_bytes()
-        write(received)
-        assert (received / place).read_bytes() == first
+        (received / name).unlink(missing_ok=True)
+        OURS[name](received)
+        first = (received / name).read_bytes()
+        OURS[name](received)
+        assert (received / name).read_bytes() == first
 
-    @pytest.mark.parametrize("name", [SCENARIOS, "exports"])
-    @pytest.mark.parametrize("file_format", ["sumo", "openscenario", "csv"])
-    def test_with_a_link_for_exports_gets_none(self, received, tmp_path, name, file_format):
-        if (received / name).exists():
-            shutil.rmtree(received / name)
-        (received / name).symlink_to("../ours")
-        before = tree(tmp_path)
-        said = CliRunner().invoke(cli.app, ["export", str(received), "59", "--format", file_format])
-        assert isinstance(said.exception, UserError)
-        assert "it is a link" in str(said.exception)
-        assert tree(tmp_path) == before
-
-    def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received, tmp_path):
+    def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received):
         worst, second, *_ = failures(Run(received).outcomes)
         shutil.rmtree(received / SCENARIOS)
         theirs = received / SCENARIOS / case_name(worst.index)
-        theirs.mkdir(parents=True)
-        (theirs / "thesis.tex").write_text("theirs")
+        theirs.parent.mkdir()
+        PLACES["a folder"](theirs)
         resume_campaign(received)
-        assert tree(theirs)[str(theirs / "thesis.tex")] == ("file", b"theirs")
-        assert [path.name for path in theirs.iterdir()] == ["thesis.tex"]
+        assert {path.name: path.read_text() for path in theirs.iterdir()} == {"notes": "theirs"}
         assert (received / SCENARIOS / case_name(second.index) / "replay.sumocfg").is_file()
 
 
 class TestAFolderOfPolicies:
-    def test_that_holds_other_things_is_not_trained_into(self, tmp_path):
-        (tmp_path / "pov1.training.jsonl").write_text("theirs")
-        with pytest.raises(UserError, match="holds other things than policies"):
+    @pytest.mark.parametrize(
+        ("files", "link", "said"),
+        [
+            ({"pov1.training.jsonl": "theirs"}, None, "holds other things than policies"),
+            ({"manifest.json": '{"networks": {}}'}, "pov1.training.jsonl", "it is a link"),
+        ],
+    )
+    def test_that_is_not_ours_is_not_trained_into(self, tmp_path, files, link, said):
+        for name, text in files.items():
+            (tmp_path / name).write_text(text)
+        if link is not None:
+            (tmp_path / link).symlink_to("elsewhere")
+        before = tree(tmp_path)
+        with pytest.raises(UserError, match=said):
             helix.train_library(tmp_path, ("pov1",), scenario=US23)
-        assert [path.name for path in tmp_path.iterdir()] == ["pov1.training.jsonl"]
-
-    def test_whose_log_is_a_link_is_not_trained_into(self, tmp_path):
-        (tmp_path / "manifest.json").write_text('{"networks": {}}')
-        (tmp_path / "pov1.training.jsonl").symlink_to("elsewhere")
-        with pytest.raises(UserError, match="it is a link"):
-            helix.train_library(tmp_path, ("pov1",), scenario=US23)
-        assert not (tmp_path / "elsewhere").exists()
+        assert tree(tmp_path) == before
 
     def test_that_was_begun_is_gone_on_with(self, tmp_path, monkeypatch):
         asked: list[Path] = []
@@ -552,9 +389,8 @@ class TestAFolderOfPolicies:
 
 @pytest.mark.parametrize("name", [name for name in ODD if name.isprintable() or "\x1b" in name])
 def test_a_name_in_a_command_is_read_by_a_shell_as_it_is(name):
-    done = subprocess.run(
-        [BASH, "-c", f"printf '%s|' {quoted(name)} end"], capture_output=True, check=True
-    )
+    command = [shutil.which("bash") or "", "-c", f"printf '%s|' {quoted(name)} end"]
+    done = subprocess.run(command, capture_output=True, check=True)
     assert done.stdout == os.fsencode(name) + b"|end|"
     assert printable(quoted(name)) == quoted(name)
 
@@ -575,17 +411,20 @@ class TestTheLinkToTheNewestRun:
         assert str((runs / "latest").readlink()) == "b-20260101-000001"
         assert len(list(runs.iterdir())) == 4, "nothing of ours is left beside it"
 
-    @pytest.mark.parametrize("target", ["mine", "../elsewhere", "/", "a-20260101-000000/x"])
-    def test_of_somebody_else_stays(self, runs, target):
-        (runs / "latest").symlink_to(target)
-        folders.link_latest(runs / "b-20260101-000001")
-        assert str((runs / "latest").readlink()) == target
-
-    @pytest.mark.parametrize("make", [Path.mkdir, lambda path: path.write_text("mine")])
-    def test_does_not_take_the_place_of_a_file_or_a_folder(self, runs, make):
+    @pytest.mark.parametrize(
+        "make",
+        [
+            *(PLACES[name] for name in ("a folder", "a file")),
+            lambda path: path.symlink_to("mine"),
+            lambda path: path.symlink_to("../elsewhere"),
+            lambda path: path.symlink_to("a-20260101-000000/x"),
+        ],
+    )
+    def test_does_not_take_the_place_of_somebody_elses(self, runs, make):
         make(runs / "latest")
+        before = tree(runs)
         folders.link_latest(runs / "b-20260101-000001")
-        assert not (runs / "latest").is_symlink()
+        assert tree(runs) == before
 
     @pytest.mark.parametrize(
         "folder", ["runs/mine", "elsewhere/a-20260101-000000", "runs/c-20260101-000009"]
