@@ -21,7 +21,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from bench_record import add_record_option, append_record
-from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
@@ -55,10 +54,6 @@ class MergesAt(Level0Vut):
         next_m = scene.x_vut_m + scene.v_vut_mps * DT_S
         self._wishes = np.where(next_m >= self._place_m, MERGE, STAY).astype(np.int8)
         return super().act(scene)
-
-    def wishes(self) -> NDArray[np.int8]:
-        """Return the wishes, (K,)."""
-        return self._wishes
 
 
 def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:

@@ -139,6 +139,8 @@ merges at M."""
 class Driver(ABC):
     """Drives the same vehicle in K corridors at once; the corridors are independent."""
 
+    _wishes: NDArray[np.int8] | None = None
+
     def __init__(self, corridors: int) -> None:
         """Prepare for corridors 0 to `corridors` - 1."""
         self.corridors = corridors
@@ -163,7 +165,7 @@ class Driver(ABC):
 
         A wish is granted in the next step from where the acceleration lane begins.
         """
-        return None
+        return self._wishes
 
     def clipped(self) -> NDArray[np.bool_] | None:
         """Return which of the last answers come of commands outside the limits, (K,).

@@ -94,10 +94,6 @@ class GapChoiceVut(Level0Vut):
         self._before_mps = scene.v_mps.copy()
         return answer
 
-    def wishes(self) -> NDArray[np.int8]:
-        """Return whether it merges, (K,); it says nothing where there is no lane."""
-        return self._wishes
-
     def _accepts(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
         """Return where both time gaps suffice in states, (A, K): (K,)."""
         others = np.arange(len(x_m)) != VUT

@@ -28,7 +28,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
@@ -361,9 +360,6 @@ class _Substitutes(Driver):
         merges = np.where(recorded, scene.step >= self._merges_at, at_m)
         self._wishes = np.where(merges, MERGE, STAY).astype(np.int8)
         return answer
-
-    def wishes(self) -> NDArray[np.int8]:
-        return self._wishes
 
 
 class _Mainline(Driver):

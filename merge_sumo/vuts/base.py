@@ -18,7 +18,6 @@ from typing import Any, Final, NamedTuple, Self, TextIO
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
 from merge_sumo.drivers.following import car_met
@@ -47,14 +46,12 @@ class VutOptions:
     """Folder of the networks of the learned VUTs; None for the shipped ones."""
 
     def __post_init__(self) -> None:
-        if not _is_positive(self.deadline_s):
-            raise UserError(f"--deadline is {self.deadline_s!r}: give seconds, more than 0")
-        if not _is_positive(self.memory_gib):
-            raise UserError(f"--vut-memory is {self.memory_gib!r}: give GiB, more than 0")
-
-
-def _is_positive(value: object) -> bool:
-    return isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0
+        for option, unit, value in (
+            ("--deadline", "seconds", self.deadline_s),
+            ("--vut-memory", "GiB", self.memory_gib),
+        ):
+            if not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0):
+                raise UserError(f"{option} is {value!r}: give {unit}, more than 0")
 
 
 BUILT_IN, INSTALLED, PYTHON, HERE = "built-in", "installed", "python", "here"
@@ -166,7 +163,15 @@ class Car(NamedTuple):
     v_mps: float
 
 
-class Seen(NamedTuple):
+class _State(NamedTuple):
+    t_s: float
+    x_pov_m: float
+    v_pov_mps: float
+    x_vut_m: float
+    v_vut_mps: float
+
+
+class Seen(_State):
     """What a VUT sees at a step: time and state, and nothing of the POV's driver.
 
     A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
@@ -186,58 +191,21 @@ class Seen(NamedTuple):
         v_vut_mps: speed of the VUT.
     """
 
-    t_s: float
-    x_pov_m: float
-    v_pov_mps: float
-    x_vut_m: float
-    v_vut_mps: float
+    _traffic: tuple[Car, ...] = ()
+    _lane_m: Bounds | None = None
+    _merged: bool = False
 
     @property
     def vehicles(self) -> tuple[Car, ...]:
         """All vehicles in the order of their rows: POV, VUT, and the cars ahead and behind."""
-        return Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
+        pair = Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
+        return self._traffic or pair
 
     @property
     def others(self) -> tuple[Car, ...]:
         """All cars of the mainline, the one in front first."""
         cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
         return tuple(sorted(cars, reverse=True))
-
-    @property
-    def lane_begin_m(self) -> float:
-        """Where the acceleration lane begins; 0 where there is none."""
-        return 0.0
-
-    @property
-    def lane_end_m(self) -> float:
-        """Where it ends; 0 where there is none."""
-        return 0.0
-
-    @property
-    def merged(self) -> bool:
-        """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
-        return self.x_vut_m >= 0.0
-
-    @property
-    def may_merge(self) -> bool:
-        """Whether a wish to merge, now, puts the VUT on the mainline in the next step.
-
-        False after the merge, and where there is no acceleration lane.
-        """
-        return False
-
-
-class SeenOnRoad(Seen):
-    """What a VUT sees in traffic, or on a road with an acceleration lane."""
-
-    _vehicles: tuple[Car, ...] = ()
-    _lane_m: Bounds | None = None
-    _merged: bool = False
-
-    @property
-    def vehicles(self) -> tuple[Car, ...]:
-        """All vehicles in the order of their rows."""
-        return self._vehicles
 
     @property
     def lane_begin_m(self) -> float:
@@ -256,7 +224,10 @@ class SeenOnRoad(Seen):
 
     @property
     def may_merge(self) -> bool:
-        """Whether a wish to merge, now, puts the VUT on the mainline in the next step."""
+        """Whether a wish to merge, now, puts the VUT on the mainline in the next step.
+
+        False after the merge, and where there is no acceleration lane.
+        """
         if self._lane_m is None or self._merged:
             return False
         return self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
@@ -276,11 +247,11 @@ def seen_in(
     `met` is the row that counts as POV, `lane_m` the acceleration lane, None without one, and
     `merged` whether the VUT has left it.
     """
-    state = t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT]
-    if lane_m is None and len(x_m) == 2:
-        return Seen(*state)
-    seen = SeenOnRoad(*state)
-    seen._vehicles, seen._lane_m, seen._merged = tuple(map(Car, x_m, v_mps)), lane_m, merged
+    seen = Seen(t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT])
+    if lane_m is not None:
+        seen._lane_m, seen._merged = lane_m, merged
+    if len(x_m) > 2:
+        seen._traffic = tuple(map(Car, x_m, v_mps))
     return seen
 
 
@@ -407,6 +378,7 @@ class PerCorridor(Driver):
 
     Attributes:
         renewal: begins the reason where that fails.
+        renew_first: whether the controller of a corridor is made anew before its next episode.
         seed: of the episode that begins, for controllers that draw random numbers.
     """
 
@@ -417,10 +389,9 @@ class PerCorridor(Driver):
         super().__init__(corridors)
         self._deadline = Deadline(deadline_s)
         self._reasons: list[str | None] = [None] * corridors
-        self._renew_first = [False] * corridors
+        self.renew_first = [False] * corridors
         self._signals: dict[int, Left] = {}
         self._lanes_m: list[Bounds | None] = [None] * corridors
-        self._wishes: NDArray[np.int8] | None = None
 
     @abstractmethod
     def renew(self, corridor: int) -> None:
@@ -444,9 +415,9 @@ class PerCorridor(Driver):
         activity = self.renewal
         try:
             with self._deadline as deadline:
-                if self._renew_first[corridor]:
+                if self.renew_first[corridor]:
                     deadline.call(corridor, self.renew, corridor)
-                    self._renew_first[corridor] = False
+                    self.renew_first[corridor] = False
                 activity, self.seed = "reset", case.told_seed
                 deadline.call(corridor, self.reset, corridor, seen_at_start(case))
         except BaseException as error:
@@ -478,14 +449,9 @@ class PerCorridor(Driver):
                     self._fault(k, deadline.reason(error))
                     answers[k] = math.nan
         if wishes:
-            self._wishes = np.array(
-                [wishes.get(k, NO_WISH) for k in range(self.corridors)], dtype=np.int8
-            )
+            self._wishes = np.full(self.corridors, NO_WISH, dtype=np.int8)
+            self._wishes[list(wishes)] = list(wishes.values())
         return np.array(answers)
-
-    def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the last answers wish, (K,); None where none of them says."""
-        return self._wishes
 
     def reason(self, corridor: int) -> str | None:
         """Return what the controller of a corridor did wrong."""
@@ -502,13 +468,9 @@ class PerCorridor(Driver):
     def _checked(self, corridor: int, seen: Seen) -> tuple[float, int]:
         return as_answer(self.answer(corridor, seen))
 
-    def renew_next(self, corridor: int) -> None:
-        """Have the controller of a corridor made anew before the next episode."""
-        self._renew_first[corridor] = True
-
     def _fault(self, corridor: int, reason: str) -> None:
         self._reasons[corridor] = reason
-        self.renew_next(corridor)
+        self.renew_first[corridor] = True
 
 
 class WrongAnswerError(Exception):

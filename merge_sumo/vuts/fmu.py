@@ -67,13 +67,6 @@ class Unit:
             raise UserError(
                 f"{path} is of FMI {self.description.fmiVersion}: export it as FMI 2.0 or 3.0"
             )
-        if fmpy.platform not in fmpy.supported_platforms(str(path)) and (
-            getattr(fmpy, "platform_tuple", None) not in fmpy.supported_platforms(str(path))
-        ):
-            raise UserError(
-                f"{path} has no binary for {fmpy.platform}, only for "
-                f"{', '.join(fmpy.supported_platforms(str(path))) or 'nothing'}"
-            )
         variables = {v.name: v for v in self.description.modelVariables}
         inputs = [
             (place, variables[name])

@@ -25,8 +25,6 @@ WISH: Final = 1
 """Numbers of an output that say whether to merge: the last one, if there."""
 Decision = float | tuple[float, bool]
 """An acceleration, or it and whether to merge."""
-WEIGHTED: Final = ("Gemm", "MatMul", "Conv", "ConvTranspose", "LSTM", "GRU", "RNN")
-"""Nodes whose constant inputs are weights."""
 _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
 
@@ -74,7 +72,6 @@ class Network:
             if tensors.uses_external_data(tensor)
         }
         """Files beside it; native code opens them."""
-        _check_weights(path)
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or inputs[0].type not in _DTYPES or list(inputs[0].shape)[-1:] != [4]:
             said = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
@@ -118,39 +115,6 @@ def _acceleration_mps2(output: np.ndarray[Any, Any], of_actions: FloatArray) -> 
     if not np.isfinite(output).all():
         return float("nan")
     return float(of_actions[int(output.argmax())])
-
-
-def _check_weights(path: Path) -> None:
-    """Raise `UserError` for a network with a constant that is NaN, or an infinite weight.
-
-    Infinity is a number like any other as a limit or in a mask, so only what nodes of `WEIGHTED`
-    multiply by counts as a weight. Constants of types that numpy does not know are not looked at.
-    """
-    import onnx
-
-    try:
-        model = onnx.load(path)
-    except Exception as error:  # onnx has a class of its own for every failure
-        raise UserError(f"{path} is no ONNX network that can be read: {error}") from error
-    nodes = [node for node in model.graph.node if node.op_type in WEIGHTED]
-    weights = {name for node in nodes for name in node.input}
-    constants = [(tensor.name, tensor) for tensor in model.graph.initializer]
-    constants += [
-        (node.output[0], attribute.t)
-        for node in model.graph.node
-        if node.op_type == "Constant"
-        for attribute in node.attribute
-        if attribute.name == "value"
-    ]
-    for name, tensor in constants:
-        values = onnx.numpy_helper.to_array(tensor)
-        if values.dtype.kind != "f":
-            continue
-        if np.isnan(values).any() or (name in weights and np.isinf(values).any()):
-            raise UserError(
-                f"{path} has weights that are not finite, in {name!r}: train it again, or export "
-                "an earlier state"
-            )
 
 
 class OnnxVut(PerCorridor):

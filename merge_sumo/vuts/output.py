@@ -21,7 +21,6 @@ MOST_BYTES: Final = 4 << 20
 KEPT_BYTES: Final = 1 << 20
 PENDING_BYTES: Final = 1 << 16
 """What is kept of what is printed before the folder of the log is there."""
-SUMO_ENDS: Final = ("Error: ", "Quitting (on error).")
 LINE_BYTES: Final = 200
 PATIENCE_S: Final = 1.0
 """Time that the end of what is printed has to come."""
@@ -43,11 +42,7 @@ class Output:
         """Return the last line that was printed, after a little wait for the end; "" for none."""
         self.close()
         lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
-        # A SUMO that a controller starts itself may end behind it, and is not why it ended.
-        said = list(lines)
-        while said and said[-1].startswith(SUMO_ENDS):
-            said.pop()
-        return as_reason((said or lines)[-1]) if lines else ""
+        return as_reason(lines[-1]) if lines else ""
 
     def close(self) -> None:
         """Take what is left; what a process that was left behind prints later is lost."""

@@ -70,7 +70,7 @@ class Program:
         line = self._output.last_line()
         return f"the controller {how}" + (f": {line}" if line else "")
 
-    def stop(self, grace_s: float = GRACE_S) -> None:
+    def stop(self, grace_s: float) -> None:
         """End the program and what it started; it may end by itself for a while first."""
         try:
             self._process.wait(grace_s)

@@ -159,7 +159,7 @@ class PythonVut(PerCorridor):
             _reset(vut.reset, seen, seed=self.seed)
         elif not inspect.isroutine(vut):
             self.renewal = "made anew for this episode, as it has no `reset`"
-            self.renew_next(corridor)
+            self.renew_first[corridor] = True
 
     def answer(self, corridor: int, seen: Seen) -> Any:
         """Ask the object, and keep the `signals` that it leaves as an attribute."""
@@ -204,7 +204,6 @@ class BatchedVut(Driver):
         self._wrong: dict[int, str] = {}
         """What is wrong in a corridor alone: its reset raised something, or its wish is none."""
         self._lanes_m = np.zeros((2, corridors))
-        self._wishes: NDArray[np.int8] | None = None
 
     def begin(self, corridor: int, case: Case) -> None:
         """Call `reset`, if there is one; an error is kept as the reason of the answer.
@@ -265,10 +264,6 @@ class BatchedVut(Driver):
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
         return self._parameters.present(self._object)
-
-    def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the last answers wish, (K,); None where they do not say."""
-        return self._wishes
 
     def reason(self, corridor: int) -> str | None:
         """Return what went wrong in a corridor."""

@@ -1,5 +1,7 @@
 """The VUT that chooses a gap on an acceleration lane: which one, and where it waits for none."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 from dataclasses import replace

@@ -28,7 +28,7 @@ from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import Host, HostedVut
-from merge_sumo.vuts.host.wire import About, WireError
+from merge_sumo.vuts.host.wire import About, Said, WireError
 from merge_sumo.vuts.output import KEPT_BYTES, MOST_BYTES, append
 from merge_sumo.vuts.spec import parse
 
@@ -242,14 +242,13 @@ class TestTheWire:
         assert taken == [(7, About.ACT, b"abc"), (8, About.CLOSE, b"")]
 
     def test_answers_are_unpacked_as_they_were_packed(self):
-        packed = wire.pack_answers(np.array([1.0, np.nan]), {1: "\ud800 no"})
-        answers, reasons, _, wishes = wire.unpack_answers(packed, 2)
+        packed = wire.pack_answers(np.array([1.0, np.nan]), Said({1: "\ud800 no"}))
+        answers, said = wire.unpack_answers(packed, 2)
         assert answers.tolist()[0] == 1.0
         assert np.isnan(answers[1])
-        assert reasons == {1: "\ud800 no"}
-        assert wishes is None
-        packed = wire.pack_answers(np.zeros(3), {}, wishes=np.array([-1, 0, 1], dtype=np.int8))
-        assert wire.unpack_answers(packed, 3).wishes.tolist() == [-1, 0, 1]
+        assert said == Said({1: "\ud800 no"})
+        packed = wire.pack_answers(np.zeros(3), Said(wishes=[-1, 0, 1]))
+        assert wire.unpack_answers(packed, 3)[1].wishes == [-1, 0, 1]
 
     @pytest.mark.parametrize(
         "wishes",

@@ -128,18 +128,6 @@ def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
     assert run_cases(in_process(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_weights_that_are_not_finite_are_refused(tmp_path, value):
-    path = network(tmp_path / "bad.onnx", answer=[0.5])
-    model = onnx.load(path)
-    weight = onnx.numpy_helper.to_array(model.graph.initializer[0]).copy()
-    weight[0, 0] = value
-    model.graph.initializer[0].CopyFrom(onnx.numpy_helper.from_array(weight, "w"))
-    path.write_bytes(model.SerializeToString())
-    with pytest.raises(UserError, match=r"bad\.onnx has weights that are not finite, in 'w'"):
-        in_process(f"onnx:{path}")
-
-
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "text.onnx").write_text("no network")
     network(tmp_path / "wide.onnx", answer=[0.0], width=5)

@@ -77,23 +77,6 @@ def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path)
     assert log.read_text().splitlines() == [f"note: {STAYED}"]
 
 
-@pytest.mark.slow
-def test_in_sumos_own_modes_sumo_drives_and_merges_it(tmp_path):
-    source = """
-while traci.simulation.getMinExpectedNumber() > 0:
-    traci.simulationStep()
-    if "vut" in traci.vehicle.getIDList() and traci.vehicle.getLaneChangeMode("vut") == 0:
-        traci.vehicle.setLaneChangeMode("vut", 1621)
-        traci.vehicle.setSpeedMode("vut", 31)
-        traci.vehicle.setSpeed("vut", -1)
-"""
-    log = tmp_path / "controller.log"
-    ran = drive(tmp_path, source, cases=6, log=log)
-    assert {t.error for t in ran} == {None}
-    assert all(t.x_vut_m[-1] < 130.0 for t in ran)
-    assert not log.exists()
-
-
 class TestTheShadow:
     """The SUMO that decides, step by step."""
 

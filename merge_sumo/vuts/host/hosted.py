@@ -33,7 +33,7 @@ from merge_sumo.values.signals import Left
 from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
 from merge_sumo.vuts.host import wire
-from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, WireError
+from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, Said, WireError
 from merge_sumo.vuts.output import Output
 
 T = TypeVar("T")
@@ -144,9 +144,7 @@ class Host:
             patience_s = GRACE * self._options.deadline_s + GRACE_S
         self._number += 1
         try:
-            rest = memoryview(wire.frame(self._number, about, content))
-            while rest:
-                rest = rest[os.write(self._to, rest) :]
+            wire.write(self._to, wire.frame(self._number, about, content))
             return self._answer(patience_s)
         except (OSError, EOFError):
             raise self._died() from None
@@ -300,9 +298,7 @@ class HostedVut(Driver):
         super().__init__(corridors)
         self._spec, self._options = spec, options
         self._begun: list[tuple[int, Case]] = []
-        self._reasons: dict[int, str] = {}
-        self._signals: dict[int, Left] = {}
-        self._wishes: NDArray[np.int8] | None = None
+        self._said = wire.NOTHING
         self._files: set[Path] = set()
         self._parameters: Mapping[str, float] = {}
         self._host = _first(self._started)
@@ -320,7 +316,8 @@ class HostedVut(Driver):
                 raise VutLostError(str(error), killed=error.death.killed) from error
             except UserError as error:
                 self._begun.clear()
-                self._reasons = dict.fromkeys(range(self.corridors), f"started anew: {error}")
+                why = dict.fromkeys(range(self.corridors), f"started anew: {error}")
+                self._said = Said(reasons=why)
                 return np.full(self.corridors, math.nan)
         content = wire.pack_scene(self._begun, scene)
         self._begun.clear()
@@ -333,9 +330,7 @@ class HostedVut(Driver):
                 # Not its driver, but what surrounds it failed: the VUT has changed that.
                 self._host.kill()
                 raise VutLostError(wire.from_json(answer.content, str), final=True)
-            answers = wire.unpack_answers(answer.content, self.corridors)
-            self._reasons, self._signals = answers.reasons, answers.signals
-            self._wishes = answers.wishes
+            answers, self._said = wire.unpack_answers(answer.content, self.corridors)
         except HostDiedError as died:
             own = died.corridor if (died.corridor or 0) < self.corridors else None
             how = {"final": died.hung, "killed": died.killed}
@@ -343,15 +338,16 @@ class HostedVut(Driver):
         except WireError:
             self._host.kill()
             raise VutLostError(how_it_ended(None)) from None
-        return answers.a_mps2
+        return answers
 
     def signals(self) -> Mapping[int, Left]:
         """Return what the VUT left with its last answers."""
-        return self._signals
+        return self._said.signals
 
     def wishes(self) -> NDArray[np.int8] | None:
         """Return what the VUT's last answers wish, (K,); None where none of them says."""
-        return self._wishes
+        wishes = self._said.wishes
+        return None if wishes is None else np.array(wishes, dtype=np.int8)
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the VUT, as they were when it was made."""
@@ -359,7 +355,7 @@ class HostedVut(Driver):
 
     def reason(self, corridor: int) -> str | None:
         """Return what the VUT did wrong in a corridor."""
-        return self._reasons.get(corridor)
+        return self._said.reasons.get(corridor)
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that the VUT has loaded so far."""

@@ -23,23 +23,23 @@ from merge_sumo.vuts.base import Vut, VutOptions, text_of
 from merge_sumo.vuts.blame_cell import BlameCell, current_call
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.file_audit import LoadedFiles
-from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening
+from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, Said
 from merge_sumo.vuts.registry import KINDS
 
 
 def main(settings: Mapping[str, Any]) -> None:
     """Host a VUT until the channel ends."""
     sys.argv[1:] = []
-    channel = _Channel()
+    hosting = _Hosting()
     _hear_signals()
     lower_limits(RLIMIT_DATA=int(settings["memory_gib"] * 2**30), RLIMIT_CORE=0)
     end_with(settings["lifeline"])
     current_call.share(mmap.mmap(settings["blame_cell"], BlameCell.FORMAT.size))
-    _Hosting(channel).serve()
+    hosting.serve()
 
 
-class _Channel:
-    """The frames of the other process."""
+class _Hosting:
+    """A VUT and its driver, by the questions that the other process asks."""
 
     def __init__(self) -> None:
         self._in, self._out = os.dup(0), os.dup(1)
@@ -51,37 +51,12 @@ class _Channel:
         sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
         self._buffer = bytearray()
         self._process = os.getpid()
-
-    def receive(self) -> Frame | None:
-        """Return the next question; None when the other process is gone."""
-        while (question := wire.take(self._buffer)) is None:
-            part = os.read(self._in, 1 << 16)
-            if not part:
-                return None
-            self._buffer += part
-        return question
-
-    def send(self, number: int, about: About, content: bytes = b"") -> None:
-        """Answer."""
-        if os.getpid() != self._process:
-            os._exit(0)  # the VUT forked, and its child came back here
-        rest = memoryview(wire.frame(number, about, content))
-        while rest:
-            rest = rest[os.write(self._out, rest) :]
-
-
-class _Hosting:
-    """A VUT and its driver, by the questions that are asked."""
-
-    def __init__(self, channel: _Channel) -> None:
-        self._channel = channel
-        self._loaded: LoadedFiles | None = None
         self._vut: Vut | None = None
         self._driver: Driver | None = None
 
     def serve(self) -> None:
         """Answer question by question."""
-        while (question := self._channel.receive()) is not None:
+        while (question := self._receive()) is not None:
             try:
                 about, content = self._answer(question)
             except UserError as error:
@@ -92,9 +67,20 @@ class _Hosting:
             except Exception as error:
                 sentence = f"{type(error).__name__}: {text_of(error)}"
                 about, content = About.REFUSED, wire.to_json(sentence)
-            self._channel.send(question.number, about, content)
+            if os.getpid() != self._process:
+                os._exit(0)  # the VUT forked, and its child came back here
+            wire.write(self._out, wire.frame(question.number, about, content))
             if question.about is About.CLOSE:
                 return
+
+    def _receive(self) -> Frame | None:
+        """Return the next question; None when the other process is gone."""
+        while (question := wire.take(self._buffer)) is None:
+            part = os.read(self._in, 1 << 16)
+            if not part:
+                return None
+            self._buffer += part
+        return question
 
     def _answer(self, question: Frame) -> tuple[About, bytes]:
         if question.about is About.OPEN:
@@ -120,7 +106,6 @@ class _Hosting:
 
     def _files(self) -> list[str]:
         assert self._vut is not None, "opened first"  # noqa: S101
-        assert self._loaded is not None, "opened first"  # noqa: S101
         return sorted({str(file.resolve()) for file in self._vut.files} | self._loaded.files())
 
     def _act(self, driver: Driver, content: bytes) -> bytes:
@@ -130,7 +115,9 @@ class _Hosting:
         answers = driver.act(scene)
         wrong = np.flatnonzero(~np.isfinite(answers) & scene.active).tolist()
         reasons = {k: reason for k in wrong if (reason := driver.reason(k)) is not None}
-        return wire.pack_answers(answers, reasons, driver.signals(), driver.wishes())
+        wishes = driver.wishes()
+        told = None if wishes is None else wishes.tolist()
+        return wire.pack_answers(answers, Said(reasons, dict(driver.signals()), told))
 
 
 def _hear_signals() -> None:

@@ -7,10 +7,10 @@ answer with the same number.
 from __future__ import annotations
 
 import json
-import math
+import os
 import struct
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
@@ -18,12 +18,11 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import NO_SIGNALS, Scene
+from merge_sumo.drivers.base import Scene
 from merge_sumo.values.case import Case, FloatArray, ToldCase
 from merge_sumo.values.scenario import RANGES, US23, Bounds, Scenario, lane_of
-from merge_sumo.values.signals import Left, as_signals
+from merge_sumo.values.signals import as_signals
 from merge_sumo.vuts.base import VutSpec
 
 T = TypeVar("T")
@@ -63,6 +62,13 @@ class Frame(NamedTuple):
 def frame(number: int, about: About, content: bytes = b"") -> bytes:
     """Return the bytes of a frame."""
     return HEAD.pack(len(content), number, about) + content
+
+
+def write(descriptor: int, content: bytes) -> None:
+    """Write all of it; raises OSError where that cannot be."""
+    rest = memoryview(content)
+    while rest:
+        rest = rest[os.write(descriptor, rest) :]
 
 
 def take(buffer: bytearray) -> Frame | None:
@@ -119,22 +125,34 @@ class Lost(msgspec.Struct, frozen=True):
     final: bool
 
 
-class _Beside(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What an answer says besides accelerations, by corridor."""
+class Said(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What comes with accelerations: why one is not finite and what was left, by corridor.
+
+    `wishes` are those of all corridors; None where no answer has one.
+    """
 
     reasons: dict[int, str] = {}
     signals: dict[int, dict[str, Any]] = {}
     wishes: list[Literal[-1, 0, 1]] | None = None
 
 
+NOTHING: Final = Said()
+
+
 _TOLD: Final = ("x_vut0_m", "level0_a_mps2", "level0_v_mps", "a_min_mps2", "a_max_mps2")
 """What a VUT is told of its scenario, besides the acceleration lane."""
-_NO_LANE: Final = (math.nan, math.nan)
-_BEGIN: Final = struct.Struct(f"<II{len(_TOLD) + len(_NO_LANE)}d")
-"""Corridor, draw, and what is told; position and speed of each vehicle follow."""
-_HEAD: Final = struct.Struct("<IIIII")
-"""Episodes that begin, corridors, vehicles, whether the cars that are met are told, and whether
-VUTs have merged."""
+_DTYPES: Final = (np.bool_, np.int64, np.float64, np.float64, np.int64, np.bool_)
+"""Of the arrays of a `Scene`."""
+
+
+class _Begun(msgspec.Struct, array_like=True, frozen=True):
+    """An episode that begins in a corridor."""
+
+    corridor: int
+    draw: int
+    told: tuple[float, ...]
+    lane_m: tuple[float, float] | None
+    starts: tuple[tuple[float, float], ...]
 
 
 def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
@@ -142,17 +160,19 @@ def pack_scene(begun: Sequence[tuple[int, Case]], scene: Scene) -> bytes:
 
     Of a case only what its VUT may know travels.
     """
-    vehicles, corridors = scene.x_m.shape
-    optional = (scene.facing, scene.merged)
-    tells = (array is not None for array in optional)
-    parts = [_HEAD.pack(len(begun), corridors, vehicles, *tells)]
+    episodes = []
     for corridor, case in begun:
-        told = (getattr(case.scenario, name) for name in _TOLD)
-        parts.append(_BEGIN.pack(corridor, case.draw, *told, *(lane_of(case.scenario) or _NO_LANE)))
-        parts.append(np.array(case.starts(), dtype=np.float64).tobytes())
-    arrays = (scene.active, scene.step, scene.x_m, scene.v_mps, *optional)
-    parts += [np.ascontiguousarray(array).tobytes() for array in arrays if array is not None]
-    return b"".join(parts)
+        told = tuple(float(getattr(case.scenario, name)) for name in _TOLD)
+        starts = tuple((float(x_m), float(v_mps)) for x_m, v_mps in case.starts())
+        episodes.append(_Begun(corridor, case.draw, told, lane_of(case.scenario), starts))
+    arrays = [
+        None if array is None else np.ascontiguousarray(array, dtype).tobytes()
+        for array, dtype in zip(scene, _DTYPES, strict=True)
+    ]
+    return msgspec.msgpack.encode((episodes, arrays))
+
+
+_SCENE: Final = msgspec.msgpack.Decoder(tuple[list[_Begun], list[bytes | None]])
 
 
 @lru_cache(maxsize=8)
@@ -164,69 +184,37 @@ def _any_scenario(lane_m: Bounds | None, *told: float) -> Scenario:
 
 def unpack_scene(content: bytes) -> tuple[list[tuple[int, Case]], Scene]:
     """Return what `pack_scene` packed; level and orientation of the cases are not in it."""
-    count, k, vehicles, tells_met, tells_merged = _HEAD.unpack_from(content)
-    at = _HEAD.size
+    episodes, packed = _SCENE.decode(content)
     begun: list[tuple[int, Case]] = []
-    for _ in range(count):
-        corridor, draw, *told, begin_m, end_m = _BEGIN.unpack_from(content, at)
-        at += _BEGIN.size
-        starts = np.frombuffer(content, np.float64, 2 * vehicles, at).reshape(vehicles, 2)
-        at += starts.nbytes
-        rows = tuple((x_m, v_mps) for x_m, v_mps in starts.tolist())
-        lane_m = None if math.isnan(begin_m) else (begin_m, end_m)
-        scenario = _any_scenario(lane_m, *told)
-        begun.append((corridor, ToldCase(level=0, draw=draw, scenario=scenario, told=rows)))
-    active = np.frombuffer(content, np.bool_, k, at)
-    step = np.frombuffer(content, np.int64, k, at + k)
-    at += 9 * k
-    x_m, v_mps = np.frombuffer(content, np.float64, 2 * vehicles * k, at).reshape(2, vehicles, k)
-    at += x_m.nbytes + v_mps.nbytes
-    met = np.frombuffer(content, np.int64, k, at) if tells_met else None
-    at += 8 * k if tells_met else 0
-    merged = np.frombuffer(content, np.bool_, k, at) if tells_merged else None
-    return begun, Scene(active, step, x_m, v_mps, met, merged)
+    for one in episodes:
+        scenario = _any_scenario(one.lane_m, *one.told)
+        case = ToldCase(level=0, draw=one.draw, scenario=scenario, told=one.starts)
+        begun.append((one.corridor, case))
+    arrays: list[Any] = [
+        None if array is None else np.frombuffer(array, dtype)
+        for array, dtype in zip(packed, _DTYPES, strict=True)
+    ]
+    active, step, x_m, v_mps, facing, merged = arrays
+    shape = -1, len(active)
+    return begun, Scene(active, step, x_m.reshape(shape), v_mps.reshape(shape), facing, merged)
 
 
-class Answers(NamedTuple):
-    """Accelerations, (K,), and by corridor why one is not finite, and what was left with it.
-
-    `wishes` is (K,), None where no answer has one.
-    """
-
-    a_mps2: FloatArray
-    reasons: dict[int, str]
-    signals: dict[int, Left]
-    wishes: NDArray[np.int8] | None = None
-
-
-def pack_answers(
-    answers: FloatArray,
-    reasons: Mapping[int, str],
-    signals: Mapping[int, Left] = NO_SIGNALS,
-    wishes: NDArray[np.int8] | None = None,
-) -> bytes:
-    """Return accelerations, (K,), the reasons of those that are not finite, signals and wishes."""
+def pack_answers(answers: FloatArray, said: Said = NOTHING) -> bytes:
+    """Return accelerations, (K,), and what comes with them, as bytes."""
     numbers = np.ascontiguousarray(answers, dtype=np.float64).tobytes()
-    if not reasons and not signals and wishes is None:
-        return numbers
-    said = None if wishes is None else wishes.tolist()
-    return numbers + to_json(_Beside(dict(reasons), dict(signals), said))
+    return numbers if said == NOTHING else numbers + to_json(said)
 
 
-def unpack_answers(content: bytes, k: int) -> Answers:
-    """Return what `pack_answers` packed for `k` corridors.
-
-    Raises `WireError` for what it did not.
-    """
+def unpack_answers(content: bytes, k: int) -> tuple[FloatArray, Said]:
+    """Return what `pack_answers` packed for `k` corridors; `WireError` for what it did not."""
     if len(content) < 8 * k:
         raise WireError("it has too few answers")
     answers = np.frombuffer(content, np.float64, k)
     if len(content) == 8 * k:
-        return Answers(answers, {}, {})
-    said = from_json(content[8 * k :], _Beside)
+        return answers, NOTHING
+    said = from_json(content[8 * k :], Said)
     if said.wishes is not None and len(said.wishes) != k:
         raise WireError("it has another number of wishes")
     # Who wrote this runs a stranger's code: what it left is checked here, too.
     signals = {c: as_signals(values) for c, values in said.signals.items() if 0 <= c < k}
-    wishes = None if said.wishes is None else np.array(said.wishes, dtype=np.int8)
-    return Answers(answers, said.reasons, signals, wishes)
+    return answers, Said(said.reasons, dict(signals), said.wishes)

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Callable
 from contextlib import suppress
 from ipaddress import ip_address
-from itertools import chain
 from pathlib import Path
 from time import monotonic
 from typing import Final
@@ -50,8 +49,6 @@ class Door:
                 "--vut traci:PORT"
             ) from error
         self._note = note
-        self.refused = ""
-        """Whose connections were refused last."""
 
     @property
     def port(self) -> int:
@@ -73,20 +70,8 @@ class Door:
                 return connection
             connection.close()
             if refusal:
-                self.refused = f"{refusal} did"
                 self._note(f"{refusal} connected to the port of the controller and was not served")
         return None
-
-    def another_waits(self, peer: int | None) -> bool:
-        """Return whether a client that would be served has connected besides the one that is."""
-        with suppress(OSError):
-            self._listener.settimeout(0.0)
-            while True:
-                connection = self._listener.accept()[0]
-                with connection:
-                    if _refusal(connection, peer) is None:
-                        return True
-        return False
 
     def close(self) -> None:
         """Close it."""
@@ -136,35 +121,25 @@ def _host(text: str) -> object:
 
 def descends(inode: int, program: int) -> bool:
     """Return whether a program has a socket, or a process below it or of its session has it."""
-    parents, of_session = _processes(program)
-    descendants = (process for process in parents if _has_ancestor(process, program, parents))
-    # The session first: its processes are few.
-    return any(_has(process, inode) for process in chain(of_session, descendants))
-
-
-def _processes(session: int) -> tuple[dict[int, int], list[int]]:
-    """Return the parents of all processes, and those of a session."""
-    parents, of_session = {}, []
+    known: dict[int, tuple[int, int]] = {}  # parent and session
     for entry in os.listdir("/proc"):  # noqa: PTH208 (names alone, of many)
-        if not entry.isdecimal():
-            continue
-        with suppress(OSError, ValueError):
-            stat = Path("/proc", entry, "stat").read_text(encoding="utf-8", errors="replace")
-            _, parent, _, its_session, *_ = stat.rpartition(")")[2].split()
-            parents[int(entry)] = int(parent)
-            if int(its_session) == session:
-                of_session.append(int(entry))
-    return parents, of_session
+        if entry.isdecimal():
+            with suppress(OSError, ValueError):
+                stat = Path("/proc", entry, "stat").read_text(encoding="utf-8", errors="replace")
+                _, parent, _, session, *_ = stat.rpartition(")")[2].split()
+                known[int(entry)] = int(parent), int(session)
 
+    def is_of_program(process: int) -> bool:
+        for _ in known:  # a number that was given anew could make a circle
+            if process == program:
+                return True
+            if process not in known:
+                return False
+            parent, session = known[process]
+            process = program if session == program else parent
+        return False
 
-def _has_ancestor(process: int, ancestor: int, parents: dict[int, int]) -> bool:
-    seen: set[int] = set()
-    while process in parents and process not in seen:
-        if process == ancestor:
-            return True
-        seen.add(process)
-        process = parents[process]
-    return False
+    return any(_has(process, inode) for process in known if is_of_program(process))
 
 
 def _has(process: int, inode: int) -> bool:

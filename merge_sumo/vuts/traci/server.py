@@ -34,14 +34,11 @@ MOST_FILE_BYTES: Final = 16 << 20
 
 
 class FaultError(Exception):
-    """What the client did wrong.
+    """The client's fault; where its connection is `gone`, its program may say why."""
 
-    Its connection may be `gone`, so that its program may say why, or its step `late`.
-    """
-
-    def __init__(self, text: str, *, gone: bool = False, late: bool = False) -> None:
+    def __init__(self, text: str, *, gone: bool = False) -> None:
         super().__init__(text)
-        self.gone, self.late = gone, late
+        self.gone = gone
 
 
 class ClosedError(Exception):
@@ -87,7 +84,7 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
                 answer = {"v_mps": client.show(message["states"], first=first, merged=merged)}
                 answer |= {"merge": sumo.wants_to_merge, "by_sumo": sumo.by_sumo}
         except FaultError as fault:
-            answer = {"fault": str(fault), "gone": fault.gone, "late": fault.late}
+            answer = {"fault": str(fault), "gone": fault.gone}
         except ClosedError:
             answer = {"closed": True}
         channel.send({**answer, "notes": client.session.notes})
@@ -242,8 +239,7 @@ class Client:
             except TimeoutError as error:
                 what = "sent half a message and no more" if half else "made no step"
                 raise FaultError(
-                    f"the controller {what} within the deadline of {self._deadline_s:g} s",
-                    late=not half,
+                    f"the controller {what} within the deadline of {self._deadline_s:g} s"
                 ) from error
             except OSError as error:
                 raise FaultError("the controller broke the connection", gone=True) from error

@@ -20,7 +20,6 @@ from time import monotonic
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
@@ -34,7 +33,8 @@ from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
-from merge_sumo.vuts.process import Program, split_command
+from merge_sumo.vuts.output import append
+from merge_sumo.vuts.process import GRACE_S, Program, split_command
 from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door
 from merge_sumo.vuts.traci.server import FaultError
@@ -109,7 +109,6 @@ class TraciVut(Driver):
         self._program: Program | None = None
         self._client: socket.socket | None = None
         self._reason: str | None = None
-        self._wishes: NDArray[np.int8] | None = None
         self._noted: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
@@ -140,10 +139,6 @@ class TraciVut(Driver):
                 self._disconnect()
         return np.array([math.nan])
 
-    def wishes(self) -> NDArray[np.int8] | None:
-        """Return whether SUMO put the VUT beside the acceleration lane; None without a lane."""
-        return self._wishes
-
     def reason(self, corridor: int) -> str | None:
         """Return what the client did wrong."""
         return self._reason
@@ -166,7 +161,7 @@ class TraciVut(Driver):
             name: (x, v, (v - self._before_mps.get(name, v)) / DT_S)
             for name, x, v in zip(VEHICLES, x_m, v_mps, strict=False)
         }
-        self._before_mps = {name: v for name, (_, v, _) in states.items()}
+        self._before_mps = dict(zip(VEHICLES, v_mps, strict=False))
         starting, self._starting = self._starting, False
         merged = scene.merged is not None and bool(scene.merged[0])
         message = {"states": states, "merged": merged}
@@ -224,8 +219,6 @@ class TraciVut(Driver):
         text = str(answer["fault"])
         if answer["gone"] and self._program is not None and (ended := self._program.ended(0.5)):
             text += f"; {ended}"
-        if answer["late"] and self._door is not None and self._door.another_waits(self._peer):
-            text += "; another client waits, but one at a time is served"
         raise FaultError(text)
 
     @property
@@ -259,7 +252,15 @@ class TraciVut(Driver):
                 )
             connection = self._accept(self._door, patience_s)
         if connection is None:
-            raise FaultError(self._why_none_came(self._door.port, patience_s))
+            ended = self._program.ended(0.0) if self._program else ""
+            late = f"no TraCI client connected to {HOST}:{self._door.port} in {patience_s:g} s"
+            if self._command is not None:
+                late += (
+                    ": the command is told the port as {port} and in MERGE_SUMO_PORT, for "
+                    "traci.init(PORT) or traci.start(..., port=PORT)"
+                )
+            self._disconnect()
+            raise FaultError(f"{ended} (before it connected)" if ended else late)
         self._patience_s = self._options.connect_s
         self._client = connection
         try:
@@ -268,22 +269,6 @@ class TraciVut(Driver):
             self._shadow.close()
             self._disconnect()
             raise FaultError(f"the SUMO that answers the controller failed: {error}") from error
-
-    def _why_none_came(self, port: int, patience_s: float) -> str:
-        ended = self._program.ended(0.0) if self._program else ""
-        refused = self._door.refused if self._door else ""
-        self._disconnect()
-        if ended:
-            return f"{ended} (before it connected)"
-        late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
-        if refused:
-            late += f" but {refused}"
-        if self._command is not None:
-            late += (
-                ": the command is told the port as {port} and in MERGE_SUMO_PORT, "
-                "for traci.init(PORT) or traci.start(..., port=PORT)"
-            )
-        return late
 
     def _accept(self, door: Door, patience_s: float) -> socket.socket | None:
         """Return the connection to serve; None when none comes, or the program has ended."""
@@ -301,12 +286,11 @@ class TraciVut(Driver):
         if sentence in self._noted:
             return
         self._noted.add(sentence)
-        log = self._options.log
-        if log is None:
+        if self._options.log is None:
             sys.stderr.write(f"note: {sentence}\n")
-            return
-        with suppress(OSError), log.open("a", encoding="utf-8") as file:
-            file.write(f"note: {sentence}\n")
+        else:
+            with suppress(OSError):
+                append(self._options.log, f"note: {sentence}\n".encode())
 
     def _disconnect(self, *, grace: bool = False) -> None:
         """Close the door, end the program and drop the client."""
@@ -319,7 +303,7 @@ class TraciVut(Driver):
 
     def _stop_program(self, *, grace: bool) -> None:
         if self._program is not None:
-            self._program.stop(**({} if grace else {"grace_s": 0.0}))
+            self._program.stop(GRACE_S if grace else 0.0)
             self._program = None
 
     def _drop_client(self) -> None:
@@ -352,35 +336,25 @@ class Shadow:
         with ExitStack() as opened:
             folder = opened.enter_context(scratch_folder())
             write_files(folder, self._road, self._scenario)
-            child = SumoChild(f"{server.__name__}:{server.main.__name__}", folder, {})
-            opened.callback(child.kill)
+            self._child = SumoChild(f"{server.__name__}:{server.main.__name__}", folder, {})
+            opened.callback(self._child.kill)
             self._opened = opened.pop_all()
-        self._child, self._ready = child, False
 
     def serve(self, connection: socket.socket, deadline_s: float) -> None:
         """Hand a connection over to it.
 
         Raises `UserError` where SUMO cannot use the net, `ChildDiedError` when the process has
-        ended twice, and TimeoutError when it does not answer.
+        ended, and TimeoutError when it does not answer.
         """
-        if not self._ready:
-            try:
-                self._get_ready()
-            except ChildDiedError:  # ended from outside: the client has not been heard yet
-                self.close()
-                self.start()
-                self._get_ready()
         assert self._child is not None, "started"  # noqa: S101
+        if not self._ready:
+            message = self._child.receive(START_S)
+            if "refused" in message:
+                why = self._child.said() or message["refused"]
+                raise UserError(f"SUMO cannot use the net {self._road.path}: {why}")
+            self._ready = True
         self._child.ask({"do": "connect", "deadline_s": deadline_s}, WORK_S, connection)
         self.listens = True
-
-    def _get_ready(self) -> None:
-        assert self._child is not None, "started"  # noqa: S101
-        message = self._child.receive(START_S)
-        if "refused" in message:
-            why = self._child.said() or message["refused"]
-            raise UserError(f"SUMO cannot use the net {self._road.path}: {why}")
-        self._ready = True
 
     def ask(self, message: Mapping[str, Any], patience_s: float) -> dict[str, Any]:
         """Return its answer; raises `ChildDiedError`, or TimeoutError where there is none."""
@@ -397,7 +371,7 @@ class Shadow:
 
     def close(self) -> None:
         """End it."""
-        self._child, self.listens = None, False
+        self._child, self._ready, self.listens = None, False, False
         self._opened.close()
 
 
