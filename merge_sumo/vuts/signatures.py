@@ -74,14 +74,15 @@ def check_call(
 def fits(function: Callable[..., Any], count: int) -> bool | None:
     """Return whether a function takes exactly `count` positional arguments; None if unknown."""
     try:
-        signature = inspect.signature(function)
+        parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return None
-    try:
-        signature.bind(*range(count))
-    except TypeError:
-        return False
-    return True
+    in_order = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+    places = [parameter for parameter in parameters if parameter.kind in in_order]
+    needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
+    more = any(parameter.kind is Parameter.VAR_POSITIONAL for parameter in parameters)
+    by_name = any(parameter.kind is Parameter.KEYWORD_ONLY for parameter in needed)
+    return len(needed) <= count and (more or count <= len(places)) and not by_name
 
 
 def _parameter(parameter: Parameter) -> str:
