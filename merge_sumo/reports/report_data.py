@@ -38,10 +38,11 @@ from merge_sumo.values.severity import Severity
 from merge_sumo.values.signals import to_record
 from merge_sumo.values.trajectory import Trajectory
 
-SVO_NEAR_RAD: Final = 0.1
 NEAR_SHARE: Final = 1.0 / 16.0
-MOST_STEPS: Final = 20
-"""Batches, or groups of batches, in the chart of the search."""
+STEPS: Final = 20
+"""Points of a curve in the chart of the search, at most."""
+MOST_BALLS: Final = 20_000
+"""Balls that are counted for these curves: of more failures they have fewer points."""
 SPEED_UNIT_MPS: Final = 0.002
 """Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
 COUNT_GRID: Final = (32, 20)
@@ -162,32 +163,23 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
 
 
 def _coordinate(c: Coordinate) -> dict[str, Any]:
-    low, high = c.dimension.low, c.dimension.high
-    return {
-        "field": c.field,
-        "name": c.name,
-        "unit": c.unit,
-        "digits": c.digits,
-        "low": round(low, 4),
-        "high": round(high, 4),
-        # Cases are shown in full this near to where the reader is in a third coordinate.
-        "near": SVO_NEAR_RAD if c.unit == "rad" else NEAR_SHARE * (high - low),
-    }
+    known = {"name": c.name, "unit": c.unit, "digits": c.digits, **to_plain(c.dimension)}
+    # Cases are shown in full this near to where the reader is in a third coordinate.
+    return {**known, "near": NEAR_SHARE * (c.dimension.high - c.dimension.low)}
 
 
 def _search(model: ReportModel) -> dict[str, Any]:
-    """Return the coverage of each level after groups of batches."""
-    batches = sorted({o.batch for o in model.cases})
-    width = -(-len(batches) // MOST_STEPS) or 1
+    """Return the coverage of each level after numbers of cases."""
+    number = min(STEPS, max(MOST_BALLS // max(len(model.worst), 1), 1))
+    steps = sorted({len(model.run.outcomes) * step // number for step in range(number + 1)})
     levels = []
     for level in model.levels:
-        at = [o for o in model.cases if o.failed and o.case.level == level]
-        group = np.array([o.batch // width for o in at], dtype=np.int64)
+        at = [o for o in model.worst if o.case.level == level]
         points = to_unit((o.case for o in at), level, model.run.scenario)
-        steps = range(-(-len(batches) // width))
-        covered = [round(fmc(points[group <= number]), 5) for number in steps]
+        place = np.array([o.index for o in at], dtype=np.int64)
+        covered = [round(fmc(points[place < step]), 5) for step in steps]
         levels.append({"level": level, "fmc": covered})
-    return {"batch": batches[::width], "width": width, "levels": levels}
+    return {"cases": steps, "levels": levels}
 
 
 def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:

@@ -19,8 +19,7 @@ from handmade import write_run
 
 from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.run import Run, failures, spread_failures
-from merge_sumo.reports import report
-from merge_sumo.reports import report_model as report_facts
+from merge_sumo.reports import report, report_model
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
@@ -336,7 +335,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
 def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
     if name is not None:
         corridor = corridor_of(name, tmp_path)
-        monkeypatch.setattr(report_facts, "road_of", lambda: corridor)
+        monkeypatch.setattr(report_model, "road_for", lambda _scenario: corridor)
     run = write_run(tmp_path / "run", per_level=3, error=None)
     with shown(browser, report.write_report(run)) as page:
         for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):

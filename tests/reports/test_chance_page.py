@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import pytest
 from campaigning import run_campaign
 from lxml import html
+from scipy.stats import binomtest
 from test_browser import browser, shown  # noqa: F401 (a fixture)
 
 from merge_sumo.campaigns.run import Run
@@ -94,16 +94,5 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
             assert int(decides) == index
             verdict = dict(cases[start])[index]
             assert verdict == (failures[start] > TOLERATED * RUNS)
-            # Clopper and Pearson: at the ends, so many failures or more, or fewer, have 2.5 %.
-            ends = (int(low) / 100.0, True), (int(high) / 100.0, False)
-            tails = [tail(end, failures[start], upper=upper) for end, upper in ends]
-            assert tails == pytest.approx([0.025, 0.025], abs=0.02)
-
-
-def tail(chance: float, failures: int, *, upper: bool) -> float:
-    """Return the probability of so many failures of 4 runs, or more; or of so many, or fewer."""
-    numbers = range(failures, RUNS + 1) if upper else range(failures + 1)
-    return sum(
-        math.comb(RUNS, number) * chance**number * (1.0 - chance) ** (RUNS - number)
-        for number in numbers
-    )
+            interval = binomtest(failures[start], RUNS).proportion_ci(method="exact")
+            assert (int(low), int(high)) == tuple(round(100.0 * end) for end in interval)

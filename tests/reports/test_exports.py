@@ -70,21 +70,14 @@ class TestOpenScenario:
             written = vertices(tree, who)
             assert len(written) == rows
             recorded = [
-                (
-                    float(step.get("time")),
-                    float(car.get("x")),
-                    float(car.get("y")),
-                    car.get("angle"),
-                )
-                for step in record.iterfind("timestep")
-                for car in step.iterfind("vehicle")
-                if car.get("id") == who
+                tuple(float(car.get(name)) for name in ("x", "y", "angle"))
+                for car in record.iterfind(f"timestep/vehicle[@id='{who}']")
             ][:rows]
-            for (t, x, y, h), (time, x_fcd, y_fcd, angle) in zip(written, recorded, strict=True):
-                assert (t, x, y) == pytest.approx((time, x_fcd, y_fcd), abs=1e-8)
+            for step, (ours, sumos) in enumerate(zip(written, recorded, strict=True)):
+                assert ours[:3] == pytest.approx((step * DT_S, *sumos[:2]), abs=1e-8)
                 # Degrees clockwise from north there, radians the other way from east here.
-                assert math.cos(h) == pytest.approx(math.sin(math.radians(float(angle))), abs=1e-8)
-                assert math.sin(h) == pytest.approx(math.cos(math.radians(float(angle))), abs=1e-8)
+                turned = math.remainder(ours[3] + math.radians(sumos[2] - 90.0), math.tau)
+                assert turned == pytest.approx(0.0, abs=1e-8)
 
     def test_starts_at_the_recorded_speed_and_stops_with_the_episode(self, made, scenario):
         trajectory = made.trajectory(failures(made.outcomes)[0].index)
@@ -93,7 +86,6 @@ class TestOpenScenario:
         assert speeds == pytest.approx([trajectory.v_pov_mps[0], trajectory.v_vut_mps[0]])
         stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
         assert float(stop.get("value")) == trajectory.t_end_s
-
         box = tree.find(".//Vehicle/BoundingBox")
         centre, size = box.find("Center"), box.find("Dimensions")
         assert float(centre.get("x")) + float(size.get("length")) / 2.0 == 0.0

@@ -189,31 +189,23 @@ def check_severity(told: Told, word: str, kind: str | None) -> None:
         assert (word == "Harsh") == (needed > 3.0)
 
 
-def check_arrival(told: Told, at: str, first: str, ahead: str) -> None:
+def check_arrival(told: Told, at: str, where: str | None, first: str, ahead: str) -> None:
     assert told.arrived
     near(at, told.end_s)
     near(ahead, abs(told.dx))
     assert first == ("VUT" if told.dx < 0.0 else "POV")
+    assert (where is None) == (told.lane_m is None)
+    if told.lane_m is not None and where is not None:
+        begin_m, end_m = told.lane_m
+        share = (told.place_m - begin_m) / (end_m - begin_m)
+        assert share >= 0.0
+        assert (where == "where the lane ends") == (share >= 1.0)
+        if found := re.search(NUMBER, where):
+            near(found.group(), 100.0 * share, 0)
 
 
 def check_margin(told: Told, fails: str, margin: str) -> None:
     assert (fails == "Fails") == (abs(told.dx) < NEAR_M) == (float(margin) < 0.0)
-
-
-def check_merge(told: Told, at: str, where: str, first: str, ahead: str) -> None:
-    assert told.lane_m is not None
-    check_arrival(told, at, first, ahead)
-    check_place(told, where)
-
-
-def check_place(told: Told, where: str) -> None:
-    """Check where on the lane a merge is said to be."""
-    begin_m, end_m = told.lane_m or (0.0, 0.0)
-    share = (told.place_m - begin_m) / (end_m - begin_m)
-    assert share >= 0.0
-    assert (where == "where the lane ends") == (share >= 1.0)
-    if found := re.search(NUMBER, where):
-        near(found.group(), 100.0 * share, 0)
 
 
 def check_stood(told: Told, seconds: str) -> None:
@@ -221,29 +213,24 @@ def check_stood(told: Told, seconds: str) -> None:
     near(seconds, DT_S * sum(x >= told.lane_m[0] and v < 0.1 for x, v, _ in told.vut))
 
 
-def check_braking_after(told: Told, mps2: str) -> None:
+def check_braking_after(told: Told, mps2: str | None) -> None:
     room = told.gap - told.closing * REACTION_S
-    assert told.closing > 0.0
-    near(mps2, told.closing**2 / (2.0 * room))
-
-
-def check_hardly_braking(told: Told) -> None:
-    room = told.gap - told.closing * REACTION_S
-    assert told.closing <= 0.0 or 0.0 <= told.closing**2 / (2.0 * room) < 0.1
+    needed = max(told.closing, 0.0) ** 2 / (2.0 * room)
+    if mps2 is None:
+        assert 0.0 <= needed < 0.1
+    else:
+        near(mps2, needed)
 
 
 def check_conduct(told: Told, vut: str, pov: str) -> None:
     assert (vut, pov) == (told.conduct(told.vut), told.conduct(told.pov))
 
 
-def check_way_out(told: Told, until: str) -> None:
+def check_way_out(told: Told, until: str | None = None) -> None:
     step = told.way_out_s()
-    assert step is not None
-    near(until, step * DT_S)
-
-
-def check_no_way_out(told: Told) -> None:
-    assert told.way_out_s() is None
+    assert (step is None) == (until is None)
+    if until is not None and step is not None:
+        near(until, step * DT_S)
 
 
 def check_timeout(told: Told, after: str) -> None:
@@ -251,13 +238,9 @@ def check_timeout(told: Told, after: str) -> None:
     near(after, told.end_s, 0)
 
 
-def check_impact(told: Told, mps: str) -> None:
+def check_impact(told: Told, later: str | None, mps: str) -> None:
+    assert later is None or told.gap > 0.0
     near(mps, abs(told.closing))
-
-
-def check_later(told: Told, mps: str) -> None:
-    assert told.gap > 0.0
-    check_impact(told, mps)
 
 
 def of_another_test(*_: object) -> None:
@@ -266,23 +249,21 @@ def of_another_test(*_: object) -> None:
 
 CHECKS: dict[str, Callable[..., None]] = {
     r"(Contact|Conflict|Harsh|Safe)(?: \(([^)]+)\))?\.": check_severity,
-    rf"The VUT reaches M at {NUMBER} s; the front bumper of the (VUT|POV) is {NUMBER} m ahead\.":
-        check_arrival,
-    rf"The car behind has to brake at {NUMBER} m/s² after {PLACE}\.": check_braking_after,
-    rf"The car behind has to brake at less than 0\.1 m/s² after {PLACE}\.": check_hardly_braking,
+    rf"The car behind has to brake at (?:less than 0\.1|{NUMBER}) m/s² after {PLACE}\.":
+        check_braking_after,
     r"(Fails|Does not fail): margin (-?[\d.]+)\.": check_margin,
     r"The VUT (.+), the POV (.+)\.": check_conduct,
     rf"Full braking or full acceleration of the VUT would have kept 6 m at (?:M|this place) until "
     rf"{NUMBER} s\.": check_way_out,
     r"Neither full braking nor full acceleration of the VUT would ever have kept 6 m at this "
-    r"place\.": check_no_way_out,
-    rf"The VUT merges at {NUMBER} s, (after \d+ % of the lane|where the lane ends); the front "
-    rf"bumper of the (VUT|POV) is {NUMBER} m ahead\.": check_merge,
+    r"place\.": check_way_out,
+    rf"The VUT (?:reaches M|merges) at {NUMBER} s"
+    r"(?:, (after \d+ % of the lane|where the lane ends))?; the front bumper of the (VUT|POV) is "
+    rf"{NUMBER} m ahead\.": check_arrival,
     rf"The VUT stood on the lane for {NUMBER} s\.": check_stood,
-    r"There never was a way out for the VUT\.": check_no_way_out,
+    r"There never was a way out for the VUT\.": check_way_out,
     rf"Timeout: the VUT did not reach the (?:merge point|mainline) in {NUMBER} s\.": check_timeout,
-    rf"Bodies touch at a relative speed of {NUMBER} m/s\.": check_impact,
-    rf"Bodies touch after (?:M|the merge), at a relative speed of {NUMBER} m/s\.": check_later,
+    rf"Bodies touch( after (?:M|the merge),)? at a relative speed of {NUMBER} m/s\.": check_impact,
     r"Bodies overlap before M, where the lanes run together\.": of_another_test,
     r"In the VUT's place .+ would have avoided it\.": of_another_test,
     r"No reference driver in the VUT's place would have avoided it\.": of_another_test,
@@ -338,10 +319,7 @@ class TestWhatIsSaid:
             )
             assert found is not None
             at, word, impact, where, first, ahead, kind = found.groups()
-            check_arrival(told, at, first, ahead)
-            assert (where is None) == (told.lane_m is None)
-            if where is not None:
-                check_place(told, where)
+            check_arrival(told, at, where, first, ahead)
             check_severity(told, word.capitalize(), kind)
             assert (impact is None) == (word != "contact")
 

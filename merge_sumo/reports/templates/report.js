@@ -577,12 +577,10 @@ function allCases() { // gives what shows the cases that the filters let through
 }
 /* ---------- the search ---------- */
 function search() {
-  const { batch, levels } = data.search;
-  if (!batch.length) return;
-  const half = data.search.width / 2, end = batch[batch.length - 1] + data.search.width;
-  const lines = levels.map(({ level, fmc }) => ({ name: `level${level}`, points: fmc.map((y, n) => [batch[n] + half, y]) }));
+  const { cases: numbers, levels } = data.search;
+  const lines = levels.map(({ level, fmc }) => ({ name: `level${level}`, points: fmc.map((y, n) => [numbers[n], y]) }));
   const most = Math.max(...levels.flatMap(({ fmc }) => fmc), 0.001);
-  plot(byId("chart-fmc"), { xRange: [batch[0], end], xLabel: "batch", yRange: [0, 1.1 * most], lines });
+  plot(byId("chart-fmc"), { xRange: [0, numbers[numbers.length - 1]], xLabel: "cases", yRange: [0, 1.1 * most], lines });
 }
 
 const worst = document.querySelector(".list button");
