@@ -13,17 +13,11 @@ from typing import Any, Final
 from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve_earlier
-from merge_sumo.campaigns.repeats import repeat, write_repeats
+from merge_sumo.campaigns.repeats import repeat
 from merge_sumo.campaigns.run import AGAINST, FILES, RAN_AGAIN, Run, spread_failures
 from merge_sumo.campaigns.scheduler import OnCase, Scheduler
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
-from merge_sumo.engine.evaluate import (
-    evaluate,
-    evaluate_anew,
-    evaluate_chunks,
-    open_simulators,
-    workers_or_here,
-)
+from merge_sumo.engine.evaluate import evaluate_chunks, open_simulators, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan, differences
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
@@ -76,9 +70,7 @@ class _Version:
     def ended(self, workers: Workers) -> Run:
         """Run some of all cases a second time; return the campaign."""
         done = Run(self.folder, self.outcomes)
-        again = partial(evaluate, self.plan, workers=workers)
-        if repeats := repeat(done, self.settings, again, partial(evaluate_anew, self.plan)):
-            write_repeats(done, repeats)
+        repeat(done, self.settings, self.plan, workers)
         return done
 
 
@@ -124,7 +116,7 @@ def resume_campaign(
     folder: Path,
     on_case: OnCase = lambda _: None,
     *,
-    on_before: OnCase | None = None,
+    on_before: OnCase = lambda _: None,
     workers: Workers | None = None,
     check: Callable[[], None] = lambda: None,
     begin: Callable[[], None] = lambda: None,
@@ -140,7 +132,7 @@ def resume_campaign(
         settings: those of the folder, and what a person named again (`settings_of`).
         plan: as of `run_campaign`, and so are `on_case`, `workers`, `check` and `begin`.
         folder: where the campaign is.
-        on_case: called with the cases that ran before, too, without `on_before`.
+        on_case: called with every outcome of a case that runs.
         on_before: called with the outcomes of cases that ran before.
         workers: where cases run.
         check: called after every batch.
@@ -172,7 +164,7 @@ def resume_campaign(
             if rewritten is not None:
                 one.journal.rewrite_settings(rewritten)
         for outcome in campaign.outcomes:
-            (on_before or on_case)(outcome)
+            on_before(outcome)
         return _run(*versions, workers=available, on_case=on_case, check=check, begin=begin)
 
 

@@ -5,7 +5,6 @@ The trajectories of a group go first, so that every outcome on disk has its traj
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -13,6 +12,7 @@ import os
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -80,27 +80,22 @@ class Journal:
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
-        try:
-            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
-        except OSError as error:
-            if error.errno in (errno.ENOENT, errno.ENOTDIR):
+        with ExitStack() as opened:
+            try:
+                outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
+                journal = cls(folder, opened.enter_context(outcomes), {})
+                run = Run(folder)
+                journal.settings = run.settings
+                dropped = len(run.outcomes) - run.whole_batches() + run.torn
+                if dropped:
+                    journal.keep(run, run.whole_batches())
+            except (FileNotFoundError, NotADirectoryError) as error:
                 raise UserError(
                     f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
                 ) from error
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
-        try:
-            journal = cls(folder, outcomes, {})
-            run = Run(folder)
-            journal.settings = run.settings
-            dropped = len(run.outcomes) - run.whole_batches() + run.torn
-            if dropped:
-                journal.keep(run, run.whole_batches())
-        except OSError as error:
-            outcomes.close()
-            raise UserError(f"cannot write {folder}: {error.strerror}") from error
-        except BaseException:
-            outcomes.close()
-            raise
+            except OSError as error:
+                raise UserError(f"cannot write {folder}: {error.strerror}") from error
+            opened.pop_all()
         return journal, run, dropped
 
     def keep(self, run: Run, cases: int) -> None:

@@ -16,16 +16,18 @@ The file of a folder that somebody sent is data as everything in it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import evaluate, evaluate_anew
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, replaced, to_json
-from merge_sumo.values.case import Case
+from merge_sumo.system.workers import Workers
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.values.score import Outcome
@@ -68,40 +70,32 @@ class Repeat(Record, frozen=True, omit_defaults=True):
 
 
 def repeat(
-    run: Run,
-    settings: CampaignSettings,
-    run_cases: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
-    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
+    run: Run, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
 ) -> list[Repeat]:
-    """Run some cases of a campaign again; return what became of them, in the order of the cases.
+    """Run some cases of a campaign again, and keep in its folder what became of them, by index.
 
-    Cases whose trajectory is lost, and those that end in an error now, are left out. `run_anew`
-    runs cases in a process in which none ran before.
+    Cases whose trajectory is lost, and those that end in an error now, are left out.
     """
     chosen = chosen_again(run.outcomes, settings)
     recorded = run.trajectories(outcome.index for outcome in chosen)
     again = [outcome for outcome in chosen if outcome.index in recorded]
-    found = []
-    for place, ran in run_cases([outcome.case for outcome in again]) if again else ():
+    if not again:
+        return []
+    cases, found = [outcome.case for outcome in again], []
+    for place, ran in evaluate(plan, cases, workers):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(compared(again[place], recorded[again[place].index], ran))
+            found.append(_compared(again[place], recorded[again[place].index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
-        drawn = _drawn([outcome.case for outcome in again], run_anew)
-        by_index = dict(zip((outcome.index for outcome in again), drawn, strict=True))
-        found = [one if one.same else replaced(one, drawn=by_index[one.index]) for one in found]
-    return sorted(found, key=lambda one: one.index)
-
-
-def _drawn(
-    cases: Sequence[Case],
-    run_anew: Callable[[Sequence[Case]], Iterable[tuple[int, Episode]]],
-) -> list[bool]:
-    """Return which of some cases differ between two new processes that run the same cases."""
-    first, second = (dict(run_anew(cases)) for _ in range(2))
-    return [
-        _difference(first[place].trajectory, second[place].trajectory) != (None, None)
-        for place in range(len(cases))
-    ]
+        first, second = (dict(evaluate_anew(plan, cases)) for _ in range(2))
+        drawn = {
+            outcome.index: _difference(first[place].trajectory, second[place].trajectory)
+            != (None, None)
+            for place, outcome in enumerate(again)
+        }
+        found = [one if one.same else replaced(one, drawn=drawn[one.index]) for one in found]
+    found.sort(key=lambda one: one.index)
+    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)))
+    return found
 
 
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
@@ -121,18 +115,13 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
         if not outcome.measures.end.is_error
         and (own_vut or (own_pov and outcome.case.level == OWN))
     ]
-    places = spread_places(len(tested), min(MOST, -(-len(tested) // ONE_IN)))
-    return [tested[place] for place in places]
-
-
-def spread_places(cases: int, count: int) -> list[int]:
-    """Return the places of `count` of so many cases: the first ones and others, descending."""
+    count = min(MOST, -(-len(tested) // ONE_IN))
     first = (count + 1) // 2
-    others = np.linspace(cases - 1, first, count - first).astype(np.int64).tolist()
-    return [*others, *reversed(range(first))]
+    others = np.linspace(len(tested) - 1, first, count - first).astype(np.int64).tolist()
+    return [tested[place] for place in (*others, *reversed(range(first)))]
 
 
-def compared(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
+def _compared(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
     """Return how the second run of a case compares with the recorded one."""
     differs_from_s, first = _difference(recorded, ran.trajectory)
     now = ran.outcome
@@ -156,11 +145,6 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
     # The acceleration of a step is the answer to its state, which was the same.
     vehicles = np.flatnonzero(differs[step, :, 2]).tolist()
     return round(step * DT_S, 1), VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
-
-
-def write_repeats(run: Run, found: Iterable[Repeat]) -> None:
-    """Write what became of the cases that ran twice into the folder of their campaign."""
-    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)))
 
 
 def read_repeats(run: Run) -> list[Repeat]:

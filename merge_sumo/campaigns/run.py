@@ -12,7 +12,6 @@ zip archive. Folders of older versions, without hashes, are read as they are.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.records import decode
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import one_per_case
@@ -167,11 +166,9 @@ class Run:
         """A sentence on the cases that ran again; empty where none did."""
         if not self.ran_again:
             return ""
-        one = self.ran_again == 1
         return (
-            f"{self.ran_again} {'case' if one else 'cases'} ran again, because a process of "
-            f"{'it' if one else 'theirs'} was killed or stopped, and {'has' if one else 'have'} "
-            "the outcome of the last time."
+            f"{counted(self.ran_again, 'case')} ran again, because a process was killed or "
+            "stopped; the outcome is that of the last time."
         )
 
     def outcome(self, index: int) -> Outcome:
@@ -387,7 +384,7 @@ def batch_file(folder: Path, batch: int) -> Path:
 
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
-    if error.errno in (errno.ENOENT, errno.ENOTDIR):
+    if isinstance(error, FileNotFoundError | NotADirectoryError):
         return UserError(
             f"{folder} is not a campaign: there is no {error.filename}; name a folder that "
             "`merge-sumo campaign` has written"

@@ -28,7 +28,7 @@ from typing import Final
 from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate_chunks
 from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.system.workers import MAX_CHUNK, Workers
+from merge_sumo.system.workers import MAX_CHUNK, Workers, cut
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.prediction import Prediction
@@ -218,16 +218,15 @@ class Scheduler:
         self._sampler.pend([case for group in self._untold for case in group.cases])
 
     def _chunks(self, workers: Workers, *, whole: bool) -> Iterator[Sequence[Case]]:
-        """Yield the cases as they are proposed; an empty chunk where one has to end first."""
+        """Yield the cases as they are proposed, in chunks as workers want them."""
         groups = iter(self.ask, None)
         if self._ahead:
             cases = chain.from_iterable(groups)
             while chunk := list(islice(cases, self._ahead_size(workers.count))):
                 yield chunk
         for group in groups:
-            size = len(group) if whole else workers.chunk_size(len(group))
-            for place in range(0, max(1, len(group)), max(1, size)):
-                yield group[place : place + size]
+            # Where a case has to end first, the group is empty, and so is the chunk.
+            yield from [group] if whole or not group else cut(group, workers.chunk_size(len(group)))
 
     def _ahead_size(self, workers: int) -> int:
         """Return the cases of a chunk that runs ahead, which grows as far as workers are quick."""

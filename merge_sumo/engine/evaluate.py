@@ -5,8 +5,8 @@ Whatever runs cases does it here. A worker keeps its simulator open from one chu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import cached_property, partial
 from threading import RLock
@@ -25,6 +25,7 @@ from merge_sumo.system.workers import (
     AnyWorkers,
     InProcess,
     Workers,
+    cut,
     open_workers,
     when_worker_ends,
 )
@@ -144,8 +145,7 @@ def evaluate(
     """
     with workers_or_here(workers) as available:
         kinematic = plan.engine is Engine.KINEMATIC
-        size = CHUNK if kinematic else available.chunk_size(len(cases))
-        chunks = (cases[first : first + size] for first in range(0, len(cases), size))
+        chunks = cut(cases, CHUNK if kinematic else available.chunk_size(len(cases)))
         for first, results in evaluate_chunks(plan, chunks, available, keep):
             yield from enumerate(results, start=first)
 
@@ -199,14 +199,9 @@ def evaluation_workers(workers: AnyWorkers = None, here_s: float | None = None) 
     return open_workers(workers, preload=__name__, here_s=here_s)
 
 
-@contextmanager
-def workers_or_here(workers: Workers | None) -> Iterator[Workers]:
+def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
     """Give the workers, which stay open, or this process as the only one."""
-    if workers is not None:
-        yield workers
-        return
-    with open_workers(1) as here:
-        yield here
+    return open_workers(1) if workers is None else nullcontext(workers)
 
 
 THIS_PROCESS: Final = Workers(InProcess, 1)
@@ -238,12 +233,6 @@ def _open_simulator(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[N
         return nothing
 
 
-SIMULATORS: Final[Mapping[Engine, Callable[[SimulationPlan], Simulator]]] = {
-    Engine.SUMO: Simulator,
-    Engine.KINEMATIC: KinematicSimulator,
-}
-"""What carries out the plans of an engine."""
-
 _kept: tuple[tuple[object, ...], Simulator] | None = None
 """The simulator of this process, with the key of its plan: it stays open between chunks."""
 _one_at_a_time = RLock()
@@ -260,18 +249,13 @@ def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
             if _kept is None or _kept[0] != key:
                 close_simulator()
                 plan.check_software()
-                _kept = key, _simulator(plan)
+                kind = KinematicSimulator if plan.engine is Engine.KINEMATIC else Simulator
+                _kept = key, (SubstepSimulator if plan.substeps > 1 else kind)(plan)
                 when_worker_ends(close_simulator)
             yield _kept[1]
         except BaseException:
             close_simulator()  # it stands in the middle of episodes
             raise
-
-
-def _simulator(plan: SimulationPlan) -> Simulator:
-    if plan.substeps > 1:
-        return SubstepSimulator(plan)
-    return SIMULATORS[plan.engine](plan)
 
 
 def close_simulator() -> None:

@@ -103,7 +103,6 @@ class Workers(AbstractContextManager["Workers"]):
         lost: Callable[[T], R],
         *,
         chunk: int | None = None,
-        ran_again: Callable[[R], R] | None = None,
     ) -> Generator[tuple[int, R], None, None]:
         """Yield (place in `items`, result) as chunks end.
 
@@ -114,11 +113,9 @@ class Workers(AbstractContextManager["Workers"]):
             items: what to work on.
             lost: gives the result of an item that is to blame for the deaths of its workers.
             chunk: items in a chunk; by default `chunk_size`.
-            ran_again: marks the result of an item that ran again because a worker had died.
         """
-        size = chunk or self.chunk_size(len(items))
-        chunks = (items[first : first + size] for first in range(0, len(items), size))
-        for first, results in self.run_chunks(function, chunks, lost, ran_again=ran_again):
+        chunks = cut(items, chunk or self.chunk_size(len(items)))
+        for first, results in self.run_chunks(function, chunks, lost):
             yield from enumerate(results, start=first)
 
     @property
@@ -150,7 +147,7 @@ class Workers(AbstractContextManager["Workers"]):
         next only when a chunk has ended. `ran_again` marks the results of items that ran again
         because a worker had died.
         """
-        fresh, blame = _in_a_row(chunks), Blame[range]()
+        fresh, blame = _in_a_row(chunks), Blame[int]()
         suspects: deque[_Chunk[T]] = deque()
         running: dict[Future[Sequence[R]], _Chunk[T]] = {}
         try:
@@ -229,23 +226,26 @@ class _Chunk(Generic[T]):
     items: Sequence[T]
     struck: bool = False
 
-    def died(self, blame: Blame[range], alone: bool, suspects: deque[_Chunk[T]]) -> bool:
+    def died(self, blame: Blame[int], alone: bool, suspects: deque[_Chunk[T]]) -> bool:
         """Take note of a death: return whether it is the one item's doing, else try again.
 
         A chunk that ended its worker alone is tried item by item.
         """
         self.struck = True
-        places = range(self.first, self.first + len(self.items))
-        if len(places) == 1:
-            if blame.died(places, alone=alone):
-                return True
+        if len(self.items) > 1 and alone:
+            for place in range(len(self.items)):
+                item = self.items[place : place + 1]
+                suspects.append(_Chunk(self.first + place, item, struck=True))
+            return False
+        guilty = len(self.items) == 1 and blame.died(self.first, alone=alone)
+        if not guilty:
             suspects.append(self)
-        elif alone:
-            for k, place in enumerate(places):
-                suspects.append(_Chunk(place, self.items[k : k + 1], struck=True))
-        else:
-            suspects.append(self)
-        return False
+        return guilty
+
+
+def cut(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
+    """Yield items in chunks of a size."""
+    return (items[first : first + size] for first in range(0, len(items), size))
 
 
 def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:

@@ -11,6 +11,7 @@ import re
 import resource
 import shutil
 from dataclasses import fields, replace
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -59,26 +60,13 @@ def cases(draw) -> Case:
 
 any_measures = st.builds(
     Measures,
+    **{n: maybe for n, kind in get_type_hints(Measures).items() if kind == float | None},
     end=st.sampled_from(End),
-    score=maybe,
-    dx_m=maybe,
-    dv_mps=maybe,
-    ttc_s=maybe,
-    pet_s=maybe,
     t_end_s=number,
     severity=st.sampled_from([None, *(s.value for s in Severity)]),
-    bumper_gap_m=maybe,
-    clearance_m=maybe,
-    before_clearance_m=maybe,
-    drac_mps2=maybe,
-    brake_after_mps2=maybe,
     vut_max_brake_mps2=number,
     pov_max_brake_mps2=number,
-    pov_sustained_brake_mps2=maybe,
-    pov_slowdown_mps=maybe,
-    impact_speed_mps=maybe,
     merged_first=st.sampled_from([None, "VUT", "POV"]),
-    last_avoidable_s=maybe,
     avoidable=st.none() | st.booleans(),
     clipped_steps=st.integers(0, 300),
     error=st.none() | st.text(),
@@ -140,12 +128,6 @@ class TestARecord:
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
         assert names[-1] == "error"
 
-    def test_has_no_orientation_below_level_2(self):
-        outcome = episode(0).outcome
-        social = MergeCase(level=2, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=0.25, scenario=US23)
-        assert json.loads(to_line(outcome))["svo_rad"] is None
-        assert json.loads(to_line(replace(outcome, case=social)))["svo_rad"] == 0.25
-
     def test_has_no_number_that_json_does_not_know(self):
         outcome = episode(0).outcome
         infinite = replace(outcome, measures=replace(outcome.measures, ttc_s=math.inf))
@@ -158,9 +140,6 @@ class TestReading:
         outcomes, torn = read_outcomes(b"".join(lines_of(4)), "outcomes.jsonl", scenario=US23)
         assert outcomes == [episode(index).outcome for index in range(4)]
         assert not torn
-
-    def test_of_nothing_gives_nothing(self):
-        assert read_outcomes(b"", "outcomes.jsonl", scenario=US23) == ([], False)
 
     def test_drops_a_last_line_that_is_torn_at_any_byte(self):
         whole, last = b"".join(lines_of(2)), lines_of(3)[2]
@@ -203,26 +182,15 @@ class TestReading:
         ("field", "value"),
         [
             ("index", True),
-            ("index", "0"),
-            ("index", 0.0),
             ("batch", None),
-            ("batch", 1.0),
-            ("level", "0"),
             ("level", 4),
-            ("level", None),
             ("x_pov0_m", "-200"),
-            ("x_pov0_m", None),
-            ("v_pov0_mps", [30.0]),
             ("v_vut0_mps", None),
             ("svo_rad", 0.3),
             ("end", "ARRIVED"),
-            ("end", None),
-            ("score", "-600"),
             ("score", math.nan),
             ("dx_m", "near"),
-            ("t_end_s", None),
             ("clipped_steps", 1.5),
-            ("error", 3),
         ],
     )
     def test_refuses_a_value_of_the_wrong_type(self, field, value):
@@ -276,13 +244,6 @@ class TestAJournal:
             to.append([replace(episode(1, 1), pov_files={"c": "4"})])
         noted = {"vut_files": {"a": "1", "b": "3"}, "pov_files": {"c": "4"}, "ran_again": 1}
         assert read_settings(tmp_path / "run") == noted
-
-    def test_has_on_disk_what_was_appended_so_far(self, tmp_path):
-        journal = Journal.create(tmp_path / "run", {})
-        assert Run(tmp_path / "run").outcomes == []
-        for batch in range(2):
-            journal.append([episode(batch, batch)])
-            assert len(Run(tmp_path / "run").outcomes) == batch + 1
 
     def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):
         journal = Journal.create(tmp_path / "run", {})
@@ -370,13 +331,6 @@ class TestARun:
         with pytest.raises(UserError) as error:
             run.trajectory(2)
         assert_sentence(error, "00001.npz")
-
-    def test_says_when_a_batch_lacks_a_case(self, folder):
-        batches = folder / "trajectories"
-        (batches / "00000.npz").replace(batches / "00001.npz")
-        with pytest.raises(UserError) as error:
-            Run(folder).trajectory(2)
-        assert_sentence(error, "no trajectory of case 2")
 
     @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
     def test_refuses_trajectories_that_are_cut_off(self, folder, share):

@@ -137,15 +137,6 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, n
     assert "no file of the VUT has changed" in str(again)
 
 
-@pytest.mark.slow
-def test_a_random_controller_is_found_and_told_from_one_that_remembers(vut, tmp_path):
-    run = campaign(vut(RANDOM), tmp_path / "run", cases=40)
-    repeats = read_repeats(run)
-    assert {one.differs_from_s for one in repeats} == {0.0}
-    checked = CliRunner().invoke(cli.app, ["check-vut", run.settings["vut"]])
-    assert "It draws random numbers, reads a clock" in checked.stdout
-
-
 @pytest.mark.parametrize(("source", "chance"), [(RANDOM, True), (IN_ITS_MODULE, False)])
 def test_where_cases_repeat_chance_is_expected_and_memory_is_not(vut, tmp_path, source, chance):
     run = campaign(vut(source), tmp_path / "run", cases=60, repeat="auto")
@@ -183,14 +174,8 @@ HONEST = to_plain(Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=
     "change",
     [
         {"index": 60},
-        {"index": "3"},
-        {"index": True},
-        {"differs_from_s": "1"},
         {"differs_from_s": 1e300},
         {"first": "<script>"},
-        {"end": "GONE"},
-        {"failed": None},
-        {"drawn": "no"},
         {"more": 1},
     ],
 )

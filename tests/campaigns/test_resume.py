@@ -175,11 +175,6 @@ class TestTwoProcessesOnOneFolder:
         assert contents(folder) == before
         resume_campaign(folder)
 
-    def test_are_one_too_many_from_its_very_beginning(self, tmp_path):
-        journal = Journal.create(tmp_path / "run", {})
-        with journal, pytest.raises(UserError, match="another process writes"):
-            Journal.reopen(tmp_path / "run")
-
     def test_leave_no_lock_behind_when_one_is_killed(self, folder):
         script = (
             "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
@@ -212,12 +207,6 @@ class TestADisk:
         with contextlib.suppress(UserError):
             resume_campaign(run)  # the scenarios may not fit
         assert outcomes(run) == outcomes(whole)
-
-    def test_that_is_full_takes_no_new_campaign(self, small_disk):
-        (small_disk / "others").write_bytes(bytes(shutil.disk_usage(small_disk).free))
-        with pytest.raises(UserError, match=r"cannot write .*No space left on device"):
-            run_campaign(settings(), small_disk / "run")
-        assert [path.name for path in small_disk.iterdir()] == ["others"]
 
     def test_that_is_read_only_is_refused_and_left_alone(self, folder, small_disk):
         run = Path(shutil.copytree(folder, small_disk / "run"))
@@ -253,8 +242,6 @@ class TestTheCommand:
     @pytest.mark.parametrize(
         ("options", "sentence"),
         [
-            (("--seed", "9"), "seed differs"),
-            (("--level", "1"), "levels differs"),
             (("--out", "elsewhere"), "leave --out away"),
             (("--cases", "0"), "`cases` is 0"),
         ],
@@ -265,36 +252,6 @@ class TestTheCommand:
         assert isinstance(result.exception, UserError)
         assert sentence in str(result.exception)
         assert contents(folder) == before
-
-
-class TestFromAnotherFolder:
-    """Names of a controller's files are relative to where its campaign was begun."""
-
-    @pytest.fixture
-    def begun(self, tmp_path, monkeypatch):
-        """Return a function that begins a campaign here, stops it, and goes elsewhere."""
-
-        def begin(spec: str) -> Path:
-            (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 1.0\n")
-            monkeypatch.chdir(tmp_path)
-            values = settings(vut=spec)
-            with pytest.raises(Stopped):
-                run_campaign(values, tmp_path / "run", check=StopAfter(2))
-            (tmp_path / "other").mkdir()
-            monkeypatch.chdir(tmp_path / "other")
-            return tmp_path / "run"
-
-        return begin
-
-    def test_goes_on_with_a_controller_that_is_named_by_its_whole_path(self, begun, tmp_path):
-        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
-        assert len(resume_campaign(folder).outcomes) == 28
-
-    def test_of_one_that_has_changed_is_refused(self, begun, tmp_path):
-        folder = begun(f"{tmp_path / 'my_vut.py'}:drive")
-        (tmp_path / "my_vut.py").write_text("def drive(seen):\n    return 0.5\n")
-        with pytest.raises(UserError, match=r"vut_files\.my_vut\.py differs"):
-            resume_campaign(folder)
 
 
 @pytest.mark.long

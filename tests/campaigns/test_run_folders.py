@@ -116,15 +116,6 @@ class TestARunFolder:
         expected = (mine / "whole" / OUTCOMES).read_bytes()
         assert Path("results", OUTCOMES).read_bytes() == expected
 
-    def test_of_a_controller_of_the_package_names_it(
-        self, tmp_path: Path, command_line: Call
-    ) -> None:
-        for number, vut in enumerate(("design2", "sumo:IDM?tau=1.2")):
-            folder = tmp_path / str(number)
-            run_campaign(campaign_settings(vut=vut, cases=4, batch=2, sampler="uniform"), folder)
-            assert named_again(read_settings(folder)) == ""
-            assert command_line("rerun", folder, 0, "-q")[0] == 0
-
     def test_has_no_pov_and_no_earlier_version_run(self, mine: Path, command_line: Call) -> None:
         Path("pov.py").write_text(VUT)
         of_pov = {"vut": "design2", "pov": "pov.py:Vut", "levels": (3,)}

@@ -224,15 +224,6 @@ def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two
 
 
 class TestInFlight:
-    def test_a_cut_campaign_goes_on_to_the_same_bytes(self, whole, tmp_path):
-        folder = Path(shutil.copytree(whole, tmp_path / "run"))
-        text = outcomes(folder)
-        (folder / OUTCOMES).write_bytes(text[: len(text) // 2])
-        said: list = []
-        resume_campaign(folder, warn=said.append)
-        assert recorded(folder) == recorded(whole)
-        assert "dropped" in said[0]
-
     @pytest.mark.slow
     def test_a_campaign_grows_as_one_that_had_the_cases_from_the_start(self, whole, tmp_path):
         ends = ends_of_groups(Run(whole).outcomes)
@@ -270,14 +261,6 @@ class TestAhead:
         with pytest.raises(Stopped):
             run_campaign(UNIFORM, tmp_path / "run", check=StopAfter(1))
         assert 0 < len(Run(tmp_path / "run").outcomes) < 90
-        resume_campaign(tmp_path / "run")
-        assert recorded(tmp_path / "run") == in_turn
-
-    def test_batches_that_were_not_written_to_their_end_run_again(self, in_turn, tmp_path):
-        """All trajectories are on the disk before the first line."""
-        run_campaign(UNIFORM, tmp_path / "run")
-        with (tmp_path / "run" / OUTCOMES).open("r+b") as file:
-            file.truncate(len(in_turn[OUTCOMES]) // 2)
         resume_campaign(tmp_path / "run")
         assert recorded(tmp_path / "run") == in_turn
 

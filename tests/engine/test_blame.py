@@ -18,7 +18,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
 from merge_sumo.system.pulse import AwakeClock
-from merge_sumo.system.workers import open_workers
+from merge_sumo.system.workers import cut, open_workers
 from merge_sumo.values.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
@@ -137,7 +137,7 @@ class TestKills:
         assert RAN_AGAIN not in calm.settings
         assert struck.ran_again == bad
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
-        assert f"{bad} cases ran again, because a process of theirs" in struck.ran_again_in_words
+        assert f"{bad} cases ran again, because a process was killed" in struck.ran_again_in_words
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
@@ -182,11 +182,10 @@ if (FLAGS / "again").exists():
     def test_of_a_worker_mark_what_ran_again(self, tmp_path):
         with open_workers(2) as workers:
             work = partial(killed_once, tmp_path / "flag")
-            found = dict(
-                workers.run(work, range(6), lambda _: (0, False), chunk=2, ran_again=marked)
-            )
-        assert [found[k][0] for k in range(6)] == [k * k for k in range(6)]
-        assert any(found[k][1] for k in (2, 3))
+            chunks = cut(range(6), 2)
+            found = dict(workers.run_chunks(work, chunks, lambda _: (0, False), ran_again=marked))
+        assert [square for first in (0, 2, 4) for square, _ in found[first]] == [0, 1, 4, 9, 16, 25]
+        assert any(again for _, again in found[2])
 
 
 def killed_once(flag: Path, items):
