@@ -58,9 +58,14 @@ def cases(draw) -> Case:
     )
 
 
+MAYBE = [
+    name
+    for name, kind in get_type_hints(Measures).items()
+    if kind == float | None and name not in (*FOLLOWED_UP, *ON_LANE)
+]
 any_measures = st.builds(
     Measures,
-    **{n: maybe for n, kind in get_type_hints(Measures).items() if kind == float | None},
+    **dict.fromkeys(MAYBE, maybe),
     end=st.sampled_from(End),
     t_end_s=number,
     severity=st.sampled_from([None, *(s.value for s in Severity)]),
