@@ -161,7 +161,8 @@ class Workers(AbstractContextManager["Workers"]):
                     running[self._submit(function, next_chunk.items)] = next_chunk
                 if not running:
                     return
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                done = wait(running, return_when=FIRST_COMPLETED).done
+                for future in [one for one in running if one in done]:
                     ended = running.pop(future)
                     try:
                         results = future.result()
