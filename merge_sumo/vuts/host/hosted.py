@@ -85,10 +85,9 @@ def _first(opened: Callable[[], Host]) -> Host:
     while True:
         try:
             return opened()
-        except OpeningDiedError as error:
-            died = error.death
+        except HostDiedError as died:
             if blame.died(None, alone=True, repeatable=died.hung, killed=died.killed):
-                raise
+                raise UserError(died.reason) from died
 
 
 class HostDiedError(Exception):
@@ -105,14 +104,6 @@ class HostDiedError(Exception):
         self.reason, self.corridor, self.hung, self.killed = reason, corridor, hung, killed
 
 
-class OpeningDiedError(UserError):
-    """The process died while the VUT was opened: how, is in `death`."""
-
-    def __init__(self, sentence: str, death: HostDiedError) -> None:
-        super().__init__(sentence)
-        self.death = death
-
-
 class Host:
     """The process of a VUT, with the VUT opened in it.
 
@@ -122,7 +113,7 @@ class Host:
     """
 
     def __init__(self, spec: VutSpec, options: VutOptions) -> None:
-        """Start the process and open the VUT; `UserError` when that cannot be."""
+        """Start the process and open the VUT; `UserError` or `HostDiedError` when that fails."""
         self._spec, self._options = spec, options
         self._number = 0
         self.alive = True
@@ -131,7 +122,7 @@ class Host:
         self.facts = self._open(About.OPEN, Opening(spec, options.deadline_s), Facts)
 
     def make(self, corridors: int) -> Mapping[str, float]:
-        """Have the VUT's driver made, return its parameters; `UserError` when that cannot be."""
+        """Have the VUT's driver made, return its parameters; errors as of a new `Host`."""
         return self._open(About.MAKE, corridors, dict[str, wire.Number])
 
     def ask(self, about: About, content: bytes = b"", *, patience_s: float | None = None) -> Frame:
@@ -221,15 +212,15 @@ class Host:
         self._poll.register(self._from, select.POLLIN)
 
     def _open(self, about: About, question: Any, kind: type[T]) -> T:
-        """Ask for a VUT to be opened or made; `UserError` when that cannot be."""
+        """Ask for a VUT to be opened or made."""
         spec, content = self._spec, wire.to_json(question)
         try:
             answer = self.ask(about, content, patience_s=self._options.connect_s)
         except HostDiedError as died:
             line = self._output.last_line()
             printed = f" (it printed: {line})" if line else ""
-            sentence = f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
-            raise OpeningDiedError(sentence, died) from died
+            died.reason = f"opening the VUT {spec} {died.reason}{printed}: look into the VUT"
+            raise
         try:
             if answer.about is About.REFUSED:
                 raise UserError(wire.from_json(answer.content, str))
@@ -312,8 +303,8 @@ class HostedVut(Driver):
         if not self._host.alive:
             try:
                 self._host = self._started()
-            except OpeningDiedError as error:
-                raise VutLostError(str(error), killed=error.death.killed) from error
+            except HostDiedError as died:
+                raise VutLostError(died.reason, killed=died.killed) from died
             except UserError as error:
                 self._begun.clear()
                 why = dict.fromkeys(range(self.corridors), f"started anew: {error}")

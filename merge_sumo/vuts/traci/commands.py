@@ -40,12 +40,11 @@ LOOKS: Final = (
     *("setParameter", "requestToC"),
 )
 CARRIED_OUT: Final = frozenset(
-    [f"vehicle.{function}" for function in (*SPEEDS, *GAPS_AND_STOPS, *MODEL, *LOOKS)]
+    ["vehicle.setLaneChangeMode"]
+    + [f"vehicle.{function}" for function in (*SPEEDS, *GAPS_AND_STOPS, *MODEL, *LOOKS)]
     + [f"vehicletype.{function}" for function in (*MODEL, *LOOKS)]
 )
-ON_A_LANE: Final = frozenset(
-    {"vehicle.setLaneChangeMode", "vehicle.changeLane", "vehicle.changeLaneRelative"}
-)
+ON_A_LANE: Final = frozenset({"vehicle.changeLane", "vehicle.changeLaneRelative"})
 """Commands that say on which lane the VUT is to drive, where there are two for it."""
 NOTHING: Final = frozenset(
     f"vehicle.{function}"

@@ -24,8 +24,6 @@ QUESTIONS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
 SET: Final = 0x20
 """Distance from there to the identifier of a domain's commands."""
-LANE_CHANGE_MODE: Final = 0xB6
-LANE_CHANGE_BITS: Final = 0xFFF
 LOAD, ADD_FILTER = 0x01, 0x7E
 REASONS: Final = {
     LOAD: "the campaign runs the simulation",
@@ -50,7 +48,6 @@ class Session:
         notes: sentences on what a command does less than in SUMO, once each.
         expected: whether more vehicles may come.
         departed: vehicles that departed since the client was last answered; and `arrived`.
-        lane_change_mode: mode of the VUT; without an acceleration lane nothing obeys it.
     """
 
     def __init__(self, sumo: ShadowSumo) -> None:
@@ -60,7 +57,6 @@ class Session:
         self.expected = True
         self.departed: list[str] = []
         self.arrived: list[str] = []
-        self.lane_change_mode = 0
         self._knows_of_the_lane = False
         """Whether the client has ever commanded anything of lanes."""
 
@@ -78,7 +74,6 @@ class Session:
         """Make a step in which the vehicles depart."""
         self.sumo.enter(states)
         self.departed += states
-        self.lane_change_mode = 0
 
     def step(self) -> float | None:
         """Make a step; return the speed that SUMO gives the VUT by what was commanded."""
@@ -160,8 +155,9 @@ class Session:
         if command == tp.SET_VEHICLE and object_id not in self.sumo.at_m:
             raise RefusedError(f"Vehicle '{object_id}' is not known.")
         mine = object_id in (NAME_OF_VUT, OWN_TYPE)
+        self._knows_of_the_lane |= "Lane" in name
         if effect is Effect.ON_A_LANE and self.sumo.has_lane:
-            effect, self._knows_of_the_lane = Effect.CARRIED_OUT, True
+            effect = Effect.CARRIED_OUT
         if effect is Effect.CARRIED_OUT and mine:
             function, arguments = commands.call_of_command(functions, object_id, reader)
             if function == "vehicle.changeLane":
@@ -171,11 +167,6 @@ class Session:
         if effect is Effect.CARRIED_OUT and commands.OF_OTHERS.isdisjoint(functions):
             what = "vehicle" if command == tp.SET_VEHICLE else "type"
             raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
-        if command == tp.SET_VEHICLE and mine and variable == LANE_CHANGE_MODE:
-            mode = reader.typed()
-            if not isinstance(mode, int):
-                raise RefusedError("a mode is an integer")
-            self.lane_change_mode = mode & LANE_CHANGE_BITS
         self._note(f"{name} is accepted and changes nothing here")
 
     def _check_lane(self, name: str, index: object) -> None:
@@ -194,19 +185,11 @@ def _expected(session: Session, _: str) -> bytes:
     return pack("i", max(len(session.sumo.at_m), EXPECTED * session.expected))
 
 
-def _lane_change_mode(session: Session, name: str) -> int:
-    """Return the mode of a vehicle; without a lane, where nothing obeys it, as it was commanded."""
-    if session.sumo.has_lane:
-        return int(session.sumo.call("vehicle.getLaneChangeMode", name))
-    return session.lane_change_mode if name == NAME_OF_VUT else 0
-
-
 OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
     # SUMO's own answers to these are those before the vehicle was put back.
     (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.sumo.point(name)[2:4]),  # getPosition
     (GET_VEHICLE, 0x39): lambda s, name: pack("O", (*s.sumo.point(name)[2:4], 0.0)),  # in space
     (GET_VEHICLE, 0x43): lambda s, name: pack("d", s.sumo.point(name).angle_deg),
-    (GET_VEHICLE, LANE_CHANGE_MODE): lambda s, name: pack("i", _lane_change_mode(s, name)),
     # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
     (GET_SIMULATION, 0x73): lambda s, _: pack("i", len(s.departed)),
     (GET_SIMULATION, 0x74): lambda s, _: pack("l", s.departed),
