@@ -193,6 +193,7 @@ PROCESSES: Final = {
     ),
 }
 RAISES: Final = {
+    "a breakpoint": acts("breakpoint()", "a debugger was left"),
     "a BaseException": acts("raise BaseException('odd')", "BaseException: odd"),
     "a KeyboardInterrupt": acts("raise KeyboardInterrupt", "KeyboardInterrupt"),
     "what stops the program": acts(

@@ -18,7 +18,7 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from misbehaviours import STUBBORN
 from processes import none_left, wait_for
-from vut_contract import LEVEL0_CLASS, cases_of, factory, run_cases
+from vut_contract import LEVEL0_CLASS
 
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
@@ -215,15 +215,11 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("plain", "plain"),
-        ("", ""),
         ("a\nb\t\0", r"a\nb\t\x00"),
         ("\x1b[31m", r"\x1b[31m"),
         ("\u202ereversed", r"\u202ereversed"),
         ("\ud800", r"\ud800"),
-        ("größer", "größer"),
         ("at 0x7fc7fadabac0>, 0x7fc7fadabac1", "at 0x...>, 0x..."),
-        ("0x1f", "0x1f"),
         ("x" * 1000, "x" * 600),
     ],
 )
@@ -273,23 +269,3 @@ class TestTheWire:
         assert [lane_of(case.scenario) for _, case in begun] == [None, (-70.0, 130.0)]
         assert as_merge(begun[1][1].scenario).lane_end == "merge"
         assert wire.unpack_scene(wire.pack_scene([], scene(2)))[1].merged is None
-
-
-def test_innocent_cases_are_not_blamed_for_what_a_thread_does_later(spec):
-    source = """
-import os, threading
-class Vut:
-    def reset(self, seen):
-        self.guilty = seen.v_pov_mps > 34.3
-    def act(self, seen):
-        if self.guilty:
-            if seen.t_s == 0.3:
-                self.thread = threading.Thread(target=lambda: self.last and os._exit(3))
-                self.last = True
-            if seen.t_s == 0.5:
-                self.thread.start()
-                self.thread.join()
-        return 1.0
-"""
-    ran = run_cases(factory(spec(source), deadline_s=0.3), cases_of(6), corridors=4)
-    assert [t.error for t in ran] == [None] * 4 + ["ended its process with exit code 3", None]

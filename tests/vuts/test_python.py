@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 from campaigning import campaign_settings, run_campaign
-from processes import at_most_cpu_s
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
 from merge_sumo.errors import UserError
@@ -120,79 +119,6 @@ class Vut:
         return 1.0
 """
     assert {t.end for t in run_cases(in_process(vut(source)), cases_of(40))} == {End.MERGED}
-
-
-WRONG_ANSWERS = {
-    "float('nan')": "nan",
-    "[1.0]": "answered [1.0] (list) instead of a number",
-    "1 / 0": "ZeroDivisionError: division by zero (my_vut.py, line 6)",
-    "breakpoint()": "a debugger was left; breakpoints work with `merge-sumo run --debug`",
-    "exec('while True: pass')": "took longer than the deadline of 0.3 s",
-}
-SOMETIMES = """
-class Vut:
-    def reset(self, seen):
-        self.bad = seen.v_pov_mps > 30.0
-    def act(self, seen):
-        return {answer} if self.bad and seen.t_s == 0.3 else 1.0
-"""
-
-
-@pytest.mark.parametrize("answer", WRONG_ANSWERS)
-def test_what_it_does_wrong_is_the_outcome_of_its_own_case(vut, answer):
-    cases = cases_of(8)
-    spec = vut(SOMETIMES.format(answer=answer))
-    with at_most_cpu_s(20.0):
-        trajectories = run_cases(in_process(spec, deadline_s=0.3), cases)
-    for case, trajectory in zip(cases, trajectories, strict=True):
-        if case.v_pov0_mps > 30.0:
-            assert trajectory.end is End.VUT_ERROR
-            assert WRONG_ANSWERS[answer] in trajectory.error
-            assert len(trajectory.motion) == 4
-        else:
-            assert trajectory.end is End.MERGED
-
-
-@pytest.mark.parametrize(
-    ("body", "reason"),
-    [
-        ("raise KeyError('x')", "reset: KeyError: 'x'"),
-        ("import time; time.sleep(9)", "reset: took longer than the deadline of 0.3 s"),
-    ],
-)
-def test_a_reset_that_fails_is_the_outcome_of_its_own_case(vut, body, reason):
-    source = f"""
-class Vut:
-    def __init__(self, *corridors):
-        pass
-    def reset(self, *arguments):
-        if arguments[-1].v_pov_mps > 30.0:
-            {body}
-    def act_batch(self, seen):
-        return 0.0 * seen.v_vut_mps + 1.0
-"""
-    cases = cases_of(8)
-    for case, trajectory in zip(
-        cases, run_cases(in_process(vut(source), deadline_s=0.3), cases), strict=True
-    ):
-        if case.v_pov0_mps > 30.0:
-            assert trajectory.error.startswith(reason)
-        else:
-            assert trajectory.end is End.MERGED
-
-
-def test_an_object_that_failed_is_made_anew(vut):
-    source = """
-class Vut:
-    broken = False
-    def act(self, seen):
-        if self.broken:
-            raise RuntimeError("still broken")
-        self.broken = seen.t_s > 0.2
-        return 1.0
-"""
-    errors = [t.error for t in run_cases(in_process(vut(source)), cases_of(3), corridors=1)]
-    assert errors == ["RuntimeError: still broken (my_vut.py, line 6)"] * 3
 
 
 def test_a_batched_vut_cannot_move_the_cars(vut):

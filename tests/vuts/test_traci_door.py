@@ -69,17 +69,9 @@ def drives(client: Client) -> bool:
 STRANGERS = {
     "drives": drives,
     "says nothing": lambda c: c.read(1),
-    "writes slowly": lambda c: slowly(c),  # noqa: PLW0108 (it stands below)
     "sends garbage": lambda c: c.socket.sendall(os.urandom(200)) or c.read(1),
-    "announces much": lambda c: c.socket.sendall(b"\x7f\xff\xff\xff") or c.read(1),
     "closes": lambda c: None,
 }
-
-
-def slowly(client: Client) -> None:
-    for _ in range(4):
-        client.socket.send(b"\0")
-        time.sleep(0.1)
 
 
 class TestAProgram:
