@@ -10,6 +10,7 @@ import importlib
 import inspect
 import sys
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -48,6 +49,14 @@ def load_traci() -> Any:
         raise UserError(
             f"SUMO's traci cannot be loaded ({error}): run `pip install traci=={SUMO_VERSION}`"
         ) from error
+
+
+@cache
+def packer() -> Callable[..., bytes]:
+    """Return what packs typed values in SUMO's own client: letters of a form, and the values."""
+    connection = load_traci().connection.Connection
+    pack: Callable[..., bytes] = connection.__new__(connection)._pack
+    return pack
 
 
 class _SentError(Exception):

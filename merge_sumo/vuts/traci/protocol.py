@@ -8,10 +8,10 @@ big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html). Bytes that are not th
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
 from merge_sumo.sumo.binding import SUMO_VERSION
+from merge_sumo.sumo.traci_names import packer
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
 """A controller of one vehicle never says more at a time; garbage read as a length mostly does."""
@@ -19,13 +19,13 @@ API_VERSION: Final = 22
 """Of the TraCI of SUMO 1.28."""
 
 GET_VERSION, SIMULATION_STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
-GET_VEHICLE, GET_SIMULATION, SET_VEHICLE, SET_SIMULATION = 0xA4, 0xAB, 0xC4, 0xCB
+GET_VEHICLE, GET_SIMULATION, SET_VEHICLE = 0xA4, 0xAB, 0xC4
 """Identifiers of commands."""
 PARAMETER: Final = 0x7E
 """The variable of `getParameter` and `setParameter` in every domain."""
 
 POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D, POSITION_ROADMAP = range(5)
-TYPE_POLYGON, TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x06, 0x07, 0x08, 0x09, 0x0B
+TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x07, 0x08, 0x09, 0x0B
 TYPE_STRING, TYPE_STRINGLIST, TYPE_COMPOUND, TYPE_DOUBLELIST, TYPE_COLOR = 0x0C, *range(0x0E, 0x12)
 """Types of values."""
 OK, NOT_IMPLEMENTED, ERROR = 0x00, 0x01, 0xFF
@@ -41,7 +41,7 @@ _FIXED: Final = {
     TYPE_COLOR: struct.Struct("!BBBB"),
 }
 POSITIONS: Final = range(POSITION_ROADMAP + 1)
-_UBYTE, _INT, _DOUBLE = (_FIXED[t] for t in (TYPE_UBYTE, TYPE_INTEGER, TYPE_DOUBLE))
+_INT, _DOUBLE = _FIXED[TYPE_INTEGER], _FIXED[TYPE_DOUBLE]
 _MAX_NESTING: Final = 4
 
 
@@ -219,47 +219,13 @@ def raw_double(value: float) -> bytes:
     return _DOUBLE.pack(value)
 
 
-def _strings(values: Sequence[str]) -> bytes:
-    items = b"".join(map(raw_string, values))
-    return bytes((TYPE_STRINGLIST,)) + _INT.pack(len(values)) + items
-
-
-def _polygon(points: Sequence[Sequence[float]]) -> bytes:
-    """Return a typed list of points; a count above 255 stands behind a 0."""
-    few = len(points) < 256
-    count = bytes((len(points),)) if few else bytes((0,)) + _INT.pack(len(points))
-    items = b"".join(struct.pack("!dd", *point[:2]) for point in points)
-    return bytes((TYPE_POLYGON,)) + count + items
-
-
-def _road_position(place: tuple[str, float, int]) -> bytes:
-    edge, position_m, lane = place
-    return bytes((POSITION_ROADMAP,)) + raw_string(edge) + struct.pack("!dB", position_m, lane)
-
-
-_PACK: Final[dict[str, Callable[[Any], bytes]]] = {
-    "i": lambda value: struct.pack("!Bi", TYPE_INTEGER, int(value)),
-    "d": lambda value: struct.pack("!Bd", TYPE_DOUBLE, value),
-    "s": lambda value: bytes((TYPE_STRING,)) + raw_string(str(value)),
-    "b": lambda value: bytes((TYPE_BYTE, (ord(value) if isinstance(value, str) else value) & 0xFF)),
-    "B": lambda value: bytes((TYPE_UBYTE, int(value))),
-    "l": _strings,
-    "f": lambda value: struct.pack(f"!Bi{len(value)}d", TYPE_DOUBLELIST, len(value), *value),
-    "o": lambda value: struct.pack("!B2d", POSITION_2D, *value),
-    "O": lambda value: struct.pack("!B3d", POSITION_3D, *value),
-    "c": lambda value: bytes((TYPE_COLOR, *value)),
-    "p": _polygon,
-    "r": _road_position,
-}
-
-
 def pack(form: str, *values: Any) -> bytes:
-    """Return typed values, one for each letter of `form`; letters as in SUMO's own client.
+    """Return typed values, one for each letter of `form`, as SUMO's own client packs them.
 
     Integer, double, string, signed and unsigned Byte, list of strings, list of floats, position in
     the plane (o) and in space (O), colour, polygon, and place on a road.
     """
-    return b"".join([_PACK[letter](value) for letter, value in zip(form, values, strict=True)])
+    return packer()(form, *values)
 
 
 def compound(count: int, content: bytes) -> bytes:

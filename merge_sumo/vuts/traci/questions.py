@@ -179,7 +179,7 @@ _LAYOUTS: Final[dict[str, Callable[[Any], bytes]]] = {
     "vehicle.getFollower": _one_vehicle,
     "vehicle.getNeighbors": _neighbours,
     "vehicle.getLaneChangeState": _fields("ii"),
-    "vehicle.getNextTLS": _rows("sidb"),
+    "vehicle.getNextTLS": lambda answer: _rows("sidb")([(*row[:3], ord(row[3])) for row in answer]),
     "vehicle.getNextStops": _objects("sdsidd", *_NEXT_STOP),
     "vehicle.getStops": _objects("sdsiddddddsssssd", *_STOP),
     "vehicle.getJunctionFoes": _rows("sddddssBB"),
