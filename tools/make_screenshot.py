@@ -3,7 +3,6 @@
 Needs Chromium (`apt-get install chromium`). An older picture is to be removed first. The picture
 in README is that of
 
-    for level in 0 1 2; do merge-sumo truth --vut design2 --level $level; done
     merge-sumo campaign --vut design2 --seed 1 --out runs/picture
     python tools/make_screenshot.py runs/picture scenarios/report.png
 """
