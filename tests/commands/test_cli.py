@@ -10,12 +10,13 @@ import shutil
 from pathlib import Path
 
 import pytest
-from calling import Said, assert_refused, contents, run_in_a_process
+from calling import Said, assert_refused, contents, invoke, run_in_a_process
 from lxml import etree
-from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.reports.reproduction_page import TABLE_JSON
+from merge_sumo.studies.reproduction import TABLE_II, Scale
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES, SUMO_VERSION
 from merge_sumo.sumo.replay_folder import CONFIG, RECORD
 
@@ -50,11 +51,11 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
         ("arguments", "parts"),
         [
             (("--vut", "design9"), ("'design9'", "design1", "level0")),
-            (("--vut", ""), ("design1",)),
             (("--level", "3"), ("'3'", "0, 1, 2 or all")),
             (("--level", "-1"), ("'-1'", "0, 1, 2 or all")),
             (("--cases", "0"), ("--cases is 0",)),
-            (("--cases", "-5"), ("--cases is -5",)),
+            (("--gate", "failure"), ("choose failures",)),
+            (("--junit", "gone/junit.xml"), ("--junit", "there is no folder gone")),
             (("--workers", "two"), ("'two'", "tcp://HOST:PORT")),
             (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
             (("--seed", "-1"), ("--seed is -1",)),
@@ -65,24 +66,6 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
         before = contents(tmp_path)
         others = [option for option in (SMALL[1:3], SMALL[3:5]) if option[0] not in arguments]
         assert_refused(call(SMALL[0], *sum(others, ()), "--out", "run", *arguments), *parts)
-        assert contents(tmp_path) == before
-
-    @pytest.mark.parametrize("level", [("--level", "0"), ()], ids=["level 0", "all levels"])
-    def test_for_a_folder_that_exists(self, call, tmp_path, level):
-        (tmp_path / "mine").mkdir()
-        (tmp_path / "mine" / "outcomes.jsonl").write_text("mine")
-        before = contents(tmp_path)
-        said = call(
-            "campaign", "--vut", "design1", *level, "--cases", 4, "--out", tmp_path / "mine"
-        )
-        assert_refused(said, "mine exists", "--out")
-        assert contents(tmp_path) == before
-
-    def test_for_a_file_in_place_of_the_folder(self, call, tmp_path):
-        (tmp_path / "mine").write_text("mine")
-        before = contents(tmp_path)
-        assert_refused(call(*SMALL, "--cases", 4, "--out", tmp_path / "mine"), "mine exists")
-        assert_refused(call(*SMALL, "--cases", 4, "--out", tmp_path / "mine/run"), "cannot write")
         assert contents(tmp_path) == before
 
     @pytest.mark.parametrize(
@@ -190,11 +173,8 @@ class TestExport:
         configs = [Path("cases", name, CONFIG) for name in ("case-00003", "case-00000")]
         assert said.out.splitlines() == [str(config) for config in configs]
         assert all(config.is_file() for config in configs)
-
-    def test_writes_into_the_campaign_by_default(self, call, campaign):
-        case = next(o.index for o in Run(campaign).outcomes if not o.failed)
-        assert call("export", campaign, case).code == 0
-        assert (campaign / "scenarios" / f"case-{case:05d}" / CONFIG).is_file()
+        assert call("export", campaign, 3).code == 0
+        assert (campaign / "scenarios" / "case-00003" / CONFIG).is_file(), "by default"
 
     def test_refuses_trajectories_that_are_gone(self, call, campaign, tmp_path):
         shutil.rmtree(campaign / "trajectories")
@@ -259,32 +239,78 @@ class TestReport:
         (campaign / "outcomes.jsonl").write_bytes(b"".join(lines[:kept]))
         assert call("report", campaign).code == 0
 
-    @pytest.mark.parametrize("text", ["{}", "[]", "null", '{"levels": 0}', "{"])
-    def test_refuses_settings_that_are_no_campaigns(self, call, campaign, text):
-        (campaign / "campaign.json").write_text(text)
-        assert_refused(call("report", campaign), "campaign.json")
-
 
 class TestHelp:
     @pytest.mark.parametrize("name", COMMANDS)
     def test_of_every_command_has_an_example_of_that_command(self, name):
-        result = CliRunner().invoke(cli.app, [name, "--help"])
+        result = invoke(name, "--help")
         assert result.exit_code == 0
-        words = " ".join(result.output.split())
-        assert f"Example: merge-sumo {name}" in words
+        assert f"Example: merge-sumo {name}" in " ".join(result.output.split())
 
-    @pytest.mark.parametrize("flag", ["--help", "-h"])
-    def test_says_how_to_start_and_names_every_command(self, flag):
-        result = CliRunner().invoke(cli.app, [flag])
-        assert result.exit_code == 0
-        assert "merge-sumo campaign --vut" in result.output
-        assert {"campaign", "export", "replay", "report"} <= set(COMMANDS)
-        assert all(name in result.output for name in COMMANDS)
+    def test_says_how_to_start_and_names_every_command_and_the_version(self):
+        said = invoke("--help").output
+        assert invoke("-h").output == said
+        assert "merge-sumo campaign --vut" in said
+        assert all(name in said for name in COMMANDS)
+        assert invoke("--version").output.startswith("merge-sumo ")
 
-    def test_knows_the_version(self):
-        result = CliRunner().invoke(cli.app, ["--version"])
-        assert result.exit_code == 0
-        assert result.output.startswith("merge-sumo ")
+
+class TestBenchmark:
+    BENCHMARK = (
+        *("benchmark", "--vut", "design1", "--level", 0, "--truth-cases", 300, "--workers", 1),
+        *("--samplers", "uniform,gpr", "--seeds", 2, "--cases", 30, "--batch", 15),
+    )
+
+    def test_prints_one_json_object_with_the_keys_that_are_promised_and_draws(
+        self, call, tmp_path, monkeypatch
+    ):
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+        code, out, err = call(*self.BENCHMARK, "--json", "--figure", "curves.svg")
+        assert code == 0, err
+        assert out.count("\n") == 1
+        found = json.loads(out)
+        assert 0.0 < found["truth_fmc"] <= found["limit_fmc"]
+        assert found["dense_fmc"] == {}
+        assert len(found["oracle_fmc_by_batch"]) == 2
+        for name in ("uniform", "gpr"):
+            assert set(found["samplers"][name]["fmc"]) == {"median", "low", "high"}
+        assert (tmp_path / "curves.svg").read_text().count("<svg") == 1
+        code, out, err = call(*self.BENCHMARK)
+        assert code == 0, err
+        assert {"truth:", "limit:", "oracle:", "uniform", "gpr"} <= {
+            line.split()[0] for line in out.splitlines() if line.strip()
+        }
+
+
+class TestReproduce:
+    def test_prints_the_table_and_where_the_rest_is(self, call, tmp_path, monkeypatch):
+        scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
+        monkeypatch.setattr("merge_sumo.studies.reproduction.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.studies.reproduction.TABLE_II", TABLE_II[:1])
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+        code, out, err = call("reproduce", "--quick", "--workers", 1, "--out", "here")
+        assert code == 0, err
+        assert out.startswith("| FMC: ours (the paper's) |")
+        assert "here/index.html" in out.splitlines()[-1]
+        assert json.loads((tmp_path / "here" / TABLE_JSON).read_text())["scale"]["seeds"] == 1
+
+
+@pytest.mark.parametrize(
+    ("command", "part"),
+    [
+        ("reproduce --seeds 0 --out here", "--seeds is 0"),
+        ("reproduce --workers 0 --out here", "--workers is 0"),
+        ("benchmark --vut design1 --figure f.pdf", "--figure"),
+        ("benchmark --vut design1 --figure gone/f.png", "--figure"),
+        ("campaign --vut design1 --vut design2", "--vut is given 2 times: give it once"),
+        ("scenario new a.toml --net x --net y", "--net is given 2 times: give it once"),
+        ("campaign --vut --vut", "there is no VUT '--vut'"),
+        ("campaign --vut desgin2 --gate errors --gate failures -q --quiet", "there is no VUT 'des"),
+    ],
+)
+def test_what_is_wrong_is_named_before_anything_runs(call, tmp_path, command, part):
+    assert_refused(call(*command.split()), part)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_error_in_a_process_of_its_own_is_one_sentence_without_a_traceback(tmp_path):

@@ -16,7 +16,7 @@ import typer
 from typer.testing import CliRunner
 
 from merge_sumo import cli
-from merge_sumo.commands.application import PANELS, unwrapped
+from merge_sumo.commands.application import PANELS
 from merge_sumo.options import GROUPS
 
 ENDS = ".", ":", "!", "?"
@@ -98,9 +98,6 @@ class TestHelp:
         assert "[default: (one a core, as soon" in shown
         assert "[default: (kinematic where" in " ".join(help_of("probability", 200).split())
 
-    def test_joins_the_lines_of_a_paragraph(self):
-        assert unwrapped("A\n    b.\n\n    C\n    d.\n    ") == "A b.\n\nC d."
-
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")
 class TestCtrlC:
@@ -125,33 +122,6 @@ class TestCtrlC:
         assert last.startswith("stopped")
         assert "Traceback" not in text
 
-    @pytest.mark.long
-    def test_prints_no_control_sequence_where_there_is_no_terminal(self, tmp_path):
-        command = "campaign --vut design1 --level 0 --cases 4000 --out run"
-        process = subprocess.Popen(
-            [sys.executable, "-m", "merge_sumo.cli", *command.split()],
-            cwd=tmp_path,
-            env=environment(tmp_path),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
-        assert process.stderr is not None
-        said = process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        _, rest = process.communicate(timeout=120)
-        assert process.returncode == 130
-        assert b"\x1b" not in said + rest
-        assert b"go on with: merge-sumo campaign --resume run" in rest
-
-
-def environment(folder: Path) -> dict[str, str]:
-    return {
-        **os.environ,
-        "MERGE_SUMO_CACHE": str(folder / "cache"),
-        "TERM": "xterm",
-        "COLUMNS": "100",
-    }
-
 
 def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
     """Run a command on a pseudo-terminal until Ctrl-C; return its output and its exit code."""
@@ -159,7 +129,7 @@ def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
     process = subprocess.Popen(
         [sys.executable, "-m", "merge_sumo.cli", *command.split()],
         cwd=folder,
-        env=environment(folder),
+        env={**os.environ, "MERGE_SUMO_CACHE": str(folder / "cache"), "TERM": "xterm"},
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,

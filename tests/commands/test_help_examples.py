@@ -28,8 +28,7 @@ ELSEWHERE = {"train", "reproduce"}
 
 def examples() -> list[str]:
     found = []
-    command = typer.main.get_command(cli.app)
-    waiting = [command]
+    waiting = [typer.main.get_command(cli.app)]
     while waiting:
         one = waiting.pop()
         waiting += getattr(one, "commands", {}).values()
@@ -52,10 +51,6 @@ def place(tmp_path_factory) -> Path:
         net = re.sub(rf"\b{ours}(?=[_\"])", theirs, net)
     (folder / "my.net.xml").write_text(net)
     return folder
-
-
-def test_there_are_examples_of_every_command():
-    assert len(examples()) >= 13
 
 
 @pytest.mark.parametrize("example", [e for e in examples() if e.split()[1] not in ELSEWHERE])

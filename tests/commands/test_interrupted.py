@@ -121,6 +121,7 @@ def test_what_was_stopped_is_made_to_the_byte_and_nothing_stays(name, how, whole
     time.sleep(np.random.default_rng([len(name), len(how)]).uniform(0.3, 1.0) * whole_s)
     code, err = stop(process, how)
     assert "Traceback" not in err or verb.script, err
+    assert "\x1b" not in err, "there is no terminal"
     assert wait_for(world.has_ended), "left running"
     if how != "SIGKILL" and not verb.script:
         assert code in (0, 1, *(c for n in SIGNALS[how] for c in (128 + n, -n))), err
