@@ -104,49 +104,9 @@ class TestAGate:
             assert not Gate(name).check(judge([]), summary).met
 
 
-# The shape that Jenkins (xunit plugin), GitLab and others read, in the attributes that count.
-SHAPE = """
-<xs:schema xmlns:xs="http://www.w3.org/2001/XMLSchema">
-  <xs:attributeGroup name="counts">
-    <xs:attribute name="name" type="xs:string" use="required"/>
-    <xs:attribute name="tests" type="xs:nonNegativeInteger" use="required"/>
-    <xs:attribute name="failures" type="xs:nonNegativeInteger" use="required"/>
-    <xs:attribute name="errors" type="xs:nonNegativeInteger" use="required"/>
-    <xs:attribute name="time" type="xs:decimal" use="required"/>
-  </xs:attributeGroup>
-  <xs:complexType name="wrong"><xs:simpleContent><xs:extension base="xs:string">
-    <xs:attribute name="type" type="xs:string" use="required"/>
-    <xs:attribute name="message" type="xs:string"/>
-  </xs:extension></xs:simpleContent></xs:complexType>
-  <xs:element name="testsuites"><xs:complexType>
-    <xs:sequence><xs:element name="testsuite" maxOccurs="unbounded"><xs:complexType>
-      <xs:sequence>
-      <xs:element name="properties" minOccurs="0"><xs:complexType><xs:sequence>
-        <xs:element name="property" minOccurs="0" maxOccurs="unbounded"><xs:complexType>
-          <xs:attribute name="name" type="xs:string" use="required"/>
-          <xs:attribute name="value" type="xs:string" use="required"/>
-        </xs:complexType></xs:element></xs:sequence></xs:complexType></xs:element>
-      <xs:element name="testcase" minOccurs="0" maxOccurs="unbounded"><xs:complexType>
-        <xs:choice minOccurs="0">
-          <xs:element name="failure" type="wrong"/>
-          <xs:element name="error" type="wrong"/>
-        </xs:choice>
-        <xs:attribute name="name" type="xs:string" use="required"/>
-        <xs:attribute name="classname" type="xs:string" use="required"/>
-        <xs:attribute name="time" type="xs:decimal" use="required"/>
-      </xs:complexType></xs:element></xs:sequence>
-      <xs:attributeGroup ref="counts"/>
-      <xs:attribute name="skipped" type="xs:nonNegativeInteger"/>
-    </xs:complexType></xs:element></xs:sequence>
-    <xs:attributeGroup ref="counts"/>
-  </xs:complexType></xs:element>
-</xs:schema>
-"""
-
-
 def read_junit(file: Path) -> etree._Element:
     root = etree.parse(file).getroot()
-    etree.XMLSchema(etree.fromstring(SHAPE)).assertValid(root)
+    etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd"))).assertValid(root)
     return root
 
 
