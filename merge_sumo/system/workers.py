@@ -263,7 +263,7 @@ AnyWorkers = int | str | None
 def workers_or_cores(workers: int | None) -> int:
     """Return the number of workers: as asked, or one for each core."""
     if workers is not None and (not isinstance(workers, Integral) or workers < 1):
-        raise UserError(f"--workers is {workers!r}: it must be a whole number, 1 or more")
+        raise UserError(f"`workers` is {workers!r}: it must be a whole number, 1 or more")
     return workers or os.cpu_count() or 1
 
 

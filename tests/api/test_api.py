@@ -106,7 +106,7 @@ class TestWrongValues:
             ({"fail_when": 3}, "fail_when is 3: it must be a text"),
             ({"deadline_s": "x"}, "deadline_s is 'x': it must be a number"),
             ({"workers": "2"}, "workers is '2': give a number of processes"),
-            ({"workers": 0}, "--workers is 0: it must be a whole number, 1 or more"),
+            ({"workers": 0}, "`workers` is 0: it must be a whole number, 1 or more"),
         ],
     )
     def test_of_a_campaign(self, values, sentence, tmp_path):

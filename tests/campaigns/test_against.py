@@ -151,11 +151,6 @@ class TestRefuses:
             resume_campaign(Path("run"), {"cases": 20})
         assert json.loads((Path("run") / SETTINGS).read_text())["cases"] == 10
 
-    def test_nothing_where_a_study_runs_the_new_version_alone(self, call):
-        run_campaign(settings(vut="design2", cases=10), Path("run"))
-        assert call("rerun", "run", 0).code == 0
-        assert call("run", "--case", "run", 0, "--vut", "old.py:f").code in (0, 1)
-
     def test_a_link_in_the_place_of_the_old_version(self):
         run_campaign(settings(cases=10), Path("run"))
         shutil.move(Path("run") / AGAINST, "elsewhere")

@@ -315,13 +315,6 @@ class TestARun:
         assert len(run.outcomes) == 2
         assert not run.torn
 
-    def test_knows_that_its_last_line_was_torn(self, folder):
-        outcomes = folder / "outcomes.jsonl"
-        outcomes.write_bytes(outcomes.read_bytes()[:-9])
-        run = Run(folder)
-        assert len(run.outcomes) == 2
-        assert run.torn
-
     @pytest.mark.parametrize("name", ["campaign.json", "outcomes.jsonl"])
     def test_without_one_of_its_files_is_no_campaign(self, folder, name):
         (folder / name).unlink()
@@ -336,15 +329,6 @@ class TestARun:
         with pytest.raises(UserError) as error:
             run.trajectory(2)
         assert_sentence(error, "00001.npz")
-
-    @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.99])
-    def test_refuses_trajectories_that_are_cut_off(self, folder, share):
-        path = folder / "trajectories" / "00000.npz"
-        whole = path.read_bytes()
-        path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(UserError) as error:
-            Run(folder).trajectory(0)
-        assert_sentence(error, "00000.npz")
 
     def test_refuses_trajectories_with_a_flipped_bit(self, folder):
         path = folder / "trajectories" / "00000.npz"

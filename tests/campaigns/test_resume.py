@@ -26,7 +26,6 @@ from merge_sumo.system.interrupt import Interrupt, Stopped
 
 BATCH = 8
 MOUNT = shutil.which("mount")
-KILLER = Path(__file__).resolve().parents[2] / "tools" / "kill_campaigns.py"
 
 
 def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
@@ -252,15 +251,3 @@ class TestTheCommand:
         assert isinstance(result.exception, UserError)
         assert sentence in str(result.exception)
         assert contents(folder) == before
-
-
-@pytest.mark.long
-def test_campaigns_that_are_killed_and_resumed_have_the_same_outcomes():
-    done = subprocess.run(
-        [sys.executable, str(KILLER), "--kills", "2", "--seed", "1"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert "the same outcomes.jsonl after 2 of 2 kills" in done.stdout

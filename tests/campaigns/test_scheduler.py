@@ -224,29 +224,11 @@ def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two
 
 
 class TestInFlight:
-    @pytest.mark.slow
-    def test_a_campaign_grows_as_one_that_had_the_cases_from_the_start(self, whole, tmp_path):
-        ends = ends_of_groups(Run(whole).outcomes)
-        folder = run_campaign(settings(cases=ends[-3]), tmp_path / "run").folder
-        resume_campaign(folder, {"cases": 60})
-        assert outcomes(folder) == outcomes(whole)
-
     def test_a_campaign_records_what_decides_its_outcomes(self, whole, tmp_path):
         assert read_settings(whole)["in_flight"] == 12
         folder = Path(shutil.copytree(whole, tmp_path / "run"))
         with pytest.raises(UserError, match="in_flight differs"):
             resume_campaign(folder, {"in_flight": 13, "cases": 70})
-
-    @pytest.mark.slow
-    def test_a_campaign_that_converges_ends_where_it_would_have_ended(self, tmp_path):
-        eager = settings(cases=400, in_flight=10, stop_when_converged=True)
-        run = run_campaign(eager, tmp_path / "run")
-        count = len(run.outcomes)
-        assert count < 400
-        lines = outcomes(run.folder).splitlines(keepends=True)
-        (run.folder / OUTCOMES).write_bytes(b"".join(lines[: count // 2]))
-        resume_campaign(run.folder)
-        assert outcomes(run.folder) == b"".join(lines)
 
 
 class TestAhead:

@@ -257,7 +257,7 @@ class TestACampaign:
 
 
 def test_no_workers_are_refused_in_a_sentence():
-    with pytest.raises(UserError, match="--workers is 0"):
+    with pytest.raises(UserError, match="`workers` is 0"):
         workers_or_cores(0)
 
 
