@@ -30,7 +30,7 @@ from bench_record import add_record_option, append_record
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
-from merge_sumo.campaigns.campaign import twin_of, twins_of
+from merge_sumo.campaigns.campaign import twin_of
 from merge_sumo.campaigns.plan import resolve, resolve_earlier
 from merge_sumo.campaigns.scheduler import Scheduler, groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -40,6 +40,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.studies.sampler_study import greedy_cover
+from merge_sumo.twin.pair import TwinPair
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import radius_for
@@ -110,7 +111,7 @@ class Versions:
     def against(self, cases: int, seed: int) -> FloatArray:
         """Return the regressions that a campaign against the old version finds, (k, d)."""
         settings = self.pair.settings(cases, seed)
-        twins = twins_of(settings, self.new, self.old)
+        twins = TwinPair(twin_of(settings, self.new), twin_of(settings, self.old))
         sampler = make_sampler(settings.sampler, settings.pool, seed, twins)
         young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
         scheduler = Scheduler(sampler, cases, first=young, tell=partial(tell_both, sampler))

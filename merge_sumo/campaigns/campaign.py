@@ -273,7 +273,7 @@ def _run(
 def _scheduler(campaign: _Version, earlier: _Version | None, on_case: OnCase) -> Scheduler:
     """Return the scheduler of a campaign, which knows what ran before."""
     settings, twin = campaign.settings, twin_of(campaign.settings, campaign.plan)
-    predictor = twin if earlier is None else twins_of(settings, campaign.plan, earlier.plan)
+    predictor = twin if earlier is None else TwinPair(twin, twin_of(settings, earlier.plan))
     sampler = settings.with_repeats(settings.new_sampler(predictor))
     motion = sampler.uses_predictions
     history = campaign.history(motion=motion)
@@ -299,11 +299,6 @@ def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
     """Return the twin of the VUT."""
     lines = centre_lines(plan.road)
     return Twin(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
-
-
-def twins_of(settings: CampaignSettings, new: SimulationPlan, old: SimulationPlan) -> TwinPair:
-    """Return the twins of both versions of a campaign against an earlier one."""
-    return TwinPair(twin_of(settings, new), twin_of(settings, old))
 
 
 def case_name(index: int) -> str:

@@ -21,15 +21,16 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
+from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import counted, printable
-from merge_sumo.system.records import decode
+from merge_sumo.system.records import convert, decode
 from merge_sumo.values.case import FloatArray, to_unit
 from merge_sumo.values.chance import one_per_case
 from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
@@ -62,8 +63,28 @@ class LostError(UserError):
     """A trajectory that is gone, or in a file that cannot be read any more."""
 
 
+class Stated(Struct, frozen=True):
+    """What a reader needs of `campaign.json`; a campaign that does not say had the default."""
+
+    levels: list[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))]] = []
+    tolerated: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
+    fail_when: str = PAPER_CRITERION.fail_when
+    require: str | None = None
+    cases: int = 0
+    stop_when_converged: bool = False
+    ran_again: Annotated[int, Meta(ge=0)] = 0
+
+
 class Run:
     """A finished or interrupted campaign, as its folder holds it.
+
+    Attributes:
+        folder: the folder.
+        settings: what `campaign.json` says.
+        scenario: the scenario.
+        criterion: what counts as a failure.
+        outcomes: the outcomes, in order.
+        torn: whether the last line of them was torn, and its case left out.
 
     Raises `UserError` when the folder is no campaign, a line of it cannot be read, or something is
     not as it was written.
@@ -78,7 +99,11 @@ class Run:
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
         try:
-            self.criterion = _criterion_of(self.settings, folder / SETTINGS)
+            self._stated = convert(self.settings, Stated)
+        except UserError as error:
+            raise UserError(f"{folder / SETTINGS} is no campaign's: {error}") from error
+        try:
+            self.criterion = Criterion(self._stated.fail_when, self._stated.require)
             if outcomes is None:
                 self._read()
             else:
@@ -109,21 +134,13 @@ class Run:
 
     @property
     def levels(self) -> list[int]:
-        """The POV levels that the settings name; `UserError` for none."""
-        levels = self.settings.get("levels")
-        if not isinstance(levels, list) or any(level not in ALL_LEVELS for level in levels):
-            raise UserError(f"{self.folder / SETTINGS} is no campaign's: it has no list of levels")
-        return levels
+        """The POV levels that the settings name, or else those of the cases."""
+        return self._stated.levels or sorted({one.case.level for one in self.outcomes})
 
     @property
     def tolerated(self) -> float:
-        """The share of its runs in which a case may fail; `UserError` for none."""
-        share = self.settings.get("tolerated", 0.0)
-        if isinstance(share, bool) or not isinstance(share, int | float) or not 0.0 <= share < 1.0:
-            raise UserError(
-                f"{self.folder / SETTINGS} has something else than a share as tolerated"
-            )
-        return float(share)
+        """The share of its runs in which a case may fail."""
+        return self._stated.tolerated
 
     @property
     def cases(self) -> list[Outcome]:
@@ -143,13 +160,12 @@ class Run:
     @property
     def may_converge(self) -> bool:
         """Whether the campaign may end before its number of cases."""
-        return self.settings.get("stop_when_converged") is True
+        return self._stated.stop_when_converged
 
     @property
     def interruption(self) -> str:
         """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
-        wanted = self.settings.get("cases")
-        fewer = isinstance(wanted, int) and len(self.outcomes) < wanted and not self.may_converge
+        fewer = len(self.outcomes) < self._stated.cases and not self.may_converge
         if not (self.torn or fewer):
             return ""
         torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
@@ -158,8 +174,7 @@ class Run:
     @property
     def ran_again(self) -> int:
         """Number of cases that ran again because a process had died or had been stopped."""
-        count = self.settings.get(RAN_AGAIN)
-        return count if isinstance(count, int) and count > 0 else 0
+        return self._stated.ran_again
 
     @property
     def ran_again_in_words(self) -> str:
@@ -285,9 +300,6 @@ def read_settings(folder: Path) -> dict[str, Any]:
             f"{path} is not as it was written: take it from a copy; if it was you who changed it, "
             f'remove its "{CHECKSUM}"'
         )
-    levels = settings.get("levels", [])
-    if not (isinstance(levels, list) and all(type(level) is int for level in levels)):
-        raise UserError(f"{path} is no campaign's: its levels are not a list of numbers")
     return settings
 
 
@@ -298,17 +310,6 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
         return US23 if recorded is None else scenario_of_record(recorded)
     except UserError as error:
         raise UserError(f"{path} has no scenario: {error}") from error
-
-
-def _criterion_of(settings: Mapping[str, Any], path: Path) -> Criterion:
-    """Return what counts as a failure in a campaign; one that does not say was the paper's."""
-    fail_when = settings.get("fail_when", PAPER_CRITERION.fail_when)
-    if not isinstance(fail_when, str):
-        raise UserError(f"{path} has no fail_when, or something else there")
-    require = settings.get("require")
-    if not (require is None or isinstance(require, str)):
-        raise UserError(f"{path} has something else than a formula as require")
-    return Criterion(fail_when, require)
 
 
 def _absent_packages(settings: Mapping[str, Any]) -> str:

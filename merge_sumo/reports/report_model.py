@@ -63,7 +63,7 @@ class ReportModel:
         *,
         learns: bool = True,
     ) -> None:
-        """Read what the page shows; `UserError` where settings have no list of levels.
+        """Read what the page shows.
 
         `summary` is that of the run, where it is known. Without `learns` there are no surrogates.
         """

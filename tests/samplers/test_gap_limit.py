@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.campaigns.campaign import twin_of, twins_of
+from merge_sumo.campaigns.campaign import twin_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluate
@@ -15,6 +15,7 @@ from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.history import bounded
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.twin.pair import TwinPair
 from merge_sumo.values.criteria import PAPER
 from merge_sumo.values.regression import regression
 from merge_sumo.values.scenario import US23
@@ -62,7 +63,8 @@ def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m, fail
 def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
     settings, plan, points, outcomes, motions = searched(limit_m, fail_when, 160)
     _, old_plan, _, old, old_motions = searched(limit_m, fail_when, 160, "design1")
-    twin, pair = twin_of(settings, plan), twins_of(settings, plan, old_plan)
+    twin = twin_of(settings, plan)
+    pair = TwinPair(twin_of(settings, plan), twin_of(settings, old_plan))
     twin.tell(outcomes[:80], motions)
     pair.tell(outcomes[:80], motions)
     pair.tell_old(old[:80], old_motions)
