@@ -78,8 +78,8 @@ class Povs:
         return min(asked, most // cars)
 
 
-CHOICE: Final = "0, 1, 2 or all, or own with --pov"
-ONE: Final = "0, 1 or 2, or own with --pov"
+CHOICE: Final = "0, 1, 2 or all, or own with `pov`"
+ONE: Final = "0, 1 or 2, or own with `pov`"
 
 
 def levels_in(
@@ -102,7 +102,7 @@ def check_level(
         levels = either(map(level_name, scenario_levels))
         raise UserError(f"this scenario has no POV level {level_name(level)}: choose {levels}")
     if level == OWN and not own:
-        raise UserError("--level own is a POV that you bring: name it with --pov")
+        raise UserError("`level` own is a POV that you bring: name it with `pov`")
     if level not in levels_in(policies, scenario_levels, own=own):
         raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
 
@@ -127,7 +127,7 @@ def parse_levels(
     level = by_name[text]
     check_level(level, policies, scenario_levels, own=own)
     if own and level != OWN:
-        raise UserError(f"--pov drives at --level own or all, not at --level {text}")
+        raise UserError(f"`pov` drives at `level` own or all, not at `level` {text}")
     return (level,)
 
 
@@ -136,7 +136,7 @@ def one_level(
 ) -> int:
     """Return the one level that `--level` names."""
     if text == "all":
-        raise UserError(f"--level all does not go here: choose {ONE}")
+        raise UserError(f"`level` all does not go here: choose {ONE}")
     return parse_levels(text, policies, scenario_levels, own=own, choice=ONE)[0]
 
 

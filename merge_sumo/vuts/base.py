@@ -47,11 +47,11 @@ class VutOptions:
 
     def __post_init__(self) -> None:
         for option, unit, value in (
-            ("--deadline", "seconds", self.deadline_s),
-            ("--vut-memory", "GiB", self.memory_gib),
+            ("deadline_s", "seconds", self.deadline_s),
+            ("vut_memory_gib", "GiB", self.memory_gib),
         ):
             if not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0):
-                raise UserError(f"{option} is {value!r}: give {unit}, more than 0")
+                raise UserError(f"`{option}` is {value!r}: give {unit}, more than 0")
 
 
 BUILT_IN, INSTALLED, PYTHON, HERE = "built-in", "installed", "python", "here"

@@ -83,7 +83,7 @@ class VutFactory:
             return count
         if requested is None:
             return most
-        raise UserError(f"--workers is {requested}: {self.spec} serves at most {most} at a time")
+        raise UserError(f"`workers` is {requested}: {self.spec} serves at most {most} at a time")
 
     def __call__(self, corridors: int, world: object = None) -> Driver:
         """Return a driver for corridors 0 to `corridors` - 1 of a world of SUMO, if there is one.
@@ -121,19 +121,19 @@ class VutFactory:
         for each in ranges:
             name = each.name
             if names.count(name) > 1:
-                raise UserError(f"--param {name} is given twice: give each parameter once")
+                raise UserError(f"`params` {name} is given twice: give each parameter once")
             if name not in known and self.vut.vut_type is not None:
                 named = quoted(str(self.spec.with_values({name: each.low})))
                 raise UserError(
-                    f"--param {name}: its value today is not known; name it, as in --vut {named}"
+                    f"`params` {name}: its value today is not known; name it, as in `vut` {named}"
                 )
             if name not in known:
                 hint = meant(name, known)
                 choice = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
-                raise UserError(f"--param {name}: {self.spec} has no such parameter: {choice}")
+                raise UserError(f"`params` {name}: {self.spec} has no such parameter: {choice}")
             if not each.low <= known[name] <= each.high:
                 raise UserError(
-                    f"--param {name}={each.low:g}..{each.high:g}: it is {known[name]:g} today, "
+                    f"`params` {name}={each.low:g}..{each.high:g}: it is {known[name]:g} today, "
                     "which is not in that range: give a range around it"
                 )
         return {name: float(known[name]) for name in names}
@@ -155,6 +155,6 @@ def _why_unknown(name: str) -> str:
     names = [*BUILT_IN_VUTS, *installed_vuts()]
     choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
     if not name:
-        return f"name the vehicle under test, as in --vut design2: {choice}"
+        return f"name the vehicle under test, as in `vut` design2: {choice}"
     kinds = [kind for kind, brings in KINDS.items() if brings.form]
     return f"there is no VUT {name!r}: {meant(name, (*names, *kinds))}choose one of {choice}"

@@ -37,7 +37,7 @@ def vut_of_object(
     vut = vut_of(thing, spec, options, given)
     if vut is None:
         raise UserError(
-            f"{text_of(thing, repr)[:80]} is no VUT: give a spec as after --vut, a class or an "
+            f"{text_of(thing, repr)[:80]} is no VUT: give a spec, a class or an "
             "object with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
         )
     try:

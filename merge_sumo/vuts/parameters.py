@@ -147,9 +147,9 @@ class Range:
         except ValueError:
             low = high = math.nan
         if not name.strip() or not (math.isfinite(low) and math.isfinite(high)):
-            raise UserError(f"--param {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
+            raise UserError(f"`params` {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
         if not low < high:
-            raise UserError(f"--param {text}: the range is empty: give the lower end first")
+            raise UserError(f"`params` {text}: the range is empty: give the lower end first")
         return cls(name.strip(), low, high)
 
     @property

@@ -73,7 +73,7 @@ def test_a_formula_is_refused_with_the_place_of_the_mistake():
         (lambda: VutFactory.of("desgin2"), "did you mean design2"),
         (lambda: VutFactory.of("Design2"), r"did you mean design2\? choose"),
         (lambda: VutFactory.of("tracy"), "did you mean traci"),
-        (lambda: VutFactory.of(""), "name the vehicle under test, as in --vut design2: careful, "),
+        (lambda: VutFactory.of(""), "name the vehicle under test, as in `vut` design2: careful, "),
         (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
         (lambda: named_scenario("us23-trafic"), "did you mean us23-traffic"),
         (lambda: Criterion("contat"), "did you mean contact"),

@@ -260,7 +260,7 @@ class TestACampaign:
             (("--level", "own"), "--level own is a POV that you bring: name it with --pov"),
             (("--level", "0", "--pov", "my_pov.py:Pov"), "--pov drives at --level own or all"),
             (("--level", "3", "--pov", "my_pov.py:Pov"), "there is no POV level '3'"),
-            (("--pov", "traci"), "a TraCI client drives the vehicle `vut` and no other"),
+            (("--pov", "traci"), "a TraCI client drives the vehicle named vut and no other"),
             (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
             (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot read"),
             (("--pov", "onnx:nowhere.onnx"), "the POV onnx:nowhere.onnx"),

@@ -200,7 +200,7 @@ class TestParameters:
     [
         (None, ["gap=1..2"], "has no such parameter: did you mean gap_m"),
         (None, ["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
-        (None, ["gap_m=8..32", "gap_m=8..32"], "--param gap_m is given twice"),
+        (None, ["gap_m=8..32", "gap_m=8..32"], "`params` gap_m is given twice"),
         (None, ["gap_m=8"], "write NAME=LOW..HIGH"),
         ("passed", [], "did not fail: name a failure, such as"),
         (10**6, [], "no case 1000000"),

@@ -187,16 +187,16 @@ def test_it_goes_on_where_it_was_stopped_and_workers_change_nothing(campaigns, t
 @pytest.mark.parametrize(
     ("params", "said"),
     [
-        ([], "name what may change: --param NAME=LOW..HIGH"),
-        (["brake"], "--param brake: write NAME=LOW..HIGH"),
+        ([], "name what may change: `params` NAME=LOW..HIGH"),
+        (["brake"], "`params` brake: write NAME=LOW..HIGH"),
         (["brake=1..x"], "write NAME=LOW..HIGH"),
         (["brake=1..nan"], "write NAME=LOW..HIGH"),
         (["=1..2"], "write NAME=LOW..HIGH"),
         (["brake=4..1"], "the range is empty: give the lower end first"),
         (["brake=0..2"], "it is 3 today, which is not in that range"),
-        (["brake=0..4", "brake=1..4"], "--param brake is given twice"),
+        (["brake=0..4", "brake=1..4"], "`params` brake is given twice"),
         (["brak=0..4"], "no such parameter: did you mean brake?"),
-        (["unused=0..4"], "--param unused has no effect on any case, be it 0 or 4"),
+        (["unused=0..4"], "`params` unused has no effect on any case, be it 0 or 4"),
     ],
 )
 def test_what_cannot_be_searched_for_is_refused_in_a_sentence(campaigns, tmp_path, params, said):
@@ -209,7 +209,7 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
     run, given = campaigns("Brakes"), {"out": tmp_path / "out", **FEW}
     with pytest.raises(UserError, match="--trials is 2: it must be 3 or more"):
         repair(run, ["brake=0..4"], **{**given, "trials": 2})
-    with pytest.raises(UserError, match="--cost is 'money': choose time or braking"):
+    with pytest.raises(UserError, match="`cost` is 'money': choose time or braking"):
         repair(run, ["brake=0..4"], cost="money", **given)
     with pytest.raises(UserError, match="the parameters of a network are its weights"):
         VutFactory(parse("onnx:policy.onnx"), files={}).values_of((Range("gain", 0.0, 1.0),))

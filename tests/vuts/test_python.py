@@ -181,7 +181,7 @@ def test_what_cannot_be_found_or_made_is_refused_in_a_sentence(vut, tmp_path):
     with pytest.raises(UserError, match="cannot be made without arguments: TypeError"):
         run_cases(in_process(vut(source)), cases_of(1))
     for deadline in (0.0, -1.0, float("nan")):
-        with pytest.raises(UserError, match="--deadline is"):
+        with pytest.raises(UserError, match="`deadline_s` is"):
             in_process("level0", deadline_s=deadline)
 
 

@@ -45,8 +45,8 @@ class Door:
         except OSError as error:
             self._listener.close()
             raise UserError(
-                f"cannot listen on {HOST}:{port} ({error.strerror}): choose another port by "
-                "--vut traci:PORT"
+                f"cannot listen on {HOST}:{port} ({error.strerror}): choose another port, "
+                "traci:PORT"
             ) from error
         self._note = note
 

@@ -74,8 +74,8 @@ def traci_vut(spec: VutSpec, options: VutOptions) -> Vut:
         max_corridors=1,
         max_workers=None if command else 1,
         files=files,
-        no_pov="a TraCI client drives the vehicle `vut` and no other; bring the POV as Python, an "
-        "FMU, a network or sumo:MODEL",
+        no_pov="a TraCI client drives the vehicle named vut and no other; bring the POV as "
+        "Python, an FMU, a network or sumo:MODEL",
     )
 
 
