@@ -36,7 +36,7 @@ from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_pro
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
 from merge_sumo.sumo.world import MAX_SPEED_MPS, World
 from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import DT_S, MAX_STEPS, US23, VEHICLES, X_VUT0_M, Scenario
+from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.factory import VutFactory
 
@@ -143,7 +143,7 @@ def _episode_by_traci(
     traci.vehicletype.setMaxSpeed("DEFAULT_VEHTYPE", MAX_SPEED_MPS)
     starts = {
         "pov.0": (case.x_pov0_m, case.v_pov0_mps),
-        "vut.0": (X_VUT0_M, case.v_vut0_mps),
+        "vut.0": (US23.x_vut0_m, case.v_vut0_mps),
     }
     for name, path in names.items():
         traci.route.add(f"route.{name}", path.route(0))
@@ -156,7 +156,7 @@ def _episode_by_traci(
         vehicle.setPreviousSpeed(name, speed, 0.0)
     pov.begin(0, case)
     vut.begin(0, case)
-    for step in range(MAX_STEPS):
+    for step in range(US23.max_steps):
         x = {
             name: begins_m[vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
             for name in names

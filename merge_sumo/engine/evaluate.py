@@ -31,7 +31,7 @@ from merge_sumo.system.workers import (
 )
 from merge_sumo.values.case import Case, FloatArray, Pool
 from merge_sumo.values.episode import Episode
-from merge_sumo.values.score import Outcome, Verdict, measure_all
+from merge_sumo.values.score import CaseVerdict, Outcome, measure_all
 from merge_sumo.values.trajectory import End, Trajectory
 
 R = TypeVar("R")
@@ -62,7 +62,7 @@ class Episodes(Sequence[Episode]):
         self.in_sumo = in_sumo
         self._plan, self._ran_again = plan, ran_again
 
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[CaseVerdict]:
         """Return the verdict on each case, which takes less time than its measures."""
         criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
         return [criterion.verdict(trajectory, lines) for trajectory in self.trajectories]

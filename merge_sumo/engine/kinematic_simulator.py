@@ -48,7 +48,6 @@ class KinematicSimulator(Simulator):
         self._plan = plan
         self._sumo: Simulator | None = None
         with ExitStack() as opened:
-            opened.callback(self._close_sumo)
             world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
             self._open_drivers(plan, world, None, opened)
 
@@ -103,6 +102,7 @@ class KinematicSimulator(Simulator):
             return []
         if self._sumo is None:
             self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
+            self._opened.callback(self._sumo.close)
         ran = dict(self._sumo.run(cases))
         return [ran[place] for place in range(len(cases))]
 
@@ -127,10 +127,6 @@ class KinematicSimulator(Simulator):
             f"the case {where} at level {case.level} ends otherwise in SUMO ({_said(sumo)}) than "
             f"by the equations of motion alone ({_said(kinematic)}): choose `engine` sumo"
         )
-
-    def _close_sumo(self) -> None:
-        if self._sumo is not None:
-            self._sumo.close()
 
 
 class SubstepSimulator(Simulator):

@@ -48,7 +48,7 @@ class Povs:
 
     @property
     def levels(self) -> tuple[int, ...]:
-        """The levels for which there is a POV."""
+        """The levels for which there is a POV; level 0 needs no policy."""
         return levels_in(self.policies, self.scenario_levels, own=self.own is not None)
 
     def check_level(self, level: int) -> None:
@@ -115,7 +115,7 @@ def parse_levels(
     own: bool,
     choice: str = CHOICE,
 ) -> tuple[int, ...]:
-    """Return the levels that `--level` names: one, or all of a scenario for which there is a POV.
+    """Return the levels that a person names: one, or all of a scenario for which there is a POV.
 
     Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
     """
@@ -134,7 +134,7 @@ def parse_levels(
 def one_level(
     text: str, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
 ) -> int:
-    """Return the one level that `--level` names."""
+    """Return the one level that a person names."""
     if text == "all":
         raise UserError(f"`level` all does not go here: choose {ONE}")
     return parse_levels(text, policies, scenario_levels, own=own, choice=ONE)[0]
@@ -169,7 +169,12 @@ class PovLibrary(Driver):
         for level in set(povs.levels) & set(POLICIES):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         if povs.own is not None:
-            self._drivers[OWN] = in_the_povs_seat(povs.own, corridors, world)
+            driver = povs.own(corridors, world)
+            if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
+                mainline = [row for row in range(driver.world.vehicles) if row != VUT]
+                self._drivers[OWN] = SumoVut(corridors, driver.world, mainline)
+            else:
+                self._drivers[OWN] = PovAdapter(driver)
         self._level = np.zeros(corridors, dtype=np.int64)
         self._levels_playing = {0}
 
@@ -208,15 +213,6 @@ class PovLibrary(Driver):
 
 BEFORE_M: Final = -1e-9
 """A VUT starts before M; a car of the mainline may start there or past it."""
-
-
-def in_the_povs_seat(own: VutFactory, corridors: int, world: World | None) -> Driver:
-    """Return the driver of the C cars of the mainline of a world, for `corridors` = C K."""
-    driver = own(corridors, world)
-    if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
-        mainline = [row for row in range(driver.world.vehicles) if row != VUT]
-        return SumoVut(corridors, driver.world, mainline)
-    return PovAdapter(driver)
 
 
 class PovAdapter(DriverWrapper):

@@ -47,7 +47,7 @@ NEVER: Final = 2**62
 
 
 @dataclass(slots=True)
-class _Episode:
+class _Running:
     """What runs in a corridor."""
 
     index: int
@@ -113,7 +113,7 @@ class _Rollout:
         self.pauses = 0
         self.excused: Counter[int] = Counter()
         """How often the error of an episode was put down to a pause, by its index."""
-        self.episodes: list[_Episode | None] = [None] * corridors
+        self.episodes: list[_Running | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
@@ -222,7 +222,7 @@ class _Rollout:
         self.begin_others()
         return True
 
-    def running(self) -> dict[int, _Episode]:
+    def running(self) -> dict[int, _Running]:
         """Return the episodes that run, by corridor."""
         episodes = enumerate(self.episodes)
         return {k: e for k, e in episodes if e is not None and self.active[k]}
@@ -296,7 +296,7 @@ class _Rollout:
         self.a_min[:, corridor] = scenario.a_min_mps2
         self.a_max[:, corridor] = scenario.a_max_mps2
         self.timeout_at[corridor] = self.row + scenario.max_steps
-        self.episodes[corridor] = _Episode(index, case, self.row)
+        self.episodes[corridor] = _Running(index, case, self.row)
         self.world.place(corridor, case.starts(), own=case.level == OWN)
         for car in range(len(self.mainline)):
             self.pov.begin(car * self.world.corridors + corridor, case)

@@ -57,9 +57,14 @@ class Simulator:
     ) -> None:
         """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
         self.world = world
-        self.vut = imperfect(plan.vut(world.corridors, sumo), plan.scenario)
+        scenario = plan.scenario
+        self.vut = plan.vut(world.corridors, sumo)
+        if not scenario.sense.is_perfect:
+            self.vut = SensedDriver(self.vut, scenario)
+        if not scenario.act.is_perfect:
+            self.vut = ActuatedDriver(self.vut, scenario.act.at_most("delay_s"))
         opened.callback(self.vut.close)
-        self.pov = povs_for(plan.scenario, plan.povs, world.corridors, sumo)
+        self.pov = povs_for(scenario, plan.povs, world.corridors, sumo)
         opened.callback(self.pov.close)
         self._opened = opened.pop_all()
 
@@ -88,18 +93,6 @@ def corridors_of(plan: SimulationPlan, most: int) -> int:
     """Return the number of corridors, at most so many, that VUT and POVs of a plan can serve."""
     corridors = min(most, plan.vut.vut.max_corridors or most)
     return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
-
-
-def imperfect(vut: Driver, scenario: Scenario) -> Driver:
-    """Return the driver of a VUT behind the sensors and the actuator of a scenario.
-
-    It is the driver itself where both are perfect.
-    """
-    if not scenario.sense.is_perfect:
-        vut = SensedDriver(vut, scenario)
-    if not scenario.act.is_perfect:
-        vut = ActuatedDriver(vut, scenario.act.at_most("delay_s"))
-    return vut
 
 
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:

@@ -20,7 +20,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
 from merge_sumo.studies.sampler_study import SamplerStudy
 from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.values.case import FloatArray, dimensions
+from merge_sumo.values.case import FloatArray
 from merge_sumo.values.fmc import RADIUS
 from merge_sumo.values.scenario import OWN, US23, level_name
 
@@ -141,7 +141,7 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
 
 def _physical(points: FloatArray, level: int) -> FloatArray:
     """Return points of the unit cube, (n, d), in the pool's units."""
-    low, high = np.array([(d.low, d.high) for d in dimensions(level)]).T
+    low, high = np.array([(d.low, d.high) for d in US23.dimensions(level)]).T
     return np.asarray(low + points * (high - low), dtype=np.float64)
 
 
@@ -149,7 +149,7 @@ def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
     from matplotlib.collections import EllipseCollection
     from matplotlib.colors import to_rgb
 
-    x, v, *more = dimensions(level)
+    x, v, *more = US23.dimensions(level)
     failing = _physical(panel.points[panel.failed], level)
     safe = _physical(panel.points[~panel.failed], level)
     size = 3.0 if len(panel.points) > 2000 else 8.0
@@ -173,7 +173,7 @@ def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
 
 
 def _pool_axes(axes: Axes, level: int) -> None:
-    x, y, *_ = dimensions(level)
+    x, y, *_ = US23.dimensions(level)
     axes.set_xlim(x.low, x.high)
     axes.set_ylim(y.low, y.high)
     axes.set_xlabel(US23.notation[x.field].symbol)
@@ -185,7 +185,7 @@ def predicted_margins(
     title: str, by_batch: Mapping[int, PredictedMargins], level: int, truth: FloatArray
 ) -> Figure:
     """Draw the surrogate's margin after some batches, with the failures of the truth, (m, 2)."""
-    x, v = dimensions(level)
+    x, v = US23.dimensions(level)
     steps = np.linspace(-1.0, 1.0, 21)
     failures = _physical(truth, level)
     rows, columns = -(-len(by_batch) // 2), min(len(by_batch), 2)

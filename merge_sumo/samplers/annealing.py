@@ -63,7 +63,7 @@ class AnnealingSampler(LevelwiseSampler):
         for cooled, batch in enumerate(batches[1:].tolist()):
             temperature = TEMPERATURE0 * COOLING**cooled
             moves = np.flatnonzero(history.batch == batch)
-            luck = self.batch_rng(level, batch).random(len(moves))
+            luck = np.random.default_rng([self.seed, level, batch, 0]).random(len(moves))
             turn = (np.arange(len(moves)) % len(standing)).tolist()
             for chain, move, chance in zip(turn, moves.tolist(), luck.tolist(), strict=True):
                 rise = float(history.margin[move] - history.margin[standing[chain]])

@@ -181,15 +181,6 @@ class Sampler(ABC):
         """
         return np.random.default_rng([self.seed, self.proposed(), *key])
 
-    def told_rng(self, *key: int) -> np.random.Generator:
-        """Return a generator that is the same whatever is pending."""
-        told = self.proposed() - len(self._pending)
-        return np.random.default_rng([self.seed, told, *key])
-
-    def batch_rng(self, level: int, batch: int) -> np.random.Generator:
-        """Return a generator that is the same whenever a batch of the past is replayed."""
-        return np.random.default_rng([self.seed, level, batch, 0])
-
 
 class LevelwiseSampler(Sampler):
     """Shares a batch out over the levels, then proposes points in each level's unit cube."""

@@ -127,15 +127,17 @@ class CoverageSampler(Sampler):
                 chance = np.ones(n)
                 # The next points of the sequence that the pending ones began.
                 begun = len(pending)
-                spread = spread_out(begun + n, history.dims, self.told_rng(level))[begun:]
+                told = self.proposed() - len(self._pending)
+                rng = np.random.default_rng([self.seed, told, level])
+                spread = spread_out(begun + n, history.dims, rng)[begun:]
                 return Proposal(spread, chance, chance, (None,) * n)
-            return _Search(history, pending, rng, n).batch(n)
+            return _LevelBatch(history, pending, rng, n).batch(n)
         skill = yield from self._skill(level)
         base_rate = None
         if skill.breaks_promises and not few:
             base_rate = self._base_rate(level, history, pending, n)
         if skill.is_worthless and not few:
-            batch = _Search(history, pending, rng, n).batch(n, base_rate)
+            batch = _LevelBatch(history, pending, rng, n).batch(n, base_rate)
             gaps = yield Query(level, batch.points)
             return skill.annotated(batch, gaps)
         return (yield from twin_guided_batch(history, pending, n, rng, level, skill, base_rate))
@@ -182,7 +184,7 @@ class CoverageSampler(Sampler):
         return shares
 
 
-class _Search:
+class _LevelBatch:
     """One batch at one level."""
 
     def __init__(

@@ -10,15 +10,13 @@ from __future__ import annotations
 import math
 from copy import copy
 from functools import lru_cache
-from typing import Final, Protocol, Self
+from typing import Final, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from merge_sumo.values.ball_union import ball_volume
 from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import RADIUS, radius_for
+from merge_sumo.values.fmc import RADIUS, IntArray, ball_volume, radius_for
 
 CELL: Final = {2: 0.01, 3: 0.0125}
 """Spacing of the grid, by the number of dimensions."""
@@ -29,8 +27,6 @@ PLACES_PER_BALL: Final = 64
 """Nodes in a ball without a grid."""
 MARGIN: Final = 1.1
 """Margin of nodes around the unit cube, in radii."""
-
-IntArray = NDArray[np.int64]
 
 
 class CoverageGrid:
@@ -70,26 +66,6 @@ class CoverageGrid:
         """Cover balls with a probability."""
         self._open[balls] *= np.float32(1.0 - probability)
 
-    def covered_balls(self) -> float:
-        """Return the expected covered volume in balls."""
-        return float((1.0 - self._open).sum()) / self._places.per_ball
-
-
-class _Places(Protocol):
-    """Nodes, the same for every grid with as many dimensions.
-
-    Attributes:
-        count: number of nodes.
-        per_ball: nodes in a ball.
-        overlap: distance from which two balls share no node.
-    """
-
-    count: int
-    per_ball: int
-    overlap: float
-
-    def balls(self, points: FloatArray) -> IntArray: ...
-
 
 class _Grid:
     """The nodes of a regular grid."""
@@ -103,7 +79,7 @@ class _Grid:
         offsets = np.stack(axes, axis=-1).reshape(-1, dims)
         inside = np.square(offsets * self._cell).sum(axis=1) <= RADIUS**2
         self._ball = offsets[inside] @ self._strides
-        self.count, self.per_ball = side**dims, len(self._ball)
+        self.count = side**dims
         self.overlap = 2.0 * RADIUS + math.sqrt(dims) * self._cell
 
     def balls(self, points: FloatArray) -> IntArray:
@@ -117,17 +93,17 @@ class _Scattered:
     def __init__(self, dims: int, radius: float) -> None:
         from scipy.stats.qmc import Halton
 
-        self.per_ball, self.overlap = PLACES_PER_BALL, math.inf
+        self.overlap = math.inf
         margin = MARGIN * radius
-        density = self.per_ball / (ball_volume(dims) * radius**dims)
+        density = PLACES_PER_BALL / (ball_volume(dims) * radius**dims)
         self.count = round(density * (1.0 + 2.0 * margin) ** dims)
         sequence = Halton(dims, seed=np.random.default_rng(dims)).random(self.count)
         self._tree = cKDTree(sequence * (1.0 + 2.0 * margin) - margin)
 
     def balls(self, points: FloatArray) -> IntArray:
-        return np.asarray(self._tree.query(points, k=self.per_ball)[1], dtype=np.int64)
+        return np.asarray(self._tree.query(points, k=PLACES_PER_BALL)[1], dtype=np.int64)
 
 
 @lru_cache
-def _places(dims: int, cell: float | None, radius: float) -> _Places:
+def _places(dims: int, cell: float | None, radius: float) -> _Grid | _Scattered:
     return _Scattered(dims, radius) if cell is None else _Grid(dims, cell)

@@ -1,8 +1,7 @@
 """Subset simulation, a baseline of the paper (Au and Beck, 2001).
 
-A small probability is a product of larger ones: P(F) = P(F1) P(F2 | F1) ... with regions F1, F2,
-... of ever lower margins that end at the failures. The cases of a region are drawn by Markov chains
-that start from the lowest margins of the region before (modified Metropolis).
+Regions F1, F2, ... of ever lower margins end at the failures. The cases of a region are drawn by
+Markov chains that start from the lowest margins of the region before (modified Metropolis).
 """
 
 from __future__ import annotations
@@ -26,47 +25,30 @@ WIDTH0: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Stage:
-    """Where subset simulation stands after a history.
+class SubsetState:
+    """The state of subset simulation after a history.
 
     Attributes:
-        probability: P(F_i), the estimated probability of the present region.
-        number: i; 0 is the whole cube, sampled uniformly.
+        number: i of the present region; 0 is the whole cube, sampled uniformly.
         threshold: the region is where the margin is at or below this; infinite for the cube.
         chains: present state of each chain, (c, d); none for the cube.
         moved: moves made in this region so far.
-        failing_share: share of failures among the samples of the region so far.
     """
 
-    probability: float
     number: int
     threshold: float
     chains: FloatArray
     moved: int
-    failing_share: float
 
 
-def failure_probability(history: LevelHistory) -> float:
-    """Return the estimate of the probability of failure under uniform cases; 0 for no failure.
-
-    It is the product of the conditional probabilities so far, P(F_i), times the share of failures
-    among the samples of F_i. Once F_i is the failures themselves, it does not change any more.
-    With stages of 100 it scatters widely and is biased upwards: on a failure probability of .005
-    it has a mean of .0061 and a coefficient of variation of .5 (200 seeds); with stages of 1000 or
-    4000 the mean is .0051 and .0050.
-    """
-    stage = replay(history)
-    return stage.probability * stage.failing_share
-
-
-def replay(history: LevelHistory) -> Stage:
+def replay(history: LevelHistory) -> SubsetState:
     """Return where the chains stand after a history of batches proposed by `SubsetSampler`.
 
     The k-th move of a stage belongs to chain k modulo their number. A batch may run over the end
     of a stage by a few samples, which then count for it.
     """
     dims = history.points.shape[1]
-    probability, number, threshold, moved = 1.0, 0, np.inf, 0
+    number, threshold, moved = 0, np.inf, 0
     chains, levels = np.empty((0, dims)), np.empty(0)
     # The samples of the stage: states of the chains, so that a rejected move repeats its state.
     samples, margins = [np.empty((0, dims))], [np.empty(0)]
@@ -93,14 +75,11 @@ def replay(history: LevelHistory) -> Stage:
         if threshold < 0.0:
             seeds = np.flatnonzero(of_population < 0.0)
             threshold = np.nextafter(0.0, -np.inf)
-        probability *= len(seeds) / len(population)
         chains, levels = population[seeds], of_population[seeds]
         # The seeds are samples of the new region too.
         samples, margins = [chains.copy()], [levels.copy()]
         number, moved = number + 1, 0
-    seen = np.concatenate(margins)
-    share = float(np.mean(seen < 0.0)) if len(seen) else 0.0
-    return Stage(probability, number, threshold, chains, moved, share)
+    return SubsetState(number, threshold, chains, moved)
 
 
 class SubsetSampler(LevelwiseSampler):
@@ -117,11 +96,11 @@ class SubsetSampler(LevelwiseSampler):
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
         """Return the next move of `n` chains, (n, d), or uniform points at first."""
-        stage = replay(history)
-        if stage.number == 0:
+        state = replay(history)
+        if state.number == 0:
             return rng.random((n, history.dims))
-        dims = stage.chains.shape[1]
-        chain = (stage.moved + np.arange(n)) % len(stage.chains)
+        dims = state.chains.shape[1]
+        chain = (state.moved + np.arange(n)) % len(state.chains)
         # A region with p0 of the volume of the one before has p0^(1/d) of its size.
-        width = WIDTH0 * SEED_SHARE ** ((stage.number - 1) / dims)
-        return reflect(stage.chains[chain] + rng.uniform(-width, width, (n, dims)))
+        width = WIDTH0 * SEED_SHARE ** ((state.number - 1) / dims)
+        return reflect(state.chains[chain] + rng.uniform(-width, width, (n, dims)))

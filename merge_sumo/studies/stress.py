@@ -34,7 +34,7 @@ from merge_sumo.system.records import Record, read_record, to_json
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
 from merge_sumo.values.scenario import COORDINATES, DT_S, Scenario
-from merge_sumo.values.score import Outcome, Verdict
+from merge_sumo.values.score import CaseVerdict, Outcome
 
 STRESS: Final = "stress.json"
 LISTED: Final = 10
@@ -326,7 +326,7 @@ def _rung(
         changed = change.plan(plan)
         for draw in range(runs):
             cases = [_case(o.case, change, draw, changed.scenario) for o in tested]
-            found: dict[int, Verdict] = {}
+            found: dict[int, CaseVerdict] = {}
             for place, verdict in evaluate(changed, cases, workers, keep=Episodes.verdicts):
                 found[place] = verdict
                 study.on_cases(1)
@@ -347,7 +347,7 @@ def _case(case: Case, change: Change, draw: int, scenario: Scenario) -> Case:
     return change.case(case, np.random.default_rng([draw, case.seed]))
 
 
-def flips_of(tested: Sequence[Outcome], found: Mapping[int, Verdict]) -> Flips:
+def flips_of(tested: Sequence[Outcome], found: Mapping[int, CaseVerdict]) -> Flips:
     """Return which verdicts flip, by those of a run at the places of the recorded outcomes."""
     passes: list[int] = []
     fails: list[int] = []

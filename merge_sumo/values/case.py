@@ -41,7 +41,6 @@ from merge_sumo.values.scenario import (
     US23,
     V_VUT0_MPS,
     VUT,
-    Dimension,
     MergeScenario,
     Scenario,
 )
@@ -52,14 +51,6 @@ _NONE: Final = (None,) * len(COORDINATES)
 _PERFECT: Final = (PERFECT_SENSING, PERFECT_ACTUATION)
 MOST_DRAWS: Final = 2**32
 """Draws of a case: their numbers have 4 bytes."""
-
-
-X_POV0, V_POV0 = US23.dimensions(0)
-
-
-def dimensions(level: int, scenario: Scenario = US23) -> tuple[Dimension, ...]:
-    """Return the continuous coordinates of the pool at a level: two, or three at level 2."""
-    return scenario.dimensions(level)
 
 
 @quickly_pickled

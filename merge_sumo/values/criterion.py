@@ -24,9 +24,9 @@ from merge_sumo.values.scenario import VEHICLES, VUT, MergeScenario, Scenario, l
 from merge_sumo.values.score import (
     FOLLOWED_UP,
     ON_LANE,
+    CaseVerdict,
     Measures,
     Outcome,
-    Verdict,
     margin_of,
     measure,
 )
@@ -150,11 +150,11 @@ class Criterion:
         )
         return self._outcome(0, 0, trajectory, measures)
 
-    def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Verdict:
+    def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
         """Return the verdict on an episode, the same as that of its outcome."""
         score = trajectory.case.scenario.score
         if self.is_papers and score is not None:
-            found = Verdict(margin_of(score(trajectory)), trajectory.end.is_tested)
+            found = CaseVerdict(margin_of(score(trajectory)), trajectory.end.is_tested)
             return found._replace(is_tested=found.is_tested or found.failed)
         return self.judged(trajectory, lines).verdict
 

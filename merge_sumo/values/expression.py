@@ -47,7 +47,7 @@ _SIGN: Final = re.compile(r"&&|\|\||[&|]|!(?!=)|(?<![=<>!])=(?!=)")
 
 
 @dataclass(frozen=True, slots=True)
-class Comparison:
+class Inequality:
     """Whether one value is below another: left < right, or <= where `or_equal`."""
 
     left: str | float
@@ -109,13 +109,13 @@ class AnyOf:
         return min(part.margin(values) for part in self.parts)
 
 
-Condition = Comparison | Equality | Negation | AllOf | AnyOf
+Condition = Inequality | Equality | Negation | AllOf | AnyOf
 
 
 def names_of(condition: Condition) -> frozenset[str]:
     """Return the values that a condition speaks of."""
     match condition:
-        case Comparison(left, right):
+        case Inequality(left, right):
             return frozenset(side for side in (left, right) if isinstance(side, str))
         case Equality(name):
             return frozenset({name})
@@ -233,9 +233,9 @@ class _Parser:
             raise self._error(first, "a comparison of two numbers says nothing of a case")
         match sign:
             case ast.Lt() | ast.LtE():
-                return Comparison(left, right, isinstance(sign, ast.LtE))
+                return Inequality(left, right, isinstance(sign, ast.LtE))
             case ast.Gt() | ast.GtE():
-                return Comparison(right, left, isinstance(sign, ast.GtE))
+                return Inequality(right, left, isinstance(sign, ast.GtE))
         raise self._error(first, "compare numbers with <, <=, > or >=")
 
     def _equality(

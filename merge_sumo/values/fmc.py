@@ -8,8 +8,8 @@ the balls are not clipped to the unit cube.
 
 One dimension is a sum of gaps and two dimensions follow from the boundary arcs of the union; both
 are exact up to rounding. Three dimensions integrate the exact two-dimensional union over parallel
-slices, to within about 1e-4 of the volume. More dimensions are integrated by quasi-Monte Carlo,
-with a standard error that `fmc_and_error` states.
+slices, to within about 1e-4 of the volume. More dimensions are sampled, with a standard error that
+`fmc_and_error` states.
 
 The paper has two and three dimensions, with one radius. Failures are a thin layer beside a
 hypersurface of the pool, where the order of merging changes, and a ball covers a disc of it with
@@ -20,6 +20,7 @@ much of such a layer takes about as many balls.
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -29,19 +30,17 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from merge_sumo.values.ball_union import FloatArray, ball_volume, union_volume
-
 RADIUS: Final = 0.05
 """Ball radius rho of the paper, in normalised coordinates (no unit)."""
 MOST_DIMENSIONS: Final = 6
 
+FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_SHARED_SAMPLES: Final = 1 << 15
-"""Places of the union at which balls are counted. Measured: `growth_bound` is within .01 of that
-of thirty times as many."""
-_SHARED_SEED: Final = 20210909
+_SAMPLES: Final = 1 << 17
+"""Places of the union at which balls are counted."""
+_SEED: Final = 20210909
 
 _TURN: Final = 2.0 * np.pi
 # Inside this module lengths are in radii: every ball has radius 1.
@@ -64,6 +63,11 @@ _DISC_BUDGET: Final = 10_000
 # Distances are rounded (0.2 - 0.15 > 0.05): without this slack a grid with the spacing of the
 # radius would fall apart into regions at random.
 _LINK_SLACK: Final = 1e-9
+
+
+def ball_volume(dimension: int) -> float:
+    """Return the volume of a ball of radius 1."""
+    return math.exp(dimension / 2.0 * math.log(math.pi) - math.lgamma(dimension / 2.0 + 1.0))
 
 
 def radius_for(dimension: int) -> float:
@@ -102,11 +106,9 @@ def fmc(points: ArrayLike, radius: float | None = None) -> float:
 def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float, float]:
     """Return `fmc` and its standard error; 0 for d = 1 and 2, and 1e-4 of the volume for d = 3.
 
-    For d > 3 it is the standard error of the mean of eight independent scramblings, 0 where no two
-    balls overlap. As a share of the volume it is, for clouds and bands of up to 1,000 points, at
-    most 4e-4 (measured for d = 4 to 6), and for heaps of them 1.3e-3; for up to 100,000 points at
-    most 1.4e-3 for d = 4, 3.5e-3 for d = 5 and 8e-3 for d = 6. The same points have the same
-    figure. Raises as `fmc` does.
+    For d > 3 it is that of sampling, 0 where no two balls overlap: as a share of the volume at most
+    1e-3 for clouds and bands of 1,000 points (measured for d = 4 to 6), 4e-3 for 20,000, and 2e-2
+    for heaps. The same points have the same figure. Raises as `fmc` does.
     """
     cases = _checked(points, radius)
     dimension = cases.shape[1]
@@ -123,7 +125,11 @@ def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float
         volume = _union_volume(centres)
         error = _SLICED * volume
     else:
-        volume, error = union_volume(centres)
+        # A place is drawn as often as it is in balls (Karp and Luby, 1983).
+        share = 1.0 / _balls_at(centres)
+        all_balls = len(centres) * ball_volume(dimension)
+        volume = all_balls * float(share.mean())
+        error = all_balls * float(share.std()) / math.sqrt(_SAMPLES)
     return float(volume * unit**dimension), float(error * unit**dimension)
 
 
@@ -135,13 +141,7 @@ def covered(points: ArrayLike, failures: ArrayLike, radius: float | None = None)
     share of independent points, so its error is that of a binomial share of m, in any dimension.
     Raises as `fmc` does.
     """
-    drawn, found = _checked(points, radius), _checked(failures, radius)
-    if not (len(drawn) and len(found)):
-        return np.zeros(len(drawn), dtype=np.bool_)
-    limit = (radius_for(drawn.shape[1]) if radius is None else radius) * (1.0 + _LINK_SLACK)
-    distance, _ = cKDTree(found).query(drawn, distance_upper_bound=2.0 * limit)
-    within: BoolArray = distance <= limit
-    return within
+    return _near(points, failures, radius, nth=1)
 
 
 def has_neighbour(points: ArrayLike, radius: float | None = None) -> BoolArray:
@@ -149,11 +149,16 @@ def has_neighbour(points: ArrayLike, radius: float | None = None) -> BoolArray:
 
     Raises as `fmc` does.
     """
-    cases = _checked(points, radius)
-    if len(cases) < 2:
-        return np.zeros(len(cases), dtype=np.bool_)
-    limit = (radius_for(cases.shape[1]) if radius is None else radius) * (1.0 + _LINK_SLACK)
-    distance, _ = cKDTree(cases).query(cases, k=[2], distance_upper_bound=2.0 * limit)
+    return _near(points, points, radius, nth=2)
+
+
+def _near(points: ArrayLike, others: ArrayLike, radius: float | None, nth: int) -> BoolArray:
+    """Return for which points, (m, d), the nth nearest of others is within the radius, (m,)."""
+    drawn, found = _checked(points, radius), _checked(others, radius)
+    if not (len(drawn) and len(found)):
+        return np.zeros(len(drawn), dtype=np.bool_)
+    limit = (radius_for(drawn.shape[1]) if radius is None else radius) * (1.0 + _LINK_SLACK)
+    distance, _ = cKDTree(found).query(drawn, k=[nth], distance_upper_bound=2.0 * limit)
     within: BoolArray = distance[:, 0] <= limit
     return within
 
@@ -179,15 +184,7 @@ def growth_bound(points: ArrayLike, radius: float | None = None) -> float:
     if len(cases) == 0:
         return 0.0
     unit = radius_for(cases.shape[1]) if radius is None else radius
-    centres = cases[np.lexsort(cases.T)] / unit
-    rng = np.random.default_rng(_SHARED_SEED)
-    direction = rng.standard_normal((_SHARED_SAMPLES, cases.shape[1]))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    reach = rng.random((_SHARED_SAMPLES, 1)) ** (1.0 / cases.shape[1])
-    places = centres[rng.integers(len(centres), size=_SHARED_SAMPLES)] + reach * direction
-    balls = cKDTree(centres).query_ball_point(places, 1.0, return_length=True)
-    # A place of the union is drawn as often as it is in balls.
-    balls = np.maximum(balls, 1)
+    balls = _balls_at(cases[np.lexsort(cases.T)] / unit)
     return float((balls == 1).sum() / (1.0 / balls).sum())
 
 
@@ -264,6 +261,17 @@ def _components(links: list[IntArray], n: int) -> IntArray:
     graph = coo_array((np.ones(len(pairs), dtype=np.bool_), pairs.T), shape=(n, n))
     component: IntArray = connected_components(graph, directed=False)[1]
     return component
+
+
+def _balls_at(centres: FloatArray) -> IntArray:
+    """Return in how many unit balls around centres, (n, d), places drawn in them lie."""
+    rng, dimension = np.random.default_rng(_SEED), centres.shape[1]
+    direction = rng.standard_normal((_SAMPLES, dimension))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    reach = rng.random((_SAMPLES, 1)) ** (1.0 / dimension)
+    places = centres[rng.integers(len(centres), size=_SAMPLES)] + reach * direction
+    balls = cKDTree(centres).query_ball_point(places, 1.0, return_length=True)
+    return np.maximum(np.asarray(balls, dtype=np.int64), 1)
 
 
 def _checked(points: ArrayLike, radius: float | None) -> FloatArray:

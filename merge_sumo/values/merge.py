@@ -88,29 +88,12 @@ def on_lane(trajectory: Trajectory) -> dict[str, float | None]:
     behind = [(x_vut - x - scenario.vut_length_m, v) for x, v in cars if x < x_vut]
     if ahead:
         found["gap_ahead_m"] = min(ahead)
-        found["time_gap_ahead_s"] = _time_gap_s(min(ahead), v_vut)
+        found["time_gap_ahead_s"] = min(ahead) / v_vut if v_vut > 0.0 else None
     if behind:
         gap_m, v_mps = min(behind)
-        found |= {"gap_behind_m": gap_m, "time_gap_behind_s": _time_gap_s(gap_m, v_mps)}
+        found["gap_behind_m"] = gap_m
+        found["time_gap_behind_s"] = gap_m / v_mps if v_mps > 0.0 else None
     return found
-
-
-def _time_gap_s(gap_m: float, v_mps: float) -> float | None:
-    """Return the time in which a follower drives a gap; None where it stands."""
-    return gap_m / v_mps if v_mps > 0.0 else None
-
-
-def needed_braking_mps2(gap_m: float, closing_mps: float) -> float:
-    """Return the deceleration with which bodies do not touch, the first reaction included.
-
-    0 where the gap does not close, infinite where bodies touch or touch within the reaction time.
-    """
-    if gap_m <= 0.0:
-        return math.inf
-    if closing_mps <= 0.0:
-        return 0.0
-    room_m = gap_m - closing_mps * REACTION_S
-    return closing_mps**2 / (2.0 * room_m) if room_m > 0.0 else math.inf
 
 
 def brake_after_mps2(trajectory: Trajectory) -> float:
@@ -119,7 +102,13 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
     0 where nobody has to brake or the VUT never merged, infinite where bodies overlap or no braking
     is in time. In traffic it is the largest that any car or the VUT needs.
     """
-    return max((needed_braking_mps2(*pair) for pair in neighbours(trajectory)), default=0.0)
+    needed_mps2 = [0.0]
+    for gap_m, closing_mps in neighbours(trajectory):
+        room_m = gap_m - max(closing_mps, 0.0) * REACTION_S
+        if room_m <= 0.0:
+            return math.inf
+        needed_mps2.append(max(closing_mps, 0.0) ** 2 / (2.0 * room_m))
+    return max(needed_mps2)
 
 
 def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:

@@ -49,13 +49,6 @@ class Prediction(Record, frozen=True):
         """The gaps, (E, G); NaN where the VUT never arrived."""
         return np.array(self.dx_m, dtype=np.float64)
 
-    @property
-    def median_dx_m(self) -> float | None:
-        """The gap in the middle of all members'; None where the VUT never arrives."""
-        gaps = np.sort(np.nan_to_num(self.gaps_m.ravel(), nan=np.inf))
-        middle = float(gaps[len(gaps) // 2])
-        return middle if math.isfinite(middle) else None
-
     def __post_init__(self) -> None:
         """Raise `UserError` unless every expert has the same number of gaps, one or more."""
         if not self.dx_m or len({len(row) for row in self.dx_m}) != 1 or not self.dx_m[0]:

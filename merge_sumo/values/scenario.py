@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
 from msgspec import Meta
@@ -236,8 +236,13 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Check the numbers one by one, then together."""
-        for field in fields(self):
-            self._check_range(field.name)
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name, None)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not math.isfinite(number):
+                    raise UserError(f"{name} is {value}: it must be finite")
+                if number is not None and not low <= number <= high:
+                    raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
         for name, fits, wanted in self._checks():
             if not fits:
                 raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
@@ -261,18 +266,6 @@ class Scenario:
         for name, imperfection in self._imperfections():
             fits = known.issuperset(f"{name}_{field}" for field in imperfection.ranged)
             yield name, fits, f"numbers: a range is a coordinate that {self.kind} does not have"
-
-    def _check_range(self, name: str) -> None:
-        """Raise `UserError` where a number is not finite, or none of a road and its cars."""
-        value = getattr(self, name)
-        numbers = [x for x in (value if isinstance(value, tuple) else (value,)) if x is not None]
-        if name not in RANGES:
-            return
-        low, high = RANGES[name]
-        if not all(math.isfinite(x) for x in numbers):
-            raise UserError(f"{name} is {value}: it must be finite")
-        if not all(low <= x <= high for x in numbers):
-            raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
 
     def to_record(self) -> dict[str, Any]:
         """Return the scenario as JSON keeps it.
@@ -543,12 +536,3 @@ def as_merge(scenario: Scenario) -> MergeScenario:
             f"{scenario.name} is a scenario of kind {scenario.kind}: this needs a merge"
         )
     return scenario
-
-
-# The paper's numbers by name, for what is of this scenario alone: training and shipped policies.
-A_MIN_MPS2: Final = US23.a_min_mps2
-A_MAX_MPS2: Final = US23.a_max_mps2
-X_VUT0_M: Final = US23.x_vut0_m
-V_VUT0_MAX_MPS: Final = US23.v_start_max_mps
-MAX_STEPS: Final = US23.max_steps
-DX_CRASH_M: Final = US23.dx_crash_m

@@ -158,7 +158,7 @@ class Measures:
         return self.score is not None and self.score < FAILURE_SCORE
 
 
-class Verdict(NamedTuple):
+class CaseVerdict(NamedTuple):
     """The verdict on an episode, without its measures.
 
     Attributes:
@@ -217,9 +217,9 @@ class Outcome:
         return self.measures.end.is_tested or self.failed
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> CaseVerdict:
         """The verdict alone."""
-        return Verdict(self.margin, self.is_tested)
+        return CaseVerdict(self.margin, self.is_tested)
 
     @property
     def signed_gap(self) -> float | None:
@@ -234,13 +234,6 @@ class Outcome:
             return None if dx_m is None else dx_m / self.case.scenario.dx_crash_m
         gap = 1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin)
         return -gap if dx_m is not None and dx_m < 0.0 else gap
-
-    @property
-    def predicted_gaps(self) -> FloatArray | None:
-        """The gaps that were predicted, (E, G), in the unit of `signed_gap`; None without any."""
-        if self.prediction is None:
-            return None
-        return self.prediction.gaps_m / self.case.scenario.dx_crash_m
 
     def to_record(self) -> dict[str, Any]:
         """Return the flat, JSON-ready record that `outcomes.jsonl` holds, units in the names."""

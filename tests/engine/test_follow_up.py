@@ -65,7 +65,7 @@ class TestMeasures:
         assert not set(FOLLOWED_UP) & set(Outcome(0, 0, CASE, measure(ending(9.0))).to_record())
 
     def test_that_nobody_takes_are_refused(self):
-        with pytest.raises(UserError, match="--follow-up SECONDS"):
+        with pytest.raises(UserError, match="`follow_up_s` SECONDS"):
             Criterion("after_ttc_s < 2").check(US23)
         Criterion("after_ttc_s < 2").check(FOLLOWED)
 

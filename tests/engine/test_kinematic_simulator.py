@@ -107,7 +107,7 @@ class TestTheCheck:
             world.x_m[VUT] += off_m / 80.0
 
         monkeypatch.setattr(EquationWorld, "command", drift)
-        with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose --engine sumo"):
+        with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose `engine` sumo"):
             run_cases(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
 
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from plans import plan_for
 from test_kinematic_simulator import uniform
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
-from merge_sumo.drivers.lane import LanePov, Merging, acc_mps2, idm_mps2
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
+from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.sumo.world import World
@@ -88,63 +88,6 @@ class TestAWish:
         assert v_mps[VUT, 0] == pytest.approx(0.0, abs=1e-9)
         assert 128.0 < x_m[VUT, 0] < 130.0
         assert hardest >= -4.0 - 1e-9
-
-
-class TestTheCarBehind:
-    def test_follows_as_published(self):
-        # Equilibrium of IDM: the gap is (s0 + v T) / sqrt(1 - (v / v0)^4).
-        gap = (2.0 + 20.0) / np.sqrt(1.0 - (20.0 / 30.0) ** 4)
-        state = np.array([gap]), np.array([20.0]), np.array([20.0])
-        assert idm_mps2(*state, np.array([30.0]))[0] == pytest.approx(0.0, abs=1e-12)
-        assert acc_mps2(*state, np.zeros(1), np.array([30.0]))[0] == pytest.approx(0.0, abs=1e-12)
-
-    def test_is_calm_where_a_leader_cuts_in_at_its_own_speed(self):
-        # Half a second behind a leader of the same speed: IDM brakes hard, ACC hardly.
-        state = np.array([15.0]), np.array([30.0]), np.array([30.0])
-        idm = idm_mps2(*state, np.array([30.0]))[0]
-        acc = acc_mps2(*state, np.zeros(1), np.array([30.0]))[0]
-        assert idm == pytest.approx(-1.5 * (32.0 / 15.0) ** 2)
-        assert acc == pytest.approx(0.01 * idm + 0.99 * 2.0 * np.tanh(idm / 2.0))
-
-    def test_brakes_as_a_leader_that_brakes_asks(self):
-        state = np.array([10.0]), np.array([20.0]), np.array([20.0])
-        idm = idm_mps2(*state, np.array([30.0]))[0]
-        acc = acc_mps2(*state, np.array([-4.0]), np.array([30.0]))[0]
-        cah = -4.0 * 400.0 / (400.0 + 2.0 * 10.0 * 4.0)
-        assert acc == pytest.approx(0.01 * idm + 0.99 * (cah + 2.0 * np.tanh((idm - cah) / 2.0)))
-
-
-class _Fixed(Driver):
-    """Brakes by 4 m/s2, and notes where it sees the VUT."""
-
-    def act(self, scene: Scene) -> FloatArray:
-        self.seen_m = scene.x_vut_m.copy()
-        return np.full(self.corridors, -4.0)
-
-
-class TestAPov:
-    @pytest.mark.parametrize(
-        ("x_pov", "x_vut", "merged", "answer", "seen_m"),
-        [
-            (-80.0, -50.0, False, -4.0, -50.0),  # before M: the game at M
-            (-30.0, 20.0, False, -4.0, -110.0),  # behind M: the game at the lane's end
-            (30.0, 20.0, False, 1.0, -110.0),  # past the VUT: back to the first speed
-            (30.0, 20.0, True, 1.0, 20.0),  # ahead of a VUT that has merged
-        ],
-    )
-    def test_by_hand(self, x_pov, x_vut, merged, answer, seen_m):
-        driver = _Fixed(1)
-        pov = LanePov(driver)
-        pov.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE))
-        scene = Scene(
-            np.array([True]),
-            np.array([10]),
-            np.array([[x_pov], [x_vut]]),
-            np.array([[25.0], [20.0]]),
-            merged=np.array([merged]),
-        )
-        assert pov.act(scene)[0] == answer
-        assert driver.seen_m[0] == seen_m
 
 
 @pytest.fixture

@@ -15,12 +15,11 @@ import numpy as np
 import pytest
 import safetensors.numpy
 from calling import assert_refused
-from campaigning import campaign_settings, resume_campaign, run_campaign
+from campaigning import campaign_settings, run_campaign
 from numpy.typing import NDArray
 from plans import plan_for
 
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
+from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, policies_of
@@ -125,37 +124,6 @@ class TestACampaign:
         assert "policies are there for level 0, 1" in err
 
 
-class TestResuming:
-    @pytest.fixture
-    def stopped(self, swapped, tmp_path) -> Path:
-        """Return a campaign with policies of its own that has run a batch of three."""
-        folder = run_campaign(settings(swapped), tmp_path / "run").folder
-        lines = outcomes(folder).splitlines(keepends=True)
-        (folder / OUTCOMES).write_bytes(b"".join(lines[:8]))
-        for batch in (1, 2):
-            (folder / "trajectories" / f"{batch:05d}.npz").unlink()
-        (folder.parent / "whole").write_bytes(b"".join(lines))
-        return folder
-
-    def test_takes_them_from_elsewhere_when_they_are_named_there(self, stopped, swapped, tmp_path):
-        moved = Path(shutil.copytree(swapped, tmp_path / "moved"))
-        resume_campaign(stopped, given={"policies": str(moved)})
-        assert outcomes(stopped) == (stopped.parent / "whole").read_bytes()
-        assert read_settings(stopped)["policies"] == str(moved)
-        assert "forced" not in read_settings(stopped)
-
-    def test_a_folder_that_somebody_sent_opens_no_policies_but_those_that_it_was_run_with(
-        self, stopped, same, swapped, monkeypatch, tmp_path
-    ):
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "theirs"))
-        record = read_settings(stopped) | {"policies": str(same)}
-        (stopped / SETTINGS).write_text(json.dumps(record))
-        with pytest.raises(UserError, match=r"policies_sha256\.pov1 differs"):
-            resume_campaign(stopped)
-        resume_campaign(stopped, given={"policies": str(swapped)})
-        assert outcomes(stopped) == (stopped.parent / "whole").read_bytes()
-
-
 class TestOtherCommands:
     def test_a_truth_is_of_its_policies_wherever_they_are(self, same, swapped, tmp_path):
         def counted(folder: Path | None) -> int:
@@ -248,12 +216,6 @@ class TestAFolder:
         assert {outcome.measures.end for outcome in ran.outcomes} == {end}
         assert {outcome.margin for outcome in ran.outcomes} == {None}
         assert "action values that are not finite" in str(ran.outcomes[0].measures.error)
-
-    @pytest.mark.parametrize("manifest", [b"", b"{", b"[]", b'{"networks": 3}', b"\xff\xfe\xfd"])
-    def test_with_a_spoilt_manifest_is_refused(self, tmp_path, manifest):
-        (tmp_path / MANIFEST).write_bytes(manifest)
-        with pytest.raises(UserError, match="is not a readable manifest"):
-            resolve(settings(tmp_path))
 
     def test_that_a_worker_does_not_have_is_said_in_a_sentence(self, same, tmp_path):
         folder = Path(shutil.copytree(same, tmp_path / "policies"))

@@ -4,10 +4,8 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
-from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -185,17 +183,6 @@ class TestAPov:
         assert same([motion for motion in mixed if motion.case.level == OWN], alone)
 
 
-class TestSumosOwnPov:
-    def test_brakes_for_the_vut_where_level_0_does_not(self):
-        (motion,) = run(
-            "sumo:IDM",
-            [MergeCase(level=OWN, x_pov0_m=-280.0, v_pov0_mps=33.0, scenario=US23)],
-            "level0",
-        )
-        assert motion.a_pov_mps2.min() < -1.0
-        assert measure(motion).end is End.MERGED
-
-
 CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])
 
 
@@ -272,24 +259,3 @@ class TestACampaign:
             assert_refused(call(command, "--vut", "design1", *arguments), said)
         left = {path.name for path in Path().iterdir()} - {"__pycache__"}
         assert left == {"my_pov.py"}
-
-
-class TestOtherCommands:
-    def test_a_truth_is_of_the_files_of_its_pov(self, call):
-        given = ("--vut", "design2", "--level", "own", "--pov", "my_pov.py:Pov", "--workers", 1)
-        source = """
-            from pathlib import Path
-            def Pov(seen):
-                Path(__file__).with_name("it-drove").touch()
-                return {}
-        """
-
-        def drives(answer: float) -> bool:
-            Path("it-drove").unlink(missing_ok=True)
-            Path("my_pov.py").write_text(dedent(source.format(answer)))
-            code, out, _ = call("truth", *given, "--cases", 30, "--json")
-            assert code == 0
-            assert json.loads(out)["level"] == OWN
-            return Path("it-drove").exists()
-
-        assert [drives(answer) for answer in (0.0, 0.0, 1.0)] == [True, False, True]

@@ -56,10 +56,6 @@ class TestItsRoad:
         assert from_the_middle_m(line) > RADIUS_M + 3.2
         assert m == road.lane_point(0.0, on_ramp=False)
 
-    def test_gives_the_ring_the_right_of_way(self, road):
-        assert road.ramp_approach.yields
-        assert not road.mainline_approach.yields
-
 
 class TestItsPool:
     def test_has_a_conflict_in_half_of_its_cases(self):

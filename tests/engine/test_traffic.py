@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +13,8 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, MergeCase, Pool, from_unit, to_unit
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, VUT, Scenario
+from merge_sumo.values.case import Case, Pool, from_unit, to_unit
+from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import VutOptions, seen_in
@@ -147,44 +146,6 @@ class TestWhatTheVutMeets:
         assert seen == (1.5, -190.0, 29.0, -140.0, 28.0)
         assert seen.others == ((-150.0, 31.0), (-190.0, 29.0), (-200.0, 30.0))
         assert seen.others[0].x_m == -150.0
-
-    def test_is_all_cars_for_sumos_own_drivers(self):
-        # Behind M the car ahead is its leader; far away there is none.
-        near = MergeCase(
-            level=0,
-            x_pov0_m=-340.0,
-            v_pov0_mps=25.0,
-            headway_ahead_s=10.0,
-            headway_behind_s=4.0,
-            scenario=TRAFFIC,
-        )
-        far = replace(near, headway_ahead_s=30.0)
-        (behind_it,), (alone,) = run("sumo:IDM", [near], 1), run("sumo:IDM", [far], 1)
-        assert not np.array_equal(behind_it.motion[:80, VUT], alone.motion[:80, VUT])
-
-
-class TestARunInTraffic:
-    def test_shows_all_cars_to_a_traci_client(self, tmp_path):
-        script = tmp_path / "client.py"
-        script.write_text(
-            "import sys, traci\n"
-            "traci.init(int(sys.argv[1]))\n"
-            "while traci.simulation.getMinExpectedNumber() > 0:\n"
-            "    traci.simulationStep()\n"
-            "    if 'vut' in (names := traci.vehicle.getIDList()):\n"
-            "        assert sorted(names) == ['ahead', 'behind', 'pov', 'vut'], names\n"
-            "        assert traci.vehicle.getLeader('behind', 500.0)[0] == 'pov'\n"
-            "        assert traci.vehicle.getLength('vut') == 4.0\n"
-            "        gap = traci.vehicle.getLeader('pov', 500.0)[1]\n"
-            "        at = [traci.vehicle.getPosition(n)[0] for n in ('ahead', 'pov')]\n"
-            "        assert abs(gap - (at[0] - at[1] - 6.0)) < 1e-6, (gap, at)\n"
-            "        traci.vehicle.setSpeed('vut', 20.0)\n"
-        )
-        scenario = replace(TRAFFIC, pov_length_m=6.0, vut_length_m=4.0)
-        command = f"{sys.executable} {script} {{port}}"
-        trajectories = run(f"traci:{command}", cases_of(0, 2, scenario))
-        assert [t.error for t in trajectories] == [None, None]
-        assert [t.end for t in trajectories] == [End.MERGED] * 2
 
 
 def ending(gaps_m: dict[int, float], speeds: dict[int, float] | None = None) -> Trajectory:

@@ -16,7 +16,7 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.hosting import hosted_paths
 from merge_sumo.sumo.world import World
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
+from merge_sumo.values.scenario import DT_S, US23
 
 EXACT = 1e-9
 
@@ -51,7 +51,9 @@ class Commander:
 
     def step(self):
         shape = self.x_m.shape
-        drawn = self.rng.uniform(A_MIN_MPS2, A_MAX_MPS2, shape) * self.rng.integers(0, 2, shape)
+        drawn = self.rng.uniform(US23.a_min_mps2, US23.a_max_mps2, shape) * self.rng.integers(
+            0, 2, shape
+        )
         to_a_stand = self.rng.random(shape) < 0.02
         a = np.where(to_a_stand, -self.v_mps / DT_S, drawn)
         self.world.step(a)

@@ -26,7 +26,7 @@ from merge_sumo.sumo.replay_folder import (
     write_scenario,
 )
 from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
+from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -48,7 +48,7 @@ def commanded(a_mps2: np.ndarray, road) -> Trajectory:
 
 
 STEPS = 300
-RANDOM = np.random.default_rng(0).uniform(A_MIN_MPS2, A_MAX_MPS2 + 1.5, (STEPS, 2))
+RANDOM = np.random.default_rng(0).uniform(US23.a_min_mps2, US23.a_max_mps2 + 1.5, (STEPS, 2))
 STANDS_THEN_GOES = np.array([(2.0, -4.0 if step < 120 else 2.0) for step in range(STEPS)])
 
 

@@ -75,7 +75,5 @@ def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when
         failed = np.array([outcome.failed for outcome in ran[80:]])
         assert failed.any()
         assert np.mean(said == failed) > 0.9
-        # What is recorded in m is read in units of the limit again.
-        skill = PredictionSkill([], 0, limit_m)
-        one = replace(ran[80], prediction=skill.prediction(gaps[..., 0], 0.5, 0.5, 0.5))
-        assert one.predicted_gaps == pytest.approx(gaps[..., 0], abs=1e-4)
+        recorded = PredictionSkill([], 0, limit_m).prediction(gaps[..., 0], 0.5, 0.5, 0.5)
+        assert recorded.gaps_m == pytest.approx(limit_m * gaps[..., 0], abs=1e-4)

@@ -28,7 +28,6 @@ from merge_sumo.studies.probability import (
     probability_of,
 )
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.values.case import dimensions
 from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.scenario import US23
 
@@ -150,9 +149,9 @@ class TestADistribution:
         return read_distribution(path, LEVELS, scenario=US23)
 
     def sample(self, distribution, level=2, n=4000):
-        chances = np.random.default_rng(0).random((n, len(dimensions(level))))
-        low = np.array([d.low for d in dimensions(level)])
-        high = np.array([d.high for d in dimensions(level)])
+        chances = np.random.default_rng(0).random((n, len(US23.dimensions(level))))
+        low = np.array([d.low for d in US23.dimensions(level)])
+        high = np.array([d.high for d in US23.dimensions(level)])
         return low + distribution.points(level, chances) * (high - low)
 
     def test_that_is_not_stated_is_uniform_over_levels_and_pool(self):

@@ -18,7 +18,7 @@ from merge_sumo.studies.stress import DRAWS, RUNGS, STRESS, Flips, Rung, Stress,
 from merge_sumo.system.records import to_plain
 from merge_sumo.values.imperfection import Actuation
 from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Verdict
+from merge_sumo.values.score import CaseVerdict
 
 FAIL_WHEN = "bumper_gap_m < 15"
 """Two fifths of the cases fail: no sampler need look for them."""
@@ -117,7 +117,11 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_sentence(tmp_path,
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
-    fails, passes, ends = Verdict(-900.0, True), Verdict(-1.0, True), Verdict(-1.0, False)
+    fails, passes, ends = (
+        CaseVerdict(-900.0, True),
+        CaseVerdict(-1.0, True),
+        CaseVerdict(-1.0, False),
+    )
     both = [failed, passed]
     assert flips_of(both, {0: fails, 1: passes}) == Flips()
     assert flips_of(both, {0: passes, 1: fails}) == Flips((failed.index,), (passed.index,))

@@ -40,7 +40,7 @@ from merge_sumo.sumo.replay_folder import (
     write_scenario,
 )
 from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MAX_MPS, X_VUT0_M, MergeScenario
+from merge_sumo.values.scenario import DT_S, US23, MergeScenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -55,7 +55,7 @@ Command = Callable[[int], float]
 
 def drive(case: Case, pov: Command, vut: Command, steps: int, end: End) -> Trajectory:
     """Return the motion of eq. (4) under given accelerations; speeds do not fall below 0."""
-    x = np.array([case.x_pov0_m, X_VUT0_M])
+    x = np.array([case.x_pov0_m, US23.x_vut0_m])
     v = np.array([case.v_pov0_mps, case.v_vut0_mps])
     rows = []
     for step in range(steps):
@@ -160,7 +160,13 @@ MOTIONS: dict[str, tuple[Case, Command, Command, int, End]] = {
     "a fast POV": (at_level_0(-180.0, 35.0), lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT),
     "no step": (at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR),
     "level 2": (OF_LEVEL_2, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED),
-    "a fast VUT": (at_level_0(-300.0, 30.0, V_VUT0_MAX_MPS), constant, constant, 41, End.MERGED),
+    "a fast VUT": (
+        at_level_0(-300.0, 30.0, 45.0),
+        constant,
+        constant,
+        41,
+        End.MERGED,
+    ),
 }
 """Case, acceleration of the POV and of the VUT, steps and end."""
 

@@ -14,7 +14,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.plan import versions
 from merge_sumo.values.case import Case, from_unit
 from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import A_MIN_MPS2, DT_S, POV, US23, VUT, Scenario
+from merge_sumo.values.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.values.score import Outcome, measure
 from merge_sumo.values.trajectory import End, Trajectory
 
@@ -37,7 +37,7 @@ def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Tra
         a[VUT] = (
             1.0
             if step * DT_S < 3.0
-            else max(A_MIN_MPS2, -v[VUT] / DT_S) * (1.0 if timeout else 0.05)
+            else max(US23.a_min_mps2, -v[VUT] / DT_S) * (1.0 if timeout else 0.05)
         )
         rows.append(list(zip(x, v, a, strict=True)))
         x = [place + speed * DT_S for place, speed in zip(x, v, strict=True)]

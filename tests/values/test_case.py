@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import MergeCase, dimensions, from_unit, to_unit
+from merge_sumo.values.case import MergeCase, from_unit, to_unit
 from merge_sumo.values.scenario import US23
 
 
@@ -25,13 +25,13 @@ def test_the_corners_of_the_unit_cube_are_the_bounds_of_the_pool():
 
 
 def test_orientation_is_a_coordinate_only_at_level_2():
-    assert [len(dimensions(level)) for level in (0, 1, 2)] == [2, 2, 3]
+    assert [len(US23.dimensions(level)) for level in (0, 1, 2)] == [2, 2, 3]
     assert from_unit(np.array([[0.5, 0.5]]), level=1, scenario=US23)[0].svo_rad is None
 
 
 @given(st.sampled_from([0, 1, 2]), st.lists(st.floats(0.0, 0.999), min_size=3, max_size=3))
 def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
-    points = np.array([coordinates[: len(dimensions(level))]])
+    points = np.array([coordinates[: len(US23.dimensions(level))]])
     assert to_unit(from_unit(points, level, scenario=US23), level, scenario=US23) == pytest.approx(
         points, abs=1e-12
     )

@@ -7,18 +7,15 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 from calling import invoke
-from campaigning import run_campaign
 from foreign_nets import FOREIGN
 from merges import SMALLER
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
-from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
-from merge_sumo.values.case import MergeCase, Pool, from_unit, to_unit
+from merge_sumo.values.case import MergeCase, Pool, to_unit
 from merge_sumo.values.scenario import RANGES, US23, MergeScenario
 from merge_sumo.values.score import measure
 from merge_sumo.values.trajectory import End, Trajectory
@@ -137,24 +134,6 @@ class TestACase:
         assert verdicts == [True, False]
 
 
-@pytest.fixture(scope="module")
-def elsewhere(tmp_path_factory) -> Run:
-    """Return a campaign of another scenario on the shipped road."""
-    settings = CampaignSettings(
-        vut="level0", levels=(0,), cases=30, batch=30, sampler="uniform", scenario=OTHER
-    )
-    return run_campaign(settings, tmp_path_factory.mktemp("other") / "run")
-
-
-class TestACampaign:
-    def test_is_driven_by_the_profile_of_its_scenario(self, elsewhere):
-        motion = elsewhere.trajectory(0).motion
-        assert motion[:-1, 1, 2].max() == 0.5
-        assert motion[:, 1, 1].max() == pytest.approx(14.0)
-        due_s = level0_time_to(np.array(100.0), np.array(10.0), 0.5, 14.0)
-        assert elsewhere.outcomes[0].measures.t_end_s == pytest.approx(float(due_s), abs=0.11)
-
-
 @pytest.mark.parametrize("name", ["curved", "lane drop", "OpenDRIVE"])
 def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     build, mainline, ramp = FOREIGN[name]
@@ -203,8 +182,3 @@ def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_train
         "ttc_min_s 7 is like 3.5 in us23 (trained on 7)",
         "dx_crash_m 6 is like 3 in us23 (trained on 6)",
     ]
-
-
-def test_points_of_one_scenario_are_cases_of_it():
-    (case,) = from_unit(np.array([[0.5, 0.5]]), 0, scenario=OTHER)
-    assert (case.x_pov0_m, case.v_pov0_mps) == (-200.0, 15.0)

@@ -78,7 +78,7 @@ class TestFormulas:
         ],
     )
     def test_with_other_words_do_not_get_to_the_parser(self, text, said):
-        with pytest.raises(UserError, match="--require") as error:
+        with pytest.raises(UserError, match="`require`") as error:
             Criterion(require=text)
         assert said in str(error.value)
 

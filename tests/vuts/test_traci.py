@@ -25,7 +25,7 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import A_MAX_MPS2, A_MIN_MPS2, DT_S, US23
+from merge_sumo.values.scenario import DT_S, US23
 from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
@@ -74,7 +74,7 @@ class Played:
                 self.reasons.append(vut.reason(0))
                 return
             self.accelerations.append(a)
-            a = min(max(a, A_MIN_MPS2), A_MAX_MPS2)
+            a = min(max(a, US23.a_min_mps2), US23.a_max_mps2)
             x_pov, x, v = x_pov + v_pov * DT_S, x + v * DT_S, max(v + a * DT_S, 0.0)
             self.speeds.append(v)
         self.reasons.append(None)
