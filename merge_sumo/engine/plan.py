@@ -93,18 +93,26 @@ class SimulationPlan:
             object.__setattr__(self, "policies_sha256", self.povs.sha256())
 
     def key(self, level: int = OWN) -> dict[str, Any]:
-        """Return what decides the outcomes of cases at a level: see `plan_key`."""
+        """Return what decides the outcomes of cases at a level, as plain values for JSON.
+
+        The files of a VUT are left out, as they are known in full only after it drove: what is kept
+        under a key has their hashes beside it. Instead the working folder counts where a user's
+        code runs, because the same name may be another file in another folder.
+        """
         own = self.povs.own if level == OWN else None
-        return plan_key(
-            vut=str(self.vut.spec),
-            deadline_s=self.vut.options.deadline_s,
-            pov=None if own is None else str(own.spec),
-            policies_sha256=self.policies_sha256,
-            road_sha256=self.road.sha256,
-            scenario=self.scenario,
-            criterion=self.criterion,
-            versions=self.versions,
-        )
+        vut, pov = str(self.vut.spec), None if own is None else str(own.spec)
+        code = runs_code(vut) or (pov is not None and runs_code(pov))
+        return {
+            "vut": vut,
+            "deadline_s": self.vut.options.deadline_s,
+            "pov": pov,
+            "folder": str(Path.cwd()) if code else None,
+            "policies_sha256": dict(self.policies_sha256),
+            "road_sha256": self.road.sha256,
+            "scenario": self.scenario.to_record(),
+            "criterion": asdict(self.criterion),
+            "versions": dict(self.versions),
+        }
 
     def at_level(self, level: int) -> SimulationPlan:
         """Return the plan for the cases of a level, which a POV of another level does not meet."""
@@ -166,37 +174,6 @@ class SimulationPlan:
                 f"a worker has another policy {name} in {self.povs.policies} than this process, or "
                 "none: put the same files there"
             )
-
-
-def plan_key(
-    *,
-    vut: str,
-    deadline_s: float,
-    pov: str | None,
-    policies_sha256: Mapping[str, str],
-    road_sha256: str,
-    scenario: Scenario,
-    criterion: Criterion,
-    versions: Mapping[str, str],
-) -> dict[str, Any]:
-    """Return what decides the outcomes of cases, as plain values that JSON can hold.
-
-    The files of a VUT are left out, as they are known in full only after it drove: what is kept
-    under a key has their hashes beside it. Instead the working folder counts where a user's code
-    runs, because the same name may be another file in another folder.
-    """
-    code = runs_code(vut) or (pov is not None and runs_code(pov))
-    return {
-        "vut": vut,
-        "deadline_s": deadline_s,
-        "pov": pov,
-        "folder": str(Path.cwd()) if code else None,
-        "policies_sha256": dict(policies_sha256),
-        "road_sha256": road_sha256,
-        "scenario": scenario.to_record(),
-        "criterion": asdict(criterion),
-        "versions": dict(versions),
-    }
 
 
 def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following, keep_behind_vut
@@ -149,7 +148,9 @@ class _Rollout:
             try:
                 world.advance()
                 acceleration = self.ask_drivers()
-                world.command(acceleration, self.merged_next())
+                merging = self.merging
+                merged = None if merging is None else merging.step(world.x_m, world.v_mps)
+                world.command(acceleration, merged)
             except VutLostError as lost:
                 yield from self.begin_anew(lost, paused=self.was_paused())
                 continue
@@ -163,7 +164,10 @@ class _Rollout:
             if self.errors and self.was_paused() and self.excuse():
                 continue
             self.step += 1
-            arrived = self.has_arrived() & self.active
+            if self.merging is not None:
+                arrived = self.merging.merged & self.active
+            else:
+                arrived = world.scenario.has_ended(world.x_m, world.v_mps) & self.active
             # In most steps no episode ends.
             if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
                 ended = arrived | (self.row >= self.timeout_at)
@@ -179,18 +183,6 @@ class _Rollout:
                             corridor, self.ends_as if arrived[corridor] else End.TIMEOUT
                         )
                 self.refill(corridors)
-
-    def merged_next(self) -> NDArray[np.bool_] | None:
-        """Return which VUTs are on the mainline after this step, (K,); None without a lane."""
-        if self.merging is None:
-            return None
-        return self.merging.step(self.world.x_m, self.world.v_mps)
-
-    def has_arrived(self) -> NDArray[np.bool_]:
-        """Return in which corridors the VUT has merged, or the scenario has come to its end."""
-        if self.merging is not None:
-            return self.merging.merged
-        return self.world.scenario.has_ended(self.world.x_m, self.world.v_mps)
 
     def goes_on(self, corridor: int, *, arrived: bool) -> bool:
         """Return whether an episode goes on behind M; note where that begins."""
@@ -317,7 +309,11 @@ class _Rollout:
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
-        _check_finite(x_m, v_mps)
+        # In most steps the sums of squares are enough.
+        if not math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)) and not (
+            np.isfinite(x_m).all() and np.isfinite(v_mps).all()
+        ):
+            raise SimulationError("a position or a speed is not finite")
         merged = None if self.merging is None else self.merging.merged
         scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
@@ -352,20 +348,16 @@ class _Rollout:
             answer = np.asarray(self.vut.act(scene), dtype=np.float64)
             if answer.shape != (corridors,):
                 raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
-            self.note_signals()
+            for corridor, left in self.vut.signals().items():
+                episode = self.episodes[corridor]
+                if left and episode is not None:
+                    episode.left.append((self.row - 1 - episode.first_row, left))
             return answer
         except (SimulationError, VutLostError):
             raise
         except WRONGS as error:
             self.raised = f"{type(error).__name__}: {error}"
             return np.full(corridors, np.nan)
-
-    def note_signals(self) -> None:
-        """Note what the VUT has left with its answers."""
-        for corridor, left in self.vut.signals().items():
-            episode = self.episodes[corridor]
-            if left and episode is not None:
-                episode.left.append((self.row - 1 - episode.first_row, left))
 
     def only_numbers(self, answer: FloatArray) -> FloatArray:
         """Return answers, (A, K), with 0 where one is no number; note whose doing that was.
@@ -419,12 +411,3 @@ class _Rollout:
             episode.case, before, self.ends_as, None, episode.clipped, after, signals
         )
         return episode.index, merged
-
-
-def _check_finite(x_m: FloatArray, v_mps: FloatArray) -> None:
-    """Raise `SimulationError` where a position or a speed, (A, K), is not finite."""
-    # In most steps the sums of squares are enough.
-    if math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)):
-        return
-    if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
-        raise SimulationError("a position or a speed is not finite")

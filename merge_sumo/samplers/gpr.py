@@ -45,19 +45,7 @@ class GprSampler(LevelwiseSampler):
     other, and the variance is conditioned on the earlier ones (it does not depend on their
     results), so that a batch is spread out instead of piled up on one maximum. A query is worth
     only the share of its ball (radius rho of the FMC) that no failure and no pick covers yet.
-
-    What the choices are worth: FMC / truth after 400 cases, design1 at level 0 and design2 at
-    level 1, medians of 6 seeds, which scatter by .03 (`python tools/bench_samplers.py --ablate`).
-
-    ===========================  =====  =====  ===========================  =====  =====
-    as it is                     .91    .91    p = 1,000                    .86    .85
-    noise 1e-4                   .77    .63    p = 16,000                   .89    .80
-    noise 1e-3                   .78    .68    length scales from .02       .90    .79
-    noise 3e-2                   .79    .90    length scales from .1        .73    .64
-    z1 = 2                       .83    .81    epsilon0 = .1                .89    .85
-    z1 = 8                       .86    .71    epsilon0 = .3                .88    .86
-    covered balls count fully    .85    .68    alpha = .91                  .91    .83
-    ===========================  =====  =====  ===========================  =====  =====
+    `python tools/bench_samplers.py --ablate` measures what the choices are worth.
     """
 
     about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"

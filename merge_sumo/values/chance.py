@@ -8,7 +8,6 @@ does.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
@@ -75,7 +74,7 @@ class RunsOfCase:
         it fails exactly where the case does.
         """
         spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
-        ordered = sorted(self.outcomes, key=lambda outcome: (_margin(outcome), outcome.index))
+        ordered = sorted(self.outcomes, key=lambda run: (run.margin or 0.0, run.index))
         return ordered[spared]
 
     def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
@@ -84,10 +83,6 @@ class RunsOfCase:
         It holds for a number of runs that outcomes do not decide.
         """
         return clopper_pearson(self.failures, self.runs, confidence)
-
-
-def _margin(outcome: Outcome) -> float:
-    return math.inf if outcome.margin is None else outcome.margin
 
 
 def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:

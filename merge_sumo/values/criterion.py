@@ -135,7 +135,9 @@ class Criterion:
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
     ) -> Outcome:
         """Return the outcome of an episode at a place in a campaign."""
-        return self._outcome(index, batch, trajectory, measure(trajectory, lines))
+        measures = measure(trajectory, lines)
+        margin = self.margin(trajectory, measures)
+        return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
     def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
         """Return the outcome of an episode of no campaign, for its verdict alone.
@@ -148,7 +150,8 @@ class Criterion:
         measures = measure(
             trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
         )
-        return self._outcome(0, 0, trajectory, measures)
+        margin = self.margin(trajectory, measures)
+        return Outcome(0, 0, trajectory.case, measures, margin=margin)
 
     def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
         """Return the verdict on an episode, the same as that of its outcome."""
@@ -167,12 +170,6 @@ class Criterion:
             return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
         margin = self.judged(trajectory, lines).margin
         return margin is not None and abs(margin) <= rounding
-
-    def _outcome(
-        self, index: int, batch: int, trajectory: Trajectory, measures: Measures
-    ) -> Outcome:
-        margin = self.margin(trajectory, measures)
-        return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
 
 PAPER_CRITERION: Final = Criterion()

@@ -11,12 +11,12 @@ parts, `or` the smallest, and `not` turns the sign.
 from __future__ import annotations
 
 import ast
-import math
 import re
+import sys
 import warnings
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
@@ -37,13 +37,10 @@ Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
 NONE: Final[Mapping[str, str]] = {}
 """No conditions that are named."""
-NEAR: Final = 20
-"""Characters of a text that are shown from a mistake on."""
 ALIKE_MEASURES: Final = 0.5
 """Ratio of matching characters from which on a measure may have been meant."""
-OTHER_SIGNS: Final = {"&&": "and", "||": "or", "&": "and", "|": "or", "!": "not", "=": "== or <"}
-"""Signs of other languages, and what stands for them here."""
-_SIGN: Final = re.compile(r"&&|\|\||[&|]|!(?!=)|(?<![=<>!])=(?!=)")
+OTHER_SIGNS: Final = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
+"""Signs of other languages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,49 +151,19 @@ def parse_condition(
         written = ast.unparse(tree)
         if len(text) > MOST_CHARACTERS and text != written:
             raise too_long
-        parser = _Parser(text, vocabulary, f"{what} {shown!r}", named)
-        return parser.condition(tree), written
+        return _Parser(vocabulary, f"{what} {shown!r}", named).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
+        sign = OTHER_SIGNS.search(text)
+        hint = f": write and, or, not, == or < instead of {sign[0]}" if sign else ""
         raise UserError(
             f"{what} {shown!r} is no expression over measures such as "
-            f"'ttc_s < 1.5 or end == \"TIMEOUT\"'{_why(text, error)}"
+            f"'ttc_s < 1.5 or end == \"TIMEOUT\"'{hint}"
         ) from error
 
 
-def _place(text: str, line: int, column: int, encoding: str | None = None) -> int:
-    """Return the index of a character by its line, and its column in characters or bytes."""
-    lead = len(text) - len(text.lstrip())
-    lines = text[lead:].splitlines(keepends=True)
-    if encoding is not None:
-        column = len(lines[line - 1].encode(encoding)[:column].decode(encoding))
-    return lead + sum(map(len, lines[: line - 1])) + column
-
-
-def _at(text: str, place: int) -> str:
-    near = text[place : place + NEAR].strip()
-    return f"at character {place + 1}, near {printable(near)!r}" if near else "at its end"
-
-
-def _why(text: str, error: BaseException) -> str:
-    """Return where a text cannot be parsed; nothing where the parser does not say."""
-    if not isinstance(error, SyntaxError) or not text.strip():
-        return ""
-    sign = _SIGN.search(text)
-    if sign is not None:
-        instead = OTHER_SIGNS[sign[0]]
-        return f": {_at(text, sign.start())}: write {instead} instead of {sign[0]}"
-    place = _place(text, error.lineno or 1, (error.offset or 1) - 1)
-    if not error.offset or place >= len(text.rstrip()):
-        return ": it breaks off at its end"
-    return f": look {_at(text, place)}"
-
-
 class _Parser:
-    def __init__(
-        self, text: str, vocabulary: Vocabulary, what: str, named: Mapping[str, str]
-    ) -> None:
-        self._text, self._what = text, what
-        self._vocabulary, self._named = vocabulary, named
+    def __init__(self, vocabulary: Vocabulary, what: str, named: Mapping[str, str]) -> None:
+        self._vocabulary, self._what, self._named = vocabulary, what, named
 
     def condition(self, node: ast.expr) -> Condition:
         """Return the condition of a part of the tree."""
@@ -215,11 +182,11 @@ class _Parser:
             case ast.Name(id=name) if name in self._named:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name in self._vocabulary:
-                raise self._error(node, f"{name} stands alone: compare it with something")
+                raise self._error(f"{name} stands alone: compare it with something")
             case ast.Name(id=name):
-                raise self._unknown(node, name)
+                raise self._unknown(name)
         raise self._error(
-            node, f"{_shown(node)} is no condition: write comparisons, and, or, not and brackets"
+            f"{_shown(node)} is no condition: write comparisons, and, or, not and brackets"
         )
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
@@ -228,30 +195,27 @@ class _Parser:
         names = [s for s in (left, right) if isinstance(s, str) and not isinstance(s, _Text)]
         choices = [self._vocabulary[name] for name in names]
         if texts or any(choices):
-            return self._equality(first, sign, names, texts)
+            return self._equality(sign, names, texts)
         if not names:
-            raise self._error(first, "a comparison of two numbers says nothing of a case")
+            raise self._error("a comparison of two numbers says nothing of a case")
         match sign:
             case ast.Lt() | ast.LtE():
                 return Inequality(left, right, isinstance(sign, ast.LtE))
             case ast.Gt() | ast.GtE():
                 return Inequality(right, left, isinstance(sign, ast.GtE))
-        raise self._error(first, "compare numbers with <, <=, > or >=")
+        raise self._error("compare numbers with <, <=, > or >=")
 
-    def _equality(
-        self, node: ast.expr, sign: ast.cmpop, names: list[str], texts: list[_Text]
-    ) -> Condition:
+    def _equality(self, sign: ast.cmpop, names: list[str], texts: list[_Text]) -> Condition:
         choices = self._vocabulary[names[0]] if len(texts) == len(names) == 1 else None
         if choices is None:
-            raise self._error(node, "compare a measure that is a text with a text in quotes")
+            raise self._error("compare a measure that is a text with a text in quotes")
         name, text = names[0], str(texts[0])
         if not isinstance(sign, ast.Eq | ast.NotEq):
-            raise self._error(node, f"{name} is a text: compare it with == or !=")
+            raise self._error(f"{name} is a text: compare it with == or !=")
         if text not in choices:
             raise self._error(
-                node,
                 f"{name} is never {text!r}: {meant(text, sorted(choices))}it is "
-                f"{either(sorted(choices))}",
+                f"{either(sorted(choices))}"
             )
         equality = Equality(name, text)
         return equality if isinstance(sign, ast.Eq) else Negation(equality)
@@ -262,56 +226,43 @@ class _Parser:
                 return name
             case ast.Name(id=name) if name in self._named:
                 raise self._error(
-                    node,
                     f"{name} is a criterion, which is met or not: write it alone, or compare a "
-                    "measure",
+                    "measure"
                 )
             case ast.Name(id=name):
-                raise self._unquoted(node, name, other) or self._unknown(node, name)
+                texts = self._vocabulary.get(other.id) if isinstance(other, ast.Name) else None
+                if near := nearest(name, sorted(texts or ())):
+                    raise self._error(f'a text is to be in quotes: {_shown(other)} == "{near[0]}"')
+                raise self._unknown(name)
             case ast.Constant(value=str(text)):
                 return _Text(text)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as number):
                 return -self._finite(number)
             case ast.Constant() as number:
                 return self._finite(number)
-        raise self._error(node, f"{_shown(node)} is neither a measure nor a number nor a text")
+        raise self._error(f"{_shown(node)} is neither a measure nor a number nor a text")
 
     def _finite(self, node: ast.Constant) -> float:
-        if type(node.value) not in (int, float):
-            raise self._error(node, f"{_shown(node)} is neither a measure nor a number nor a text")
-        if not math.isfinite(value := _as_float(node.value)):
-            raise self._error(node, "a number is to be finite")
-        return value
+        if not isinstance(node.value, int | float) or isinstance(node.value, bool):
+            raise self._error(f"{_shown(node)} is neither a measure nor a number nor a text")
+        # An integer may be too large for a float.
+        if abs(node.value) > sys.float_info.max:
+            raise self._error("a number is to be finite")
+        return float(node.value)
 
-    def _unquoted(self, node: ast.expr, name: str, other: ast.expr) -> UserError | None:
-        """Return the error for a text without quotes beside a measure that is a text."""
-        choices = self._vocabulary.get(other.id) if isinstance(other, ast.Name) else None
-        near = nearest(name, sorted(choices or ()))
-        if not isinstance(other, ast.Name) or not near:
-            return None
-        return self._error(node, f'a text is to be in quotes: {other.id} == "{near[0]}"')
-
-    def _unknown(self, node: ast.expr, name: str) -> UserError:
+    def _unknown(self, name: str) -> UserError:
         hint = meant(name, (*self._vocabulary, *self._named), ALIKE_MEASURES)
         hint = hint or f"choose {', '.join(self._vocabulary)}"
-        return self._error(node, f"there is no measure {printable(name)!r}: {hint.strip()}")
+        return self._error(f"there is no measure {printable(name)!r}: {hint.strip()}")
 
-    def _error(self, node: ast.expr, why: str) -> UserError:
-        place = _place(self._text, node.lineno, node.col_offset, "utf-8")
-        return UserError(f"{self._what}: {_at(self._text, place)}: {why}")
+    def _error(self, why: str) -> UserError:
+        return UserError(f"{self._what}: {why}")
 
 
 class _Text(str):
     """A text in quotes: a plain `str` is the name of a value."""
 
     __slots__ = ()
-
-
-def _as_float(number: Any) -> float:
-    try:
-        return float(number)
-    except OverflowError:
-        return math.inf
 
 
 def _shown(node: ast.expr) -> str:

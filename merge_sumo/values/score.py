@@ -336,8 +336,10 @@ def measure(
         avoidability: whether `last_avoidable_s` is computed, which takes most of the time.
         further: names of the further measures that are taken; all by default.
     """
-    taken = trajectory.case.scenario.measures([trajectory], lines, avoidability=avoidability)
-    return _with_further(taken[0], trajectory, lines, further)
+    measures: Measures
+    (measures,) = trajectory.case.scenario.measures([trajectory], lines, avoidability=avoidability)
+    values = further_of(trajectory, lines, further)
+    return replace(measures, further=values) if values else measures
 
 
 def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[Measures]:
@@ -346,19 +348,9 @@ def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[
         return []
     taken = trajectories[0].case.scenario.measures(trajectories, lines)
     return [
-        _with_further(measures, trajectory, lines)
+        replace(measures, further=further_of(trajectory, lines)) if further_measures() else measures
         for measures, trajectory in zip(taken, trajectories, strict=True)
     ]
-
-
-def _with_further(
-    measures: Measures,
-    trajectory: Trajectory,
-    lines: CentreLines | None,
-    names: Collection[str] | None = None,
-) -> Measures:
-    further = further_of(trajectory, lines, names)
-    return replace(measures, further=further) if further else measures
 
 
 def merge_score(trajectory: Trajectory) -> float | None:
@@ -377,8 +369,9 @@ def measure_merges(
     trajectories: Sequence[Trajectory], lines: CentreLines | None, *, avoidability: bool = True
 ) -> list[Measures]:
     """Return the verdict and the measures of merges: see `measure`."""
-    never_m = [math.inf] * len(trajectories)
-    before_m = never_m if lines is None else closest_before_m(trajectories, lines)
+    before_m = [math.inf] * len(trajectories)
+    if lines is not None:
+        before_m = closest_before_m(trajectories, lines)
     pairs = zip(trajectories, before_m, strict=True)
     return [_measure(*pair, avoidability=avoidability) for pair in pairs]
 

@@ -61,8 +61,12 @@ def check_formula(text: str) -> str:
                 f"{what}: at character {place + 1}: {sign!r} is no part of a formula over signals"
             )
         word = token[0]
-        if word[0].isalpha() or word[0] == "_":
-            _check_word(word, f"{what}: at character {place + 1}")
+        if (word[0].isalpha() or word[0] == "_") and word not in (*SIGNALS, *WORDS):
+            hint = meant(word, (*SIGNALS, *WORDS), ALIKE_MEASURES)
+            hint = hint or f"choose {', '.join(SIGNALS)}"
+            raise UserError(
+                f"{what}: at character {place + 1}: there is no signal {word!r}: {hint.strip()}"
+            )
         depth += (word == "(") - (word == ")")
         if depth < 0:
             raise UserError(f"{what}: a bracket is closed that was not opened")
@@ -72,12 +76,6 @@ def check_formula(text: str) -> str:
         if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
             raise UserError(f"{what}: no episode has a time [{bounds}], in seconds")
     return " ".join(text.split())
-
-
-def _check_word(word: str, what: str) -> None:
-    if word not in (*SIGNALS, *WORDS):
-        hint = meant(word, (*SIGNALS, *WORDS), ALIKE_MEASURES) or f"choose {', '.join(SIGNALS)}"
-        raise UserError(f"{what}: there is no signal {word!r}: {hint.strip()}")
 
 
 def try_formula(text: str) -> None:

@@ -39,24 +39,17 @@ class TestNearestNames:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("TTC_s < 2", "at character 1, near 'TTC_s < 2': there is no measure 'TTC_s': did you "),
-        ("ttc_s < 2 or TTC_S < 1", "at character 14, near 'TTC_S < 1': there is no measure"),
-        ("merged_first == VUT", "character 17, near 'VUT': .* quotes: merged_first == \"VUT\""),
-        ("end == 'timeout'", "at character 1, .* end is never 'timeout': did you mean TIMEOUT?"),
-        ("ttc_s = 2", "at character 7, near '= 2': write == or < instead of ="),
-        ("ttc_s < 2 && dx_m > 3", "at character 11, near '&& dx_m > 3': write and instead of &&"),
-        ("!(ttc_s < 2)", "at character 1, .* write not instead of !"),
-        ("  ttc_s < 3 x", "look at character 13, near 'x'"),
-        ("ttc_s <", "it breaks off at its end"),
-        ("(ttc_s < 1\n  or end == 'MERGED' and dx_n > 3)", "at character 37, near 'dx_n > 3"),
-        ("ttc_s < 1 or 3 < 4", "at character 14, near '3 < 4': a comparison of two numbers"),
-        ("ttc_s < 1 or ttc_s", "at character 14, near 'ttc_s': ttc_s stands alone"),
-        ("'ä' < ü > 3", "at character 7, near 'ü > 3'"),
+        ("ttc_s < 2 or TTC_S < 1", "there is no measure 'TTC_S': did you mean ttc_s"),
+        ("merged_first == VUT", 'a text is to be in quotes: merged_first == "VUT"'),
+        ("merged_first == level0", "there is no measure 'level0'"),
+        ("end == 'timeout'", "end is never 'timeout': did you mean TIMEOUT?"),
+        ("ttc_s = 2", "instead of ="),
+        ("ttc_s < 2 && dx_m > 3", "instead of &&"),
+        ("!(ttc_s < 2)", "instead of !"),
     ],
 )
-def test_a_condition_is_refused_with_the_place_of_the_mistake(text, said):
-    parts = map(re.escape, said.split(".*"))
-    with pytest.raises(UserError, match=".*".join(parts)):
+def test_a_condition_is_refused_with_what_was_meant(text, said):
+    with pytest.raises(UserError, match=re.escape(said)):
         Criterion(text)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from merge_sumo.drivers.policies import policies_of, policies_sha256
-from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan, plan_key, versions
+from merge_sumo.drivers.policies import policies_of
+from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan
 from merge_sumo.engine.povs import Povs
 from merge_sumo.road.merge import road_for
 from merge_sumo.studies.truth import TruthKey
@@ -38,16 +36,14 @@ def plan_for(
     )
 
 
-def key_of(*, level: int = 0, cases: int = 300, seed: int = 0, **changes: Any) -> TruthKey:
-    """Return what a truth of design1 is kept under, with some of it changed."""
-    values: dict[str, Any] = {
-        "vut": "design1",
-        "deadline_s": 5.0,
-        "pov": None,
-        "policies_sha256": policies_sha256(policies_of(US23)),
-        "road_sha256": road_for(US23).sha256,
-        "scenario": US23,
-        "criterion": PAPERS,
-        "versions": versions(),
-    }
-    return TruthKey(plan_key(**values | changes), level, cases, seed)
+def key_of(
+    *,
+    vut: str = "design1",
+    deadline_s: float = 5.0,
+    level: int = 0,
+    cases: int = 300,
+    seed: int = 0,
+) -> TruthKey:
+    """Return what a truth is kept under."""
+    options = VutOptions(policies=POVS.policies, deadline_s=deadline_s)
+    return TruthKey(plan_for(VutFactory.of(vut, options)).key(level), level, cases, seed)
