@@ -61,8 +61,12 @@ class KinematicSimulator(Simulator):
         ended = dict(rollout(self.world, self.pov, self.vut, cases, ran_again))
         close = self._close_calls(ended)
         places = sorted(close | drawn(cases))
-        in_sumo = self._in_sumo([cases[place] for place in places])
-        for place, trajectory in zip(places, in_sumo, strict=True):
+        if places and self._sumo is None:
+            self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
+            self._opened.callback(self._sumo.close)
+        again = [cases[place] for place in places]
+        for number, trajectory in self._sumo.run(again) if self._sumo and places else ():
+            place = places[number]
             if place not in close:
                 self._compare(ended[place], trajectory)
             ended[place] = trajectory if place in close else ended[place]
@@ -95,16 +99,6 @@ class KinematicSimulator(Simulator):
             for (place, one), of_end in zip(ended.items(), unclear.tolist(), strict=True)
             if of_end or criterion.is_close_call(one, ROUNDING, lines)
         }
-
-    def _in_sumo(self, cases: Sequence[Case]) -> list[Trajectory]:
-        """Return what becomes of cases in SUMO."""
-        if not cases:
-            return []
-        if self._sumo is None:
-            self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
-            self._opened.callback(self._sumo.close)
-        ran = dict(self._sumo.run(cases))
-        return [ran[place] for place in range(len(cases))]
 
     def _compare(self, kinematic: Trajectory, sumo: Trajectory) -> None:
         """Raise `UserError` where a case ended otherwise in SUMO."""

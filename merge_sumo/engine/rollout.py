@@ -144,7 +144,9 @@ class _Rollout:
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
         while self.next_timeout < NEVER:  # as long as an episode runs
-            self.observe()
+            self.now = self.record[:, self.row % self.ring]
+            self.now[..., 0], self.now[..., 1] = world.x_m.T, world.v_mps.T
+            self.row += 1
             try:
                 world.advance()
                 acceleration = self.ask_drivers()
@@ -299,12 +301,6 @@ class _Rollout:
         except WRONGS as error:
             said = f"reset raised {type(error).__name__}: {error}"
             self.errors[corridor] = End.VUT_ERROR, said
-
-    def observe(self) -> None:
-        """Write the state into the next row of the record."""
-        self.now = self.record[:, self.row % self.ring]
-        self.now[..., 0], self.now[..., 1] = self.world.x_m.T, self.world.v_mps.T
-        self.row += 1
 
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""

@@ -74,7 +74,9 @@ class Belief:
     def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
         """Learn from a history; with a `limit`, all cases up to that gap (margin) failed."""
         if limit is not None:
-            history = _as_if(history, limit)
+            failed = nearness(history) <= limit
+            failures = np.where(failed, history.runs, 0)
+            history = replace(history, failed=failed, failures=failures)
         learned = most_telling(history, MAX_LEARNED)
         self.groups = _groups(history)
         self.history = history
@@ -134,9 +136,9 @@ class Belief:
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
         self._fitted: list[tuple[float, FloatArray]] = []
         best, left_out = [], []
-        experts: list[Margin | Branches] = [self._smooth, self._rough]
-        experts += [] if self._branches is None else [self._branches]
-        for expert in experts:
+        for expert in (self._smooth, self._rough, self._branches):
+            if expert is None:
+                continue
             chance = expert.left_out()
             lowered = _lowered(chance, distances, WIDTHS[:, None])
             evidence = _evidence(lowered, distances, learned.dims)
@@ -206,12 +208,6 @@ def what_is_learned(
         return np.minimum(history.badness / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
     gap = np.nan_to_num(history.gap, nan=NO_GAP) / (limit or 1.0)
     return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
-
-
-def _as_if(history: LevelHistory, limit: float) -> LevelHistory:
-    """Return the history as if all cases up to a limit had failed."""
-    failed = nearness(history) <= limit
-    return replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
 
 
 def nearness(history: LevelHistory) -> FloatArray:

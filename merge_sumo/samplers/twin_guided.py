@@ -140,12 +140,12 @@ class _Candidates:
         gaps = yield Query(self.level, points)
         p_twin = self.skill.chance(gaps)
         p_surrogate = (
-            p_twin if self.surrogate is None else self._corrected(self.surrogate.of, points)
+            p_twin if self.surrogate is None else self.corrected(self.surrogate.of, points)
         )
         p_fail = self.skill.mixed(gaps, p_twin, p_surrogate)
         above = p_fail
         if self.surrogate is not None and self.surrogate.tolerates:
-            above = self.skill.mixed(gaps, p_twin, self.surrogate_above(self.surrogate, points))
+            above = self.skill.mixed(gaps, p_twin, self.corrected(self.surrogate.above, points))
         fresh = gaps, p_twin, p_surrogate, p_fail, above
         self._predictions = (
             tuple(
@@ -156,14 +156,7 @@ class _Candidates:
         )
         self.points = np.concatenate([self.points, points])
 
-    def surrogate_above(self, surrogate: Belief, points: FloatArray) -> FloatArray:
-        """Return the probability that points fail in more runs than are tolerated, (m,).
-
-        By the surrogate; calibrated where the twin is doubted.
-        """
-        return self._corrected(surrogate.above, points)
-
-    def _corrected(
+    def corrected(
         self, chance: Callable[[FloatArray], FloatArray], points: FloatArray
     ) -> FloatArray:
         """Return a probability of points, (m,), by the surrogate, calibrated where due."""
@@ -200,7 +193,7 @@ def _first_candidates(
     if surrogate is not None:
         screened.append(between(surrogate, BETWEEN, rng))
         own = rng.permutation(of_belief(history, surrogate, rng, n))[:SURROGATE_CANDIDATES]
-        chance = candidates.surrogate_above(surrogate, own)
+        chance = candidates.corrected(surrogate.above, own)
         chosen.append(candidates.best(own, chance, OF_SURROGATE))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))

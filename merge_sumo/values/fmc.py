@@ -120,7 +120,9 @@ def fmc_and_error(points: ArrayLike, radius: float | None = None) -> tuple[float
     if dimension == 1:
         volume = 2.0 + float(np.minimum(np.diff(centres[:, 0]), 2.0).sum())
     elif dimension == 2:
-        volume = _union_area(centres)
+        # The one slice of balls.
+        flat = np.column_stack([centres, np.zeros(len(centres))])
+        volume = _sliced_area(flat, cKDTree(flat), np.arange(len(flat)), np.zeros(len(flat)))
     elif dimension == 3:
         volume = _union_volume(centres)
         error = _SLICED * volume
@@ -303,13 +305,6 @@ def _in_radii(cases: FloatArray, radius: float) -> FloatArray:
     # The same case written with another rounding is the same case. Sorting makes the result equal
     # to the last bit for every order of the points.
     return np.unique(np.round((cases - (low + high) / 2.0) / radius / _MERGE) * _MERGE, axis=0)
-
-
-def _union_area(centres: FloatArray) -> float:
-    """Area of the union of unit discs around distinct centres (n, 2): the one slice of balls."""
-    n = len(centres)
-    flat = np.column_stack([centres, np.zeros(n)])
-    return _sliced_area(flat, cKDTree(flat), np.arange(n), np.zeros(n))
 
 
 def _union_volume(centres: FloatArray) -> float:

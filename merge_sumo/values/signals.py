@@ -7,7 +7,7 @@ and words come from the user's code: they are bounded, and made printable.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from itertools import groupby, islice
 from typing import Annotated, Any, Final
 
@@ -19,7 +19,7 @@ from merge_sumo.system.printable import printable
 
 Left = dict[str, float | str]
 """What is left at one step, by name."""
-Signals = Mapping[str, tuple[float | str | None, ...]]
+Signals = dict[str, tuple[float | str | None, ...]]
 """By name, a value for each row of the motion of a case; None where none was left."""
 
 MOST_NAMES: Final = 8
@@ -95,19 +95,12 @@ SignalRuns = Annotated[
 
 def from_runs(runs: SignalRuns, rows: int) -> Signals:
     """Return the signals of a case of so many rows; `UserError` where they are not as written."""
-    return {name: _expanded(name, values, rows) for name, values in runs.items()}
-
-
-def _expanded(
-    name: str, runs: Iterable[tuple[int, float | str | None]], rows: int
-) -> tuple[float | str | None, ...]:
-    values: list[float | str | None] = []
-    for count, value in runs:
-        if count > rows - len(values):
+    signals: Signals = {}
+    for name, pairs in runs.items():
+        if sum(count for count, _ in pairs) != rows:
             raise UserError("a signal has other rows than the motion")
-        if _word(name) != name or (value is not None and _value(value) != value):
+        values = [value for _, value in pairs if value is not None]
+        if _word(name) != name or [_value(value) for value in values] != values:
             raise UserError("a signal is not as it was written")
-        values += [value] * count
-    if len(values) != rows:
-        raise UserError("a signal has other rows than the motion")
-    return tuple(values)
+        signals[name] = tuple(value for count, value in pairs for _ in range(count))
+    return signals

@@ -21,8 +21,8 @@ def peer() -> None:
     require(find_spec("highway_env") is not None, "highway-env is not installed: the extra peers")
 
 
-def campaign_of(folder, name="us23", cases=24):
-    scenario = named_scenario(name)
+def campaign_of(folder, name="us23"):
+    scenario, cases = named_scenario(name), 24
     settings = CampaignSettings(
         vut="design2",
         levels=scenario.levels[:3],

@@ -60,20 +60,6 @@ class TestAWish:
     def test_by_hand(self, x_m, wish, merged):
         assert self.step(x_m, wish) is merged
 
-    def test_once_stated_is_not_taken_for_granted(self):
-        merging = Merging(1, LANE)
-        state = np.array([[-500.0], [50.0]]), np.full((2, 1), 20.0)
-        merging.take(np.array([STAY], dtype=np.int8), np.zeros((2, 1)), *state)
-        merging.take(np.array([NO_WISH], dtype=np.int8), np.zeros((2, 1)), *state)
-        assert not merging.step(*state)[0]
-
-    def test_is_final(self):
-        merging = Merging(1, LANE)
-        state = np.array([[-500.0], [50.0]]), np.full((2, 1), 20.0)
-        for wish in (MERGE, STAY):
-            merging.take(np.array([wish], dtype=np.int8), np.zeros((2, 1)), *state)
-            assert merging.step(*state)[0]
-
     def test_that_never_comes_stops_before_the_end(self):
         merging = Merging(1, replace(LANE, lane_end="stop"))
         x_m, v_mps = np.array([[-500.0], [60.0]]), np.full((2, 1), 22.0)

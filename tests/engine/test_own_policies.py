@@ -26,7 +26,6 @@ from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, polic
 from merge_sumo.engine.evaluate import open_simulators
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
-from merge_sumo.studies.truth import ground_truth
 from merge_sumo.system.workers import open_workers
 from merge_sumo.values.scenario import US23
 from merge_sumo.values.trajectory import End
@@ -56,14 +55,6 @@ def swapped(home) -> Path:
     known = networks(folder)
     known["pov1"], known["vut1"] = known["vut1"], known["pov1"]
     write(folder, known)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def one(home) -> Path:
-    """Return a folder in which only the POV of level 1 is trained."""
-    folder = Path(shutil.copytree(policies_of(scenario=US23), home / "one"))
-    write(folder, {"pov1": networks(folder)["pov1"]})
     return folder
 
 
@@ -113,28 +104,8 @@ class TestACampaign:
         assert recorded["policies_sha256"] == hashes
         assert run_campaign(settings(None), tmp_path / "shipped").settings["policies"] is None
 
-    def test_of_all_levels_is_of_those_that_are_trained_there(self, call, one):
-        code, out, err = call(
-            *("campaign", "--vut", "level0", "--cases", 4, "--policies", one, "--json"),
-            "--sampler",
-            "uniform",
-        )
-        assert code == 0
-        assert list(json.loads(out)["levels"]) == ["0", "1"]
-        assert "policies are there for level 0, 1" in err
-
 
 class TestOtherCommands:
-    def test_a_truth_is_of_its_policies_wherever_they_are(self, same, swapped, tmp_path):
-        def counted(folder: Path | None) -> int:
-            ran: list[int] = []
-            povs = None if folder is None else Povs(policies=folder)
-            plan = plan_for("design2", povs=povs)
-            ground_truth(plan, 1, 30, cache=tmp_path, on_cases=ran.append)
-            return sum(ran)
-
-        assert [counted(folder) for folder in (None, same, swapped, swapped)] == [30, 0, 30, 0]
-
     @pytest.mark.parametrize(
         "command",
         [

@@ -16,13 +16,11 @@ from plans import plan_for
 from processes import none_left
 from vut_contract import cases_of, factory
 
-from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.reports.report import report_page
 from merge_sumo.values.case import Case, MergeCase, from_unit
 from merge_sumo.values.scenario import LEVELS, OWN, US23
 from merge_sumo.values.score import measure
@@ -220,18 +218,6 @@ class TestWhatItDoesWrong:
 
 
 class TestACampaign:
-    def test_says_own_where_a_person_reads(self, call, tmp_path):
-        pov(YIELDS)
-        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", *FEW)
-        junit = tmp_path / "junit.xml"
-        code, out, _ = call("campaign", *given, "--junit", junit, "--out", "run", "-q")
-        assert code == 0
-        assert "\n    own " in out
-        assert 'name="POV level own"' in junit.read_text()
-        page = report_page(Run(Path("run")))
-        assert "POV level own: my_pov.py:Pov" in page
-        assert 'data-level="3"' in page
-
     def test_whose_pov_errs_is_not_the_vuts_but_an_error_all_the_same(self, call):
         pov("def Pov(seen):\n    raise ValueError('no idea')\n")
         given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", *FEW)

@@ -10,7 +10,6 @@ import math
 import numpy as np
 import pytest
 
-from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import (
     NETWORKS,
     load_network,
@@ -41,36 +40,6 @@ def uniform_cases(count: int, level: int = 0, seed: int = 0):
 
 def from_the_middle_m(at) -> float:
     return math.hypot(at.x_m, at.y_m)
-
-
-class TestItsRoad:
-    def test_is_a_ring_of_a_real_size_on_which_the_pov_drives_in_all_of_the_pool(self, road):
-        for x_m in np.arange(ROUNDABOUT.x_pov0_m[0], 0.5, 0.5):
-            at = road.lane_point(x_m, on_ramp=False)
-            assert from_the_middle_m(at) == pytest.approx(RADIUS_M, abs=0.2)
-
-    def test_has_an_entry_that_comes_from_the_south_and_touches_the_ring(self, road):
-        start, line, m = (road.lane_point(x_m, on_ramp=True) for x_m in (-50.0, -11.3, 0.0))
-        assert start.angle_deg == pytest.approx(0.0)
-        assert line.lane == "in_s_0"
-        assert from_the_middle_m(line) > RADIUS_M + 3.2
-        assert m == road.lane_point(0.0, on_ramp=False)
-
-
-class TestItsPool:
-    def test_has_a_conflict_in_half_of_its_cases(self):
-        cases = uniform_cases(20_000)
-        due_s = float(
-            level0_time_to(
-                np.array(-ROUNDABOUT.x_vut0_m),
-                np.array(ROUNDABOUT.v_vut0_mps),
-                ROUNDABOUT.level0_a_mps2,
-                ROUNDABOUT.level0_v_mps,
-            )
-        )
-        gaps_m = np.abs([case.x_pov0_m + case.v_pov0_mps * due_s for case in cases])
-        assert (gaps_m < ROUNDABOUT.dx_critical_m).mean() == pytest.approx(0.5, abs=0.02)
-        assert (gaps_m < ROUNDABOUT.dx_crash_m).mean() > 0.15
 
 
 class TestItsDrivers:

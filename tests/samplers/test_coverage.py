@@ -14,8 +14,6 @@ from conftest import some
 
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import (
-    CALIBRATION,
-    Calibration,
     _calibrated,
     what_is_learned,
 )
@@ -181,11 +179,6 @@ class TestTheCalibration:
         failed = luck < 1.0 / (1.0 + np.exp(-evidence @ true))
         assert _calibrated(evidence[None], failed, ONCE)[0][0] == pytest.approx(true, abs=0.08)
 
-    @pytest.mark.parametrize("n", [1, 3])
-    def test_stays_near_what_it_believed_before_while_it_has_seen_little(self, n):
-        weights, _ = _calibrated(self.evidence(n)[None], np.zeros(n, dtype=bool), ONCE)
-        assert (np.abs(weights - CALIBRATION[0]) < 2.0 * CALIBRATION[1]).all()
-
 
 @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "margin alone"])
 def test_looks_where_cases_come_near_but_counts_on_failures_alone(blind):
@@ -201,32 +194,3 @@ def test_looks_where_cases_come_near_but_counts_on_failures_alone(blind):
     proposal = _LevelBatch(history, np.empty((0, 2)), rng, 20).batch(20)
     assert np.median(proposal.points[:, 0]) < 0.1
     assert proposal.gain.sum() < 2.0
-
-
-class TestTheTrust:
-    """What came of the last picks says how far P(fail) is to be trusted."""
-
-    def history(self, failing_late: bool) -> LevelHistory:
-        """Return 200 cases with a band of failures; the last 100 in it, failing there or not."""
-        rng = np.random.default_rng(5)
-        points = rng.random((200, 2))
-        points[100:, 0] = 0.5 + 0.04 * (rng.random(100) - 0.5)
-        in_band = np.abs(points[:, 0] - 0.5) < 0.05
-        failed = in_band & ((np.arange(200) < 100) | failing_late)
-        gap = np.where(failed, 0.0, np.where(points[:, 0] < 0.5, -3.0, 3.0))
-        margin = np.where(failed, -0.2, 0.9)
-        return LevelHistory(points, margin, failed, gap, np.arange(200) // 20)
-
-    def test_is_whole_where_the_picks_came_true(self):
-        assert Calibration(self.history(failing_late=True)).factors[0] == 1.0
-
-    def test_is_small_where_they_did_not(self):
-        assert Calibration(self.history(failing_late=False)).factors.min() < 0.5
-
-
-def test_a_margin_fails_with_the_mass_of_a_normal_between_its_limits():
-    points = np.array([[0.0], [0.5], [1.0]])
-    margin = Margin(points, np.array([-2.0, 0.0, 2.0]), -1.0, 1.0, rough=False)
-    # P(-1 < N(1, 0.5^2) < 1) = Phi(0) - Phi(-4), and the same below 0
-    chances = margin.probability(np.array([1.0, -1.0]), np.array([0.25, 0.25]))
-    assert chances == pytest.approx([0.5 - 3.167124e-5] * 2, abs=1e-9)

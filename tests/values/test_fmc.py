@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
-from merge_sumo.values import fmc as fmc_module
 from merge_sumo.values.fmc import (
     RADIUS,
     ball_volume,
@@ -111,25 +109,6 @@ class TestClosedForms:
     def test_touching_and_distant_balls_add_up(self, dimension, distance):
         points = np.outer(np.arange(5) * distance, unit_vector(3, dimension))
         assert fmc(points) == pytest.approx(5 * BALL[dimension], rel=1e-9)
-
-    @pytest.mark.parametrize("distance", [0.02, 0.05, 0.08])
-    def test_balls_right_above_each_other_as_the_slices_see_them(self, distance):
-        # Concentric discs in every slice, and equal ones half-way between two balls.
-        up = Rotation.from_euler("xyz", fmc_module._TURNED_RAD).inv().apply([0.0, 0.0, 1.0])
-        points = np.outer(np.arange(4) * distance, up)
-        assert fmc(points) == pytest.approx(chain(4, distance, 3), rel=1e-4)
-
-    @pytest.mark.parametrize("side", [0.01, 0.05, 0.07, 0.0866])
-    def test_three_discs_with_a_common_part(self, side):
-        r = RADIUS
-        angles = np.array([0.3, 0.3 + 2 * math.pi / 3, 0.3 + 4 * math.pi / 3])
-        centres = side / math.sqrt(3) * np.column_stack([np.cos(angles), np.sin(angles)])
-        # The common part is an equilateral triangle with a circular segment on each edge.
-        edge = math.sqrt(3) * (math.sqrt(r**2 - side**2 / 4) - side / math.sqrt(12))
-        segment = r**2 * math.asin(edge / (2 * r)) - edge / 4 * math.sqrt(4 * r**2 - edge**2)
-        common = math.sqrt(3) / 4 * edge**2 + 3 * segment
-        expected = 3 * BALL[2] - 3 * lens(side, 2) + common
-        assert fmc(centres) == pytest.approx(expected, rel=1e-12)
 
     def test_the_hole_of_a_ring_does_not_count(self):
         count, ring = 24, 0.3
