@@ -34,9 +34,6 @@ TERMINALS = {
     "Latin-1": {"PYTHONIOENCODING": "latin-1"},
     "ASCII, strictly": {"PYTHONIOENCODING": "ascii:strict"},
 }
-SOME_TERMINALS = [
-    name if name == "C" else pytest.param(name, marks=pytest.mark.long) for name in TERMINALS
-]
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +55,7 @@ class TestAVutFile:
     @pytest.mark.slow
     @pytest.mark.parametrize(
         "name",
-        [
-            "my vut%41, ${HOME}",
-            pytest.param("日本 'é' [red]", marks=pytest.mark.long),
-            pytest.param("a\nb:\x1b[31m", marks=pytest.mark.long),
-        ],
+        some(["my vut%41, ${HOME}", "日本 'é' [red]", "a\nb:\x1b[31m"], "my vut%41, ${HOME}"),
     )
     def test_with_an_odd_name_is_tested(self, call, tmp_path, name):
         (tmp_path / f"{name}.py").write_text(VUT)
@@ -90,7 +83,7 @@ class TestAVutFile:
 
 class TestATerminal:
     @pytest.mark.slow
-    @pytest.mark.parametrize("name", SOME_TERMINALS)
+    @pytest.mark.parametrize("name", some(TERMINALS, "C"))
     def test_of_any_encoding_shows_results_in_folders_of_any_name(self, made, tmp_path, name):
         folder = Path(shutil.copytree(made.folder, tmp_path / NASTY))
         code, out, err = in_a_process(TERMINALS[name], "compare", folder, folder)
@@ -122,11 +115,8 @@ def test_what_is_printed_moves_no_cursor_and_keeps_letters_of_all_languages():
     )
 
 
-SUMO_NAMES = ["a b", "a,b", "a%41b", "100%s", "${HOME}", "$HOME", "a\nb", "a:b", "日本"]
-
-
 class TestSumo:
-    @pytest.mark.parametrize("name", some(SUMO_NAMES, "a,b", "${HOME}", "日本"))
+    @pytest.mark.parametrize("name", ["a,b", "${HOME}", "a\nb", "日本"])
     def test_plays_an_exported_folder_of_any_name_where_it_is(self, made, tmp_path, name):
         export_case(made, 0, tmp_path / name)
         done = subprocess.run(
@@ -137,7 +127,7 @@ class TestSumo:
         )
         assert done.returncode == 0, done.stderr
 
-    @pytest.mark.parametrize("name", some(["a b", "$HOME", "a\nb", "日本"], "$HOME", "日本"))
+    @pytest.mark.parametrize("name", ["$HOME", "日本"])
     def test_starts_with_temporary_files_in_a_folder_of_an_odd_name(
         self, tmp_path, monkeypatch, name
     ):
@@ -153,10 +143,7 @@ class TestSumo:
             Simulator(plan_for("design1", corridors=1))
 
 
-SIZES = [3990, 4000, *range(4004, 4016), 4030, 4060, 4090, 4095, 4096]
-
-
-@pytest.mark.parametrize("size", some(SIZES, 3990, 4007, 4008, 4096))
+@pytest.mark.parametrize("size", [3990, 4007, 4008, 4096])
 def test_a_path_works_or_is_too_long_before_the_first_case(tmp_path, monkeypatch, size):
     folder = tmp_path
     while size - len(os.fsencode(folder)) > 400:

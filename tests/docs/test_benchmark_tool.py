@@ -233,13 +233,3 @@ class TestCmaMe(SamplerContract):
 @needs("botorch")
 class TestStraddle(SamplerContract):
     sampler = sampler_class(f"{GUESTS / 'straddle.py'}:StraddleSampler")
-
-
-def test_the_table_of_the_page_has_a_row_for_each_problem():
-    rows = {line.split("`")[1]: line for line in PAGE.splitlines() if line.startswith("| `")}
-    for problem in PROBLEMS:
-        row = rows[problem.name]
-        assert f"`{problem.vut}`" in row
-        assert f"| {problem.scenario} |" in row
-        assert not problem.sense or f"--sense {problem.sense}" in row
-        assert not problem.act or f"--act {problem.act}" in row

@@ -13,6 +13,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.vuts.registry import KINDS
 
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
+NAMED_FILE = re.compile(r"(?<![\w/])((?:merge_sumo|tests|tools)/[\w/-]+\.py)\b")
 PAGES = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", *(ROOT / page for page in SHOWN)]
 
 
@@ -28,18 +29,6 @@ def test_links_lead_to_what_is_there_or_is_made_from_the_code(page: Path):
 def test_pages_of_the_reference_are_those_of_the_code(page: str):
     written = (DOCS / page).read_text(encoding="utf-8")
     assert written == WRITTEN[page](), "run `python tools/docs_pages.py --write`"
-
-
-def test_the_site_has_what_lies_outside_of_docs_one_folder_nearer():
-    deep = SimpleNamespace(file=SimpleNamespace(src_uri="explanations/paper.md"))
-    text = on_page_markdown("[a](../../policies/README.md) [b](../faq.md)", deep)
-    assert text == "[a](../policies/README.md) [b](../faq.md)"
-    start = SimpleNamespace(file=SimpleNamespace(src_uri="index.md"))
-    assert on_page_markdown("[a](../README.md)", start) == "[a](README.md)"
-    shown = SimpleNamespace(file=SimpleNamespace(src_uri="policies/README.md"))
-    assert on_page_markdown("[a](../docs/faq.md)", shown) == "[a](../faq.md)"
-    root = SimpleNamespace(file=SimpleNamespace(src_uri="SECURITY.md"))
-    assert on_page_markdown("[a](docs/faq.md)", root) == "[a](faq.md)"
 
 
 class TestTheArchitecture:
@@ -58,20 +47,10 @@ class TestTheArchitecture:
         assert all((ROOT / "merge_sumo" / file).is_file() for file in files)
 
 
-NAMED_FILE = re.compile(r"(?<![\w/])((?:merge_sumo|tests|tools)/[\w/-]+\.py)\b")
-
-
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_files_that_a_page_names_exist(page: Path):
     names = NAMED_FILE.findall(page.read_text(encoding="utf-8"))
     assert [name for name in names if not (ROOT / name).exists()] == []
-
-
-def test_attacks_name_tests_that_exist():
-    rows = (ROOT / "tests/README.md").read_text(encoding="utf-8")
-    names = set(re.findall(r"\btests/[\w/]+\.py\b", rows))
-    assert names
-    assert [name for name in sorted(names) if not (ROOT / name).is_file()] == []
 
 
 def test_tables_of_the_site_have_a_row_for_each_registered_object():

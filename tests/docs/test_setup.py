@@ -43,12 +43,3 @@ def test_the_workflow_calls_what_decides_elsewhere_too():
     text = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
     steps = yaml.safe_load(text)["jobs"]["run"]["steps"]
     assert steps[-1] == {"run": ".ci/run"}
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / ".github/ISSUE_TEMPLATE").glob("[!c]*.yml")))
-def test_a_form_has_a_name_and_fields_of_their_own(path):
-    form = yaml.safe_load(path.read_text(encoding="utf-8"))
-    assert form["name"]
-    assert form["description"]
-    ids = [field["id"] for field in form["body"] if field["type"] != "markdown"]
-    assert len(ids) == len(set(ids)) > 0

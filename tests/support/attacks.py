@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 import uuid
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -124,9 +123,3 @@ def stop(process: subprocess.Popen[str], how: str, *, keyboard: bool = True) -> 
         time.sleep(0.2)
     _, err = process.communicate(timeout=PATIENCE_S)
     return process.returncode, err
-
-
-def tell(seen: Counter[str], what: str = "") -> None:
-    """Say what was seen, and how often; `pytest -s` shows it."""
-    counts = ", ".join(f"{name} {seen[name]}" for name in sorted(seen))
-    sys.stdout.write(f"\n{what}{counts}\n")
