@@ -147,7 +147,7 @@ def _simple_returns(game: Game, state: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class BestGames:
-    """What a search found from n states: the best returns, (n,), and the actions that lead there.
+    """The result of a search from n states: best returns, (n,), and the actions that lead there.
 
     `plans` has shape (n, decisions): places in `game.actions_mps2`, -1 behind the end of the game.
     """

@@ -9,15 +9,14 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_acceleration
+from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_for
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
-from merge_sumo.training.env import pool_starts
-from merge_sumo.training.game import Game, IntArray, greedy, of_two
+from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
 from merge_sumo.values.case import Case, FloatArray, from_unit
 from merge_sumo.values.scenario import SVO, Scenario
@@ -26,13 +25,11 @@ from merge_sumo.values.trajectory import End, Trajectory
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201
 CORRIDORS: Final = 32
-STARTS: Final = 100
-"""Of the quick measurement of regret."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyCheck:
-    """How near a driver is to its best response, over random cases of the pool.
+    """A driver beside its best response, over random cases of the pool.
 
     Attributes:
         cases: number of cases.
@@ -89,15 +86,13 @@ def play(
 ) -> list[Trajectory]:
     """Play cases of one scenario in SUMO between two drivers; return the trajectories in order."""
     scenario = cases[0].scenario
-    played: dict[int, Trajectory] = {}
+    pov, vut = (
+        LevelKDriver(CORRIDORS, make) if isinstance(make, QNetwork) else make(CORRIDORS)
+        for make in (make_pov, make_vut)
+    )
     with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
-        pov, vut = _driver(make_pov), _driver(make_vut)
-        played |= rollout(world, pov, vut, cases)
+        played = dict(rollout(world, pov, vut, cases))
     return [played[index] for index in sorted(played)]
-
-
-def _driver(maker: type[Driver] | QNetwork) -> Driver:
-    return LevelKDriver(CORRIDORS, maker) if isinstance(maker, QNetwork) else maker(CORRIDORS)
 
 
 def check_cases(
@@ -111,13 +106,6 @@ def check_cases(
     return from_unit(points, level, scenario=scenario)
 
 
-def opponents(name: str, folder: Path | None) -> type[Driver] | QNetwork:
-    """Return the driver that a network was trained against."""
-    if name in ("pov1", "vut1"):
-        return Level0Vut if name == "pov1" else Level0Pov
-    return load_network("vut1" if name == "pov2" else "pov1", folder)
-
-
 def check_policy(
     name: str,
     folder: Path | None = None,
@@ -125,21 +113,16 @@ def check_policy(
     *,
     scenario: Scenario,
 ) -> PolicyCheck:
-    """Return how near a network is to its best response over `count` cases of the pool."""
-    opponent = opponents(name, folder)
-    return check_network(
-        name,
-        load_network(name, folder),
-        opponent if isinstance(opponent, QNetwork) else None,
-        Reward.of(scenario),
-        count,
-    )
+    """Compare a network with its best response over `count` cases of the pool."""
+    opponent = {"pov2": "vut1", "vut2": "pov1"}.get(name)
+    known = None if opponent is None else load_network(opponent, folder)
+    return check_network(name, load_network(name, folder), known, Reward.of(scenario), count)
 
 
 def check_network(
     name: str, network: QNetwork, opponent: QNetwork | None, reward: Reward, count: int
 ) -> PolicyCheck:
-    """Return how near a network is to its best response; `opponent` is None for level 0."""
+    """Compare a network with its best response; `opponent` is None for level 0."""
     cases = check_cases(name, count, scenario=reward.scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
     role: Role = "pov" if name.startswith("pov") else "vut"
@@ -176,7 +159,7 @@ def check_network(
 def best_returns(
     game: Game, network: QNetwork, cases: list[Case], svo_rad: FloatArray
 ) -> FloatArray:
-    """Return what the best response to the opponent would have, (n,): see `best_response`."""
+    """Return the returns of the best response to the opponent, (n,): see `best_response`."""
     x_vut0 = game.scenario.x_vut0_m
     start = np.array([[c.x_pov0_m, c.v_pov0_mps, x_vut0, c.v_vut0_mps] for c in cases])
     if game.opponent is None:
@@ -184,33 +167,3 @@ def best_returns(
     searched = beam_search(game, start, svo_rad, network).returns
     policy = greedy(network, game.scenario)
     return np.maximum(searched, game.play(start, svo_rad, game.improved(policy)))
-
-
-class QuickRegret:
-    """A lower bound of the mean regret that is quick enough to be watched while training.
-
-    The best response is replaced by the network's own policy with every action played out before
-    it is chosen, or by level-0 behaviour where that is better, from some starts of the pool.
-    """
-
-    def __init__(self, game: Game, *, sees_svo: bool) -> None:
-        rng = np.random.default_rng(CHECK_SEED + 1)
-        self._game = game
-        self._start = pool_starts(STARTS, rng, game.scenario)
-        self._svo_rad = rng.uniform(SVO.low, SVO.high, STARTS) * sees_svo
-        profile = game.scenario.level0_a_mps2, game.scenario.level0_v_mps
-
-        def level0(state: FloatArray, _: FloatArray) -> IntArray:
-            of_pov = game.role == "pov"
-            a = np.zeros(len(state)) if of_pov else level0_acceleration(state[:, 3], *profile)
-            return np.asarray(np.abs(game.actions_mps2 - a[:, None]).argmin(axis=1))
-
-        self._level0 = game.play(self._start, self._svo_rad, level0)
-
-    def __call__(self, network: QNetwork) -> float:
-        """Return the bound for a network, as a share of the mean gain over level-0 behaviour."""
-        policy = greedy(network, self._game.scenario)
-        reached = self._game.play(self._start, self._svo_rad, policy)
-        improved = self._game.play(self._start, self._svo_rad, self._game.improved(policy))
-        best = np.maximum(np.maximum(reached, improved), self._level0)
-        return float((best - reached).mean() / (best - self._level0).mean())

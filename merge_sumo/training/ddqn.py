@@ -33,7 +33,7 @@ SQUASH_BELOW: Final = -2.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DdqnSettings:
-    """What `train` does."""
+    """Settings of `train`."""
 
     transitions: int = 150_000  # size of the replay; every transition is kept
     updates: int = 12_000  # gradient steps; the transitions are all in after `collecting` of them
@@ -57,13 +57,12 @@ class DdqnSettings:
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where training is: told after every thousand updates of DDQN, or a round of refinement."""
+    """The progress of training, after every thousand updates of DDQN or a round of refinement."""
 
     done: int  # updates, or rounds
     loss: float  # of DDQN's fit, or the mean loss of return that a choice of the network means
     mean_return: float  # of the games that were played lately
     crash_share: float | None  # share of collisions among them; None while refining
-    network: QNetwork  # as it is now
 
 
 def squash(q: Tensor) -> Tensor:
@@ -81,7 +80,7 @@ def unsquash(squashed: Tensor) -> Tensor:
     return torch.where(squashed >= SQUASH_BELOW, squashed, SQUASH_BELOW - torch.expm1(depth))
 
 
-class Replay:
+class ReplayBuffer:
     """All transitions so far: features before and after, action, reward in parts, end."""
 
     def __init__(self, size: int) -> None:
@@ -135,7 +134,7 @@ def train(
     weights: list[Tensor] = list(online.parameters())
     averages: list[Tensor] = list(target.parameters())
     optimiser = torch.optim.Adam(weights, lr=s.learning_rate, fused=True)
-    replay = Replay(s.transitions)
+    replay = ReplayBuffer(s.transitions)
     collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)
     loss = torch.zeros(())
     update = 0
@@ -161,8 +160,7 @@ def train(
                 torch._foreach_lerp_(averages, weights, s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
-                fit, now = float(loss.detach()), export(target, game.a_min_mps2)
-                on_progress(Progress(update, fit, *collector.recent(), now))
+                on_progress(Progress(update, float(loss.detach()), *collector.recent()))
     return export(target, game.a_min_mps2)
 
 
@@ -188,7 +186,7 @@ class _Collector:
         self.decisions[which] = 0
         self.returns[which] = 0.0
 
-    def collect(self, online: nn.Sequential, epsilon: float, replay: Replay) -> None:
+    def collect(self, online: nn.Sequential, epsilon: float, replay: ReplayBuffer) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
         games = self.game.corridors
         before = features(*self.state.T, scenario=self.game.of_agent)
@@ -227,7 +225,7 @@ class _Collector:
 def _loss(
     online: nn.Sequential,
     target: nn.Sequential,
-    replay: Replay,
+    replay: ReplayBuffer,
     batch: int,
     rng: np.random.Generator,
     role: Role,
@@ -269,14 +267,12 @@ def make_network(inputs: int, width: int) -> nn.Sequential:
 
 def export(network: nn.Sequential, a_min_mps2: float | None = None) -> QNetwork:
     """Return a torch network as one that acts in numpy, with its limit of braking."""
-    linear = [layer for layer in network if isinstance(layer, nn.Linear)]
-    return QNetwork(
-        [
-            (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
-            for layer in linear
-        ],
-        a_min_mps2,
-    )
+    layers = [
+        (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
+        for layer in network
+        if isinstance(layer, nn.Linear)
+    ]
+    return QNetwork(layers, a_min_mps2)
 
 
 def as_torch(network: QNetwork) -> nn.Sequential:

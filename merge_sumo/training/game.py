@@ -41,7 +41,7 @@ Policy = Callable[[FloatArray, FloatArray], IntArray]
 
 @dataclass(frozen=True, slots=True)
 class Game:
-    """What an agent plays: its role, the opponent that it knows, and the reward."""
+    """A game of an agent: its role, the opponent that it knows, and the reward."""
 
     role: Role  # "pov" or "vut"
     opponent: QNetwork | None  # the network of level k-1, or None for the level-0 driver
@@ -71,7 +71,10 @@ class Game:
         """Hold accelerations, (n,), for one decision; return states, rewards, and what is over."""
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         of_pov, reward = self.role == "pov", self.reward
-        learned = self._learned_answer(state, svo_rad)
+        learned = None
+        if self.opponent is not None:
+            choices = actions_mps2(self.opponent.limited(self.scenario))
+            learned = choices[greedy(self.opponent, self.scenario)(state, svo_rad)]
         safe, pov_ego, vut_ego = np.zeros((3, len(state)))
         live = np.ones(len(state), dtype=bool)
         for _ in range(DECISION_STEPS):
@@ -120,7 +123,7 @@ class Game:
     def action_returns(
         self, state: FloatArray, svo_rad: FloatArray, policy: Policy, held: int = 1
     ) -> FloatArray:
-        """Return what each action is worth, (n, 7), held for a number of decisions.
+        """Return the returns of each action, (n, 7), held for a number of decisions.
 
         After them the policy goes on.
         """
@@ -131,14 +134,6 @@ class Game:
     def improved(self, policy: Policy) -> Policy:
         """Return the policy that plays every action out before it chooses (Tesauro, 1996)."""
         return lambda state, svo_rad: self.action_returns(state, svo_rad, policy).argmax(axis=1)
-
-    def _learned_answer(self, state: FloatArray, svo_rad: FloatArray) -> FloatArray | None:
-        """Return what the learned opponent holds for the decision, (n,)."""
-        if self.opponent is None:
-            return None
-        answer = greedy(self.opponent, self.scenario)(state, svo_rad)
-        choices = actions_mps2(self.opponent.limited(self.scenario))
-        return np.asarray(choices[answer], dtype=np.float64)
 
     def _level0_answer(self, v_vut_mps: FloatArray) -> FloatArray:
         """Return the level-0 opponent's acceleration at a step, (n,)."""
@@ -161,7 +156,7 @@ def greedy(network: QNetwork, scenario: Scenario) -> Policy:
 def inputs_of(
     network: QNetwork, state: FloatArray, svo_rad: FloatArray, scenario: Scenario
 ) -> FloatArray:
-    """Return what a network sees of states, (n, 4), and of psi, (n,), if it has one."""
+    """Return the inputs of a network in states, (n, 4), with psi, (n,), if it has one."""
     psi = svo_rad if network.sees_svo else None
     x_pov, v_pov, x_vut, v_vut = state.T
     return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=network.limited(scenario))

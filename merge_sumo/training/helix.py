@@ -11,10 +11,11 @@ import json
 import os
 import queue
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -48,7 +49,7 @@ from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import to_json, to_plain
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
-from merge_sumo.training.check import CHECK_CASES, PolicyCheck, QuickRegret, check_network
+from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network
 from merge_sumo.training.ddqn import DdqnSettings, Progress, train
 from merge_sumo.training.env import MergeGame, make_opponent
 from merge_sumo.training.game import Game, of_two
@@ -69,9 +70,6 @@ LOG: Final = ".training.jsonl"
 WEIGHTS: Final = ".safetensors"
 GAMES: Final = 64
 """Corridors in which transitions are collected."""
-REGRET_EVERY: Final = {"ddqn": 4_000, "refine": 4}
-"""Updates of DDQN, and rounds of refinement, between two measurements of the regret, which costs a
-second; it is measured after the last one too."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -105,28 +103,16 @@ class TrainingProgress:
     loss: float  # of DDQN's fit, or the mean cost of a choice
     mean_return: float  # of the games played lately, from exploring starts
     crash_share: float | None  # share of collisions among them; None while refining
-    regret: float | None  # a lower bound, `check.QuickRegret`; None where it was not measured
 
     @property
     def note(self) -> str:
-        """What was measured, for a bar."""
+        """The measurements, for a bar."""
         crashes = "" if self.crash_share is None else f"  crashes {self.crash_share:.2%}"
-        regret = "" if self.regret is None else f"  regret at least {self.regret:.2%}"
-        return f"return {self.mean_return:.3f}{crashes}{regret}"
+        return f"return {self.mean_return:.3f}{crashes}"
 
 
-@dataclass(frozen=True, slots=True)
-class _Task:
-    """The inputs of a process that trains a network."""
-
-    name: str
-    role: Role
-    opponent: QNetwork | None
-    reward: Reward
-    road: Corridor
-    seed: int
-    settings: TrainingSettings
-    a_min_mps2: float | None
+_Task = tuple[str, Game, Corridor, int, TrainingSettings]
+"""Name, game, road, seed and settings of a network, for the process that trains it."""
 
 
 def train_library(
@@ -167,7 +153,7 @@ def train_library(
             for name in pair
             if name in names
         }
-        tasks = []
+        tasks: list[_Task] = []
         for name, plan in plans.items():
             known = read_manifest(folder).get(name, {})
             if not _is_of(known, plan):
@@ -178,8 +164,8 @@ def train_library(
                     )
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                limit = plan.get(LIMIT)
-                tasks.append(_Task(name, role, network, reward, road, seed, of_level, limit))
+                game = Game(role, network, reward, plan.get(LIMIT))
+                tasks.append((name, game, road, seed, of_level))
             elif on_done is not None:
                 on_done(name, None)
         for trained, network, check, seconds in _train_in_parallel(folder, tasks, on_progress):
@@ -266,35 +252,31 @@ def _train_in_parallel(
     if not tasks:
         return []
     context = get_context("spawn")
-    for task in tasks:
-        _log(folder, task.name, "w")
+    for name, *_ in tasks:
+        _log(folder, name, "w")
     with without_cwd():
         reports = context.Queue()
         # Spawned, because libsumo's simulation must not be forked.
         pool = ProcessPoolExecutor(len(tasks), context, _report_into, (reports,))
-        results = [pool.submit(_train_one, task) for task in tasks]
+        results = [pool.submit(_train_one, *task) for task in tasks]
     with pool:
         running: set[Future[_Trained]] = set(results)
         try:
             while running:
                 running = wait(running, timeout=0.2).not_done
-                for progress in _pending(reports):
-                    _log(folder, progress.network, "a", json.dumps(to_plain(progress)) + "\n")
-                    if on_progress is not None:
-                        on_progress(progress)
+                with suppress(queue.Empty):
+                    while True:
+                        progress: TrainingProgress = reports.get_nowait()
+                        line = json.dumps(to_plain(progress)) + "\n"
+                        _log(folder, progress.network, "a", line)
+                        if on_progress is not None:
+                            on_progress(progress)
         except BaseException:
             # An interrupted training does not wait for the hour that a process still needs.
             for process in list(pool._processes.values()):
                 process.kill()
             raise
         return [result.result() for result in results]
-
-
-def _pending(reports: Any) -> Iterator[TrainingProgress]:
-    """Take the reports that have arrived from a queue."""
-    with suppress(queue.Empty):
-        while True:
-            yield reports.get_nowait()
 
 
 def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
@@ -320,38 +302,30 @@ def _report_into(reports: Any) -> None:
     leave_signals_to_parent()
 
 
-def _train_one(task: _Task) -> _Trained:
+def _train_one(
+    name: str, game: Game, road: Corridor, seed: int, settings: TrainingSettings
+) -> _Trained:
     """Train a network by DDQN in SUMO, refine it, check it in SUMO."""
-    sees_svo = task.name == "pov2"
-    played_out = Game(task.role, task.opponent, task.reward, task.a_min_mps2)
-    regret = QuickRegret(played_out, sees_svo=sees_svo)
-    ddqn, refinement = task.settings.ddqn, task.settings.refine
+    ddqn, refinement = settings.ddqn, settings.refine
 
-    def reporter(stage: str, total: int) -> Callable[[Progress], None]:
-        def report(now: Progress) -> None:
-            due = now.done % REGRET_EVERY[stage] == 0 or now.done == total
-            bound = regret(now.network) if due else None
-            values = (now.done, total, now.loss, now.mean_return, now.crash_share, bound)
-            _reports.put(TrainingProgress(task.name, stage, *values))
-
-        return report
+    def report(stage: str, total: int, now: Progress) -> None:
+        values = (now.done, total, now.loss, now.mean_return, now.crash_share)
+        _reports.put(TrainingProgress(name, stage, *values))
 
     started = time.perf_counter()
-    if task.opponent is None:
-        opponent = make_opponent(task.role, "level0", GAMES)
+    if game.opponent is None:
+        opponent = make_opponent(game.role, "level0", GAMES)
     else:
-        opponent = LevelKDriver(GAMES, task.opponent)
-    game = MergeGame(task.role, opponent, task.reward, task.road, task.a_min_mps2)
-    try:
-        report = reporter("ddqn", ddqn.updates)
-        network = train(game, task.seed, ddqn, sees_svo=sees_svo, on_progress=report)
-    finally:
-        game.close()
-    report = reporter("refine", refinement.rounds)
-    network = refine(played_out, network, task.seed, refinement, report)
+        opponent = LevelKDriver(GAMES, game.opponent)
+    in_sumo = MergeGame(game.role, opponent, game.reward, road, game.a_min_mps2)
+    with closing(in_sumo):
+        of_ddqn = partial(report, "ddqn", ddqn.updates)
+        network = train(in_sumo, seed, ddqn, sees_svo=name == "pov2", on_progress=of_ddqn)
+    of_refinement = partial(report, "refine", refinement.rounds)
+    network = refine(game, network, seed, refinement, of_refinement)
     seconds = time.perf_counter() - started
-    check = check_network(task.name, network, task.opponent, task.reward, task.settings.check_cases)
-    return task.name, network, check, seconds
+    check = check_network(name, network, game.opponent, game.reward, settings.check_cases)
+    return name, network, check, seconds
 
 
 def _keep(

@@ -45,7 +45,7 @@ COST_CAP: Final = 1.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RefineSettings:
-    """What `refine` does."""
+    """Settings of `refine`."""
 
     rounds: int = 16  # of policy iteration
     starts: int = 1_500  # games per round
@@ -69,7 +69,7 @@ class RefineSettings:
 
 @dataclass(frozen=True, slots=True)
 class _Starts:
-    """Where games begin: states, (n, 4), and psi, (n,)."""
+    """Starts of games: states, (n, 4), and psi, (n,)."""
 
     state: FloatArray
     svo_rad: FloatArray
@@ -123,14 +123,14 @@ def refine(
             cost = _fit(model, average, optimiser, rounds, rng, s, number)
             network = export(average, game.a_min_mps2)
             if on_progress is not None:
-                on_progress(Progress(number + 1, cost, tried.mean_return, None, network))
+                on_progress(Progress(number + 1, cost, tried.mean_return, None))
     return network
 
 
 def _starts(
     game: Game, network: QNetwork, hard: _Starts | None, rng: np.random.Generator, s: RefineSettings
 ) -> _Starts:
-    """Return where the games of a round begin; the first of them are near hard starts, if any."""
+    """Return the starts of the games of a round; the first are near hard starts, if any."""
     state = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
     if hard is not None and len(hard.state):

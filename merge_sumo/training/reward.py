@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Final, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.values.case import FloatArray
 from merge_sumo.values.scenario import DT_S, Scenario
@@ -101,10 +100,6 @@ class Reward:
         below, above = self.scenario.v_hw_min_mps - v_mps, v_mps - self.scenario.v_hw_max_mps
         return -np.maximum(np.maximum(below, above), 0.0)
 
-    def phi_v_min(self, v_vut_mps: FloatArray) -> FloatArray:
-        """Return minus the m/s by which the VUT is slower than it should be."""
-        return -np.maximum(self.scenario.v_min_mps - v_vut_mps, 0.0)
-
     def phi_ttc(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
         """Return -(1 - TTC / limit) for a TTC below the scenario's limit, else 0."""
         closing = dx_m * dv_mps < 0.0
@@ -120,36 +115,24 @@ class Reward:
         reward: FloatArray = weights.gap * wide - weights.critical * near
         return reward
 
-    def phi_crash(self, dx_m: FloatArray) -> FloatArray:
-        """Return -1 for a collision."""
-        crashed: NDArray[np.bool_] = np.abs(dx_m) < self.scenario.dx_crash_m
-        return -crashed.astype(np.float64)
-
     def safety(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
         """Return the safety reward of both vehicles at t1."""
-        return (
-            self.weights.ttc * self.phi_ttc(dx_m, dv_mps)
-            + self.phi_dx(dx_m)
-            + self.weights.crash * self.phi_crash(dx_m)
-        )
+        crash = -(np.abs(dx_m) < self.scenario.dx_crash_m).astype(np.float64)
+        near = self.weights.ttc * self.phi_ttc(dx_m, dv_mps) + self.phi_dx(dx_m)
+        return near + self.weights.crash * crash
 
     def pov_step(self, v_pov_mps: FloatArray, a_pov_mps2: FloatArray) -> FloatArray:
         """Return the POV's ego reward of one 0.1 s step."""
         weights = self.weights
         speed = weights.pov_v_hw * self.phi_v_hw(v_pov_mps)
-        return (weights.pov_acc * phi_acc(a_pov_mps2) + speed) * DT_S
+        return (weights.pov_acc * -np.square(a_pov_mps2) + speed) * DT_S
 
     def vut_step(self, v_vut_mps: FloatArray, a_vut_mps2: FloatArray) -> FloatArray:
         """Return the VUT's running ego reward of one 0.1 s step."""
         weights = self.weights
-        speed = weights.vut_v_min * self.phi_v_min(v_vut_mps)
-        return (weights.vut_acc * phi_acc(a_vut_mps2) + speed) * DT_S
+        speed = weights.vut_v_min * -np.maximum(self.scenario.v_min_mps - v_vut_mps, 0.0)
+        return (weights.vut_acc * -np.square(a_vut_mps2) + speed) * DT_S
 
     def vut_end(self, v_vut_mps: FloatArray) -> FloatArray:
         """Return the VUT's ego reward of its final speed, at t1."""
         return self.weights.vut_v_end * self.phi_v_hw(v_vut_mps)
-
-
-def phi_acc(a_mps2: FloatArray) -> FloatArray:
-    """Return minus the squared acceleration, (m/s2)^2."""
-    return -np.square(a_mps2)
