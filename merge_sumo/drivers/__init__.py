@@ -1,1 +1,1 @@
-"""Who drives a car: level-k drivers, rule-based controllers, and what a user brings."""
+"""Drivers of cars, as arrays: level-k drivers and rule-based controllers."""

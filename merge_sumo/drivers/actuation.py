@@ -18,7 +18,7 @@ SLOWEST_MPS: Final = 0.1
 
 
 def whole_steps(time_s: float) -> tuple[int, float]:
-    """Return how many whole steps a time has, and which share of a step is left over."""
+    """Return the whole steps of a time, and the share of a step that is left over."""
     steps = round(time_s / DT_S, 9)
     return int(steps), steps % 1.0
 
@@ -69,21 +69,16 @@ class ActuatedDriver(DriverWrapper):
         command = np.minimum(np.maximum(asked, self._a_min), self._a_max)
         self._clipped = np.abs(asked - command) > ROUNDING_MPS2
         finite = np.isfinite(asked)
-        u = self._after_dead_time(np.where(finite, command, 0.0))
+        rows, places, share = len(self._commands), np.arange(self.corridors), self._waits_on
+        self._commands[self._row] = np.where(finite, command, 0.0)
+        now = self._commands[(self._row - self._wait) % rows, places]
+        before = self._commands[(self._row - self._wait - 1) % rows, places]
+        self._row = (self._row + 1) % rows
+        u = np.where(share > 0.0, (1.0 - share) * now + share * before, now)
         mean = u + (self._a_mps2 - u) * self._mean
         self._a_mps2 = u + (self._a_mps2 - u) * self._decay
         limited = np.minimum(mean, self._power / np.maximum(scene.v_vut_mps, SLOWEST_MPS))
         return np.where(finite, limited, asked)
-
-    def _after_dead_time(self, command: FloatArray) -> FloatArray:
-        """Take the commands of a step, (K,); return those that act in it."""
-        rows, places = len(self._commands), np.arange(self.corridors)
-        self._commands[self._row] = command
-        now = self._commands[(self._row - self._wait) % rows, places]
-        before = self._commands[(self._row - self._wait - 1) % rows, places]
-        self._row = (self._row + 1) % rows
-        share = self._waits_on
-        return np.where(share > 0.0, (1.0 - share) * now + share * before, now)
 
     def clipped(self) -> NDArray[np.bool_]:
         """Return which of the last commands were outside the limits, (K,)."""

@@ -1,4 +1,4 @@
-"""What a driver sees, and what it has to do."""
+"""Drivers: the scene that they see, and the accelerations that they answer."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,12 +55,12 @@ class Scene(NamedTuple):
     @property
     def x_pov_m(self) -> FloatArray:
         """Positions of the POV, (K,), or of the car that counts as POV."""
-        return self._of_pov(self.x_m)
+        return self._facing_of(self.x_m)
 
     @property
     def v_pov_mps(self) -> FloatArray:
         """Speeds of the same, (K,)."""
-        return self._of_pov(self.v_mps)
+        return self._facing_of(self.v_mps)
 
     @property
     def x_vut_m(self) -> FloatArray:
@@ -74,11 +74,10 @@ class Scene(NamedTuple):
         v_mps: FloatArray = self.v_mps[VUT]
         return v_mps
 
-    def _of_pov(self, values: FloatArray) -> FloatArray:
-        of_pov: FloatArray = (
-            values[POV] if self.facing is None else values[self.facing, np.arange(values.shape[1])]
-        )
-        return of_pov
+    def _facing_of(self, values: FloatArray) -> FloatArray:
+        row: Any = POV if self.facing is None else (self.facing, np.arange(values.shape[1]))
+        found: FloatArray = values[row]
+        return found
 
     def of_mainline(self) -> Scene:
         """Return the scene for who drives all C cars of the mainline, each as the POV of its own.
@@ -99,7 +98,7 @@ class Scene(NamedTuple):
 
 
 class VutLostError(Exception):
-    """What a driver knew of its corridors is gone: their episodes have to begin anew.
+    """A driver has lost the state of its corridors: their episodes have to begin anew.
 
     Attributes:
         reason: what happened.
@@ -117,16 +116,12 @@ class VutLostError(Exception):
         final: bool = False,
         killed: bool = False,
     ) -> None:
-        """Take what happened, and what is known of it."""
         super().__init__(reason)
         self.reason, self.corridor, self.final, self.killed = reason, corridor, final, killed
 
 
 class PovLostError(VutLostError):
     """It was the driver of the POV that lost it."""
-
-
-NO_SIGNALS: Final[Mapping[int, Left]] = {}
 
 
 NO_WISH: Final = -1
@@ -161,7 +156,7 @@ class Driver(ABC):
         return None
 
     def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the last answers wish, (K,), `NO_WISH`, `STAY` or `MERGE`; None for no wish.
+        """Return the wishes of the last answers, (K,), `NO_WISH`, `STAY` or `MERGE`, or None.
 
         A wish is granted in the next step from where the acceleration lane begins.
         """
@@ -179,8 +174,8 @@ class Driver(ABC):
         return {}
 
     def signals(self) -> Mapping[int, Left]:
-        """Return what the controllers left with their last answers, by corridor."""
-        return NO_SIGNALS
+        """Return the signals of the last answers, by corridor."""
+        return {}
 
     def files(self) -> tuple[Path, ...]:
         """Return the files of the user's that have decided on its answers so far."""
@@ -234,11 +229,11 @@ class DriverWrapper(Driver):
         self._driver.begin(corridor, case)
 
     def reason(self, corridor: int) -> str | None:
-        """Return what the driver did wrong."""
+        """Return the reason of the driver."""
         return self._driver.reason(corridor)
 
     def wishes(self) -> NDArray[np.int8] | None:
-        """Return what the driver wishes, (K,)."""
+        """Return the wishes of the driver, (K,)."""
         return self._driver.wishes()
 
     def clipped(self) -> NDArray[np.bool_] | None:
@@ -246,7 +241,7 @@ class DriverWrapper(Driver):
         return self._driver.clipped()
 
     def signals(self) -> Mapping[int, Left]:
-        """Return what the driver left."""
+        """Return the signals of the driver."""
         return self._driver.signals()
 
     def files(self) -> tuple[Path, ...]:

@@ -58,7 +58,7 @@ class GapChoiceVut(Level0Vut):
         super().__init__(corridors)
         self.choice = choice
         self._lane_m = np.zeros((2, corridors))
-        """Where the lanes begin and end; 0 and 0 without one."""
+        """Begins and ends of the lanes; 0 and 0 without one."""
         self._pov_length_m = np.full(corridors, US23.pov_length_m)
         self._vut_length_m = np.full(corridors, US23.vut_length_m)
         self._before_mps: FloatArray | None = None
@@ -95,17 +95,12 @@ class GapChoiceVut(Level0Vut):
         return answer
 
     def _accepts(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
-        """Return where both time gaps suffice in states, (A, K): (K,)."""
-        others = np.arange(len(x_m)) != VUT
+        """Return the corridors in which both time gaps suffice in states, (A, K): (K,)."""
+        others, headway_s = np.arange(len(x_m)) != VUT, self.choice.headway_s
         x_other, v_other = x_m[others], v_mps[others]
-        is_ahead = x_other >= x_m[VUT]
-        ahead_m = x_other - self._pov_length_m - x_m[VUT]
-        behind_m = x_m[VUT] - self._vut_length_m - x_other
-        headway_s = self.choice.headway_s
-        enough = np.where(
-            is_ahead, ahead_m >= headway_s * v_mps[VUT], behind_m >= headway_s * v_other
-        )
-        gap: NDArray[np.bool_] = enough.all(axis=0)
+        ahead = x_other - self._pov_length_m - x_m[VUT] >= headway_s * v_mps[VUT]
+        behind = x_m[VUT] - self._vut_length_m - x_other >= headway_s * v_other
+        gap: NDArray[np.bool_] = np.where(x_other >= x_m[VUT], ahead, behind).all(axis=0)
         return gap
 
     def _following_mps2(self, scene: Scene) -> FloatArray:

@@ -169,7 +169,7 @@ class Merging:
         self._scenario = scenario
         self.merged = np.zeros(corridors, dtype=np.bool_)
         self._states_wishes = np.zeros(corridors, dtype=np.bool_)
-        """Whether the VUT has ever said whether it wishes to merge."""
+        """Whether the VUT has ever stated a wish."""
         self._wishes = np.zeros(corridors, dtype=np.bool_)
 
     @property
@@ -211,5 +211,5 @@ class Merging:
         return self.merged
 
     def _granted(self, next_m: FloatArray) -> NDArray[np.bool_]:
-        """Return whose wish is granted, (K,), by the next places of the VUTs, (K,)."""
+        """Return the granted wishes, (K,), by the next places of the VUTs, (K,)."""
         return self._wishes & (next_m >= self.begin_m)

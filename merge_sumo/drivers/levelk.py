@@ -71,7 +71,7 @@ def features(
     *,
     scenario: Scenario,
 ) -> FloatArray:
-    """Return what the network sees of n states, (n, 26), or (n, 28) with an orientation."""
+    """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation."""
     state = x_pov_m, v_pov_mps, x_vut_m, v_vut_mps
     return np.stack(feature_columns(*state, svo_rad, scenario=scenario), axis=-1)
 
@@ -85,7 +85,7 @@ def feature_columns(
     *,
     scenario: Scenario,
 ) -> list[FloatArray]:
-    """Return what the network sees of n states as 26 arrays (n,), or 28 with an orientation.
+    """Return the inputs of a network for n states as 26 arrays (n,), or 28 with an orientation.
 
     All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
     scaled; the VUT's time to M on the level-0 profile, at constant speed and at full
@@ -123,7 +123,7 @@ def prospects(
     v_vut_mps: FloatArray,
     scenario: Scenario,
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
-    """Return what may come of n states, every array of shape (n,).
+    """Predict times, gaps and speeds at M for n states, every array of shape (n,).
 
     Returns:
         The VUT's times to M in s on the level-0 profile, at constant speed and at full
@@ -311,10 +311,7 @@ class LevelKDriver(Driver):
         return self._held
 
     def _decide(self, due: NDArray[np.int64], scene: Scene, scenario: Scenario) -> None:
-        """Choose anew in corridors, which play a scenario.
-
-        Where an action value is not finite, the answer is NaN: the largest of them means nothing.
-        """
+        """Choose anew in corridors of a scenario; NaN where an action value is not finite."""
         inputs = features(
             scene.x_pov_m[due],
             scene.v_pov_mps[due],

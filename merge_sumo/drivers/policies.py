@@ -33,8 +33,6 @@ LIMITS: Final = ("reach_m", "v_start_max_mps")
 """Of what these numbers may be."""
 MOST_BYTES: Final = 1 << 26
 """No network and no manifest is larger."""
-
-
 HUMAN: Final = "human"
 """Shipped library for `us23` in which no POV brakes harder than people did: it is used by name."""
 
@@ -57,7 +55,7 @@ def policies_name(folder: Path) -> str:
 
 
 def policies_in(folder: str | Path) -> Path:
-    """Return where the policies are that a person or a record names, as a whole path.
+    """Return the policies that a person or a record names, as a whole path.
 
     That is a folder, or the name of a shipped library. Raises `UserError` where there are none, or
     where a folder here has the name of a shipped library.
@@ -77,7 +75,7 @@ def policies_in(folder: str | Path) -> Path:
     except (OSError, ValueError, RuntimeError) as error:
         what = f"cannot be read ({getattr(error, 'strerror', None) or error})"
     raise UserError(
-        f"--policies: {folder} {what}: name a folder of policies, such as `merge-sumo train --out "
+        f"`policies`: {folder} {what}: name a folder of policies, such as `merge-sumo train --out "
         f"DIR` makes, or a shipped library: {', '.join(sorted(_shipped()))}"
     )
 
@@ -92,7 +90,7 @@ class _Manifest(Record, frozen=True):
 
 
 def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Return what is known of each network, by name; empty where nothing was trained yet."""
+    """Return the entries of a manifest by name; empty where nothing was trained yet."""
     path = (folder or resource("policies")) / MANIFEST
     if not path.is_file():
         return {}
@@ -108,7 +106,7 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
 
 
 def scenario_record(scenario: Scenario) -> dict[str, Any]:
-    """Return what a manifest says of the scenario that a network was trained for."""
+    """Return the entry of a manifest for the scenario that a network was trained for."""
     values = {name: getattr(scenario, name) for name in (*PLAYED, *LIMITS)}
     return {
         "name": scenario.name,
@@ -148,7 +146,7 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
 
 
 def _content(path: Path) -> bytes:
-    """Return what is in a file; OSError where it is none, or a giant one: others name folders."""
+    """Return the bytes of a file; OSError where it is none, or a giant one."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
         raise OSError(errno.EINVAL, "it is no file, or a giant one", str(path))

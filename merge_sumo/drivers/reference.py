@@ -117,7 +117,15 @@ class RampDriver(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,)."""
         calm = super().act(scene)
-        nominal, present = self._nominal(scene), self._present(scene)
+        v_mps, distance_m = scene.v_vut_mps, np.maximum(-scene.x_vut_m, 0.0)
+        # P0: the VUT takes the level-0 profile.
+        t_s = level0_time_to(distance_m, v_mps, self.a_mps2, self.v_cruise_mps)
+        most_mps = np.maximum(v_mps, self.v_cruise_mps)
+        nominal = self._plan(scene, t_s, np.minimum(v_mps + self.a_mps2 * t_s, most_mps))
+        # P1: it keeps its speed.
+        moves = (v_mps > SLOWEST_MPS) | (distance_m == 0.0)
+        t_s = np.where(moves, distance_m / np.maximum(v_mps, SLOWEST_MPS), np.inf)
+        present = self._plan(scene, t_s, v_mps)
         self._start(scene, nominal)
         waits = self._reacts & (self._delay_steps > 0)
         self._delay_steps -= waits
@@ -146,22 +154,6 @@ class RampDriver(Level0Vut):
         due &= nominal.is_rear | self._can_fall_behind(scene, left_s)
         self._reacts |= due
         self._delay_steps = np.where(due, model.delay_steps + missing, self._delay_steps)
-
-    def _nominal(self, scene: Scene) -> Plan:
-        """Return P0: the VUT takes the level-0 profile."""
-        v_mps = scene.v_vut_mps
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
-        t_s = level0_time_to(distance_m, v_mps, self.a_mps2, self.v_cruise_mps)
-        most_mps = np.maximum(v_mps, self.v_cruise_mps)
-        return self._plan(scene, t_s, np.minimum(v_mps + self.a_mps2 * t_s, most_mps))
-
-    def _present(self, scene: Scene) -> Plan:
-        """Return P1: the VUT keeps its speed."""
-        v_mps = scene.v_vut_mps
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
-        moves = (v_mps > SLOWEST_MPS) | (distance_m == 0.0)
-        t_s = np.where(moves, distance_m / np.maximum(v_mps, SLOWEST_MPS), np.inf)
-        return self._plan(scene, t_s, v_mps)
 
     def _plan(self, scene: Scene, t_s: FloatArray, v_vut_mps: FloatArray) -> Plan:
         v_pov_mps = scene.v_pov_mps

@@ -92,7 +92,7 @@ class CarefulModel(SafetyModel):
 
 
 class Reg157Model(SafetyModel):
-    """What UN R157 asks of lane-keeping systems in a cut-in (5.2.5.2), as a way to drive.
+    """The demand of UN R157 on lane-keeping systems in a cut-in (5.2.5.2), as a way to drive.
 
     A system has to avoid a collision where TTC > (v_r - v_f) / (2 * 6 m/s2) + 0.35 s when the other
     vehicle intrudes into its lane. The driver brakes at once by 6 m/s2, 0.35 s later.

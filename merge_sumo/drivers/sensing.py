@@ -11,7 +11,6 @@ from merge_sumo.drivers.actuation import whole_steps
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.imperfection import Sensing
 from merge_sumo.values.scenario import DT_S, VUT, Scenario
 
 STREAM: Final = 26
@@ -21,7 +20,7 @@ X, V, ARRIVES = range(3)
 
 
 def far_m(scenario: Scenario) -> float:
-    """Return where a VUT sees a car that it does not see."""
+    """Return the place, out of the way, of a car that a VUT does not see."""
     ahead = 1.0 if scenario.pov_edges == scenario.vut_edges else -1.0
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
@@ -64,7 +63,16 @@ class SensedDriver(DriverWrapper):
     def begin(self, corridor: int, case: Case) -> None:
         """Take the sensors of a case; the driver is told the start as they show it."""
         scenario = case.scenario
-        self._take(corridor, case.sensing)
+        sense = case.sensing
+        whole, share = whole_steps(sense.at_most("delay_s"))
+        self._wait[corridor] = whole + (share > 0.0)
+        self._drives_on_s[corridor] = (1.0 - share) * DT_S if share > 0.0 else 0.0
+        self._noise[:, corridor] = sense.at_most("noise_x_m"), sense.at_most("noise_v_mps")
+        self._dropout[corridor] = sense.at_most("dropout")
+        ranged, hidden = sense.range_m is not None, sense.occluded_until_m is not None
+        self._range_m[corridor] = sense.at_most("range_m") if ranged else np.inf
+        until_m = sense.at_most("occluded_until_m") if hidden else -np.inf
+        self._occluded_until_m[corridor] = until_m
         self._far_m[corridor] = far_m(scenario)
         self._level0[:, corridor] = scenario.level0_a_mps2, scenario.level0_v_mps
         if self._is_random:
@@ -100,18 +108,6 @@ class SensedDriver(DriverWrapper):
             facing = car_met(x_m, v_mps, *self._level0)
         return self._driver.act(scene._replace(x_m=x_m, v_mps=v_mps, facing=facing))
 
-    def _take(self, corridor: int, sense: Sensing) -> None:
-        """Take the numbers of a case."""
-        whole, share = whole_steps(sense.at_most("delay_s"))
-        self._wait[corridor] = whole + (share > 0.0)
-        self._drives_on_s[corridor] = (1.0 - share) * DT_S if share > 0.0 else 0.0
-        self._noise[:, corridor] = sense.at_most("noise_x_m"), sense.at_most("noise_v_mps")
-        self._dropout[corridor] = sense.at_most("dropout")
-        ranged, hidden = sense.range_m is not None, sense.occluded_until_m is not None
-        self._range_m[corridor] = sense.at_most("range_m") if ranged else np.inf
-        until_m = sense.at_most("occluded_until_m") if hidden else -np.inf
-        self._occluded_until_m[corridor] = until_m
-
     def _measure(
         self, row: int, step: NDArray[np.int64], state: FloatArray, corridors: slice
     ) -> None:
@@ -133,7 +129,7 @@ class SensedDriver(DriverWrapper):
         self._seen[row % rows][..., corridors] = np.where(lost, last, seen)
 
     def _shown(self, row: int, state: FloatArray, corridors: slice) -> FloatArray:
-        """Return what VUTs see, (2, A, K), at a row at which the states are (2, A, K)."""
+        """Return the states that VUTs see, (2, A, K), at a row with the states (2, A, K)."""
         places = np.arange(self.corridors)[corridors]
         back = (row - self._wait[corridors]) % len(self._seen)
         shown: FloatArray = self._seen[back, :, :, places].transpose(1, 2, 0)

@@ -27,7 +27,7 @@ DRAWN_MIN_M: Final = 0.1
 
 
 class LanePoint(NamedTuple):
-    """Where a lane coordinate is: in the net (lane, position on it) and in the plane."""
+    """The place of a lane coordinate in the net (lane, position on it) and in the plane."""
 
     lane: str
     position_m: float
@@ -100,7 +100,7 @@ class LanePath:
         return self.pieces[max(bisect.bisect_right(self.starts_m, x_m) - 1, 0)]
 
     def point(self, x_m: float) -> LanePoint:
-        """Return where a lane coordinate is."""
+        """Return the place of a lane coordinate."""
         piece = self.piece(x_m)
         position_m = x_m - piece.start_m
         return LanePoint(piece.lane, position_m, *piece.point(position_m))
@@ -116,7 +116,7 @@ class LanePath:
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """How a path goes over the junction at M."""
+    """The right of way of a path over the junction at M."""
 
     state: str
     """SUMO's letter for its right of way."""
@@ -151,7 +151,7 @@ class AccelerationLane:
 
     @property
     def length_m(self) -> float:
-        """How long it runs beside the mainline."""
+        """Length beside the mainline."""
         return self.end_m - self.begin_m
 
     @property
@@ -162,7 +162,7 @@ class AccelerationLane:
 
 
 def lane_around_m(length_m: float) -> Bounds:
-    """Return where a lane of a length begins and ends around the expected merge, at 0.
+    """Return begin and end of a lane of a length around the expected merge, at 0.
 
     In tenths of a metre, so it is up to 0.1 m shorter than the lane.
     """
@@ -204,7 +204,7 @@ class Corridor:
         return self.mainline_edges == self.ramp_edges
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
-        """Return where a lane coordinate of one of the paths is."""
+        """Return the place of a lane coordinate of one of the paths."""
         return (self.ramp if on_ramp else self.mainline).point(x_m)
 
     @property

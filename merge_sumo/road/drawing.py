@@ -17,7 +17,7 @@ WIDTH_PX = 1000
 LANE_M = 3.2
 STEP_M = 5.0
 AFTER_M = 120.0
-"""How far behind M, or the end of the lane, the paths are drawn."""
+"""Length behind M, or the end of the lane, that is drawn."""
 LANE_COLOUR = "#009e73"
 
 
@@ -76,13 +76,10 @@ def _line_of(
     road: Corridor, low_m: float, high_m: float, on_ramp: bool
 ) -> list[tuple[float, float]]:
     """Return the points of a part of a path."""
-    points = (road.lane_point(x_m, on_ramp=on_ramp) for x_m in _steps(low_m, high_m))
-    return [(point.x_m, point.y_m) for point in points]
-
-
-def _steps(low_m: float, high_m: float) -> list[float]:
     count = max(int((high_m - low_m) / STEP_M), 1)
-    return [low_m + (high_m - low_m) * step / count for step in range(count + 1)]
+    places_m = (low_m + (high_m - low_m) * step / count for step in range(count + 1))
+    points = (road.lane_point(x_m, on_ramp=on_ramp) for x_m in places_m)
+    return [(point.x_m, point.y_m) for point in points]
 
 
 def _line(

@@ -30,7 +30,7 @@ from merge_sumo.road.netfile import Lane, Link, NetFile, Point
 from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds
 
 SURROUNDINGS_M: Final = 500.0
-"""How near to M a lane beside the paths is drawn."""
+"""Distance to M up to which lanes beside the paths are drawn."""
 POINT_M: Final = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
 
@@ -67,7 +67,7 @@ def find_corridor(
         pieces += _placed(net, side, begin_m, pieces[-1])
         shared = _placed(net, _continued(onward, room_after_m - end_m), end_m, pieces[-1])
         paths.append(LanePath((*pieces, *shared)))
-    junction_type = net.junction_type(meeting.ramp.source)
+    junction_id, junction_type = net.junction(meeting.ramp.source)
     approaches = []
     for link, other in permutations((meeting.mainline, meeting.ramp)):
         if meeting.drop is not None:
@@ -77,6 +77,8 @@ def find_corridor(
         else:
             yields = net.yields(link, other)
         approaches.append(Approach(link.state, yields, link.visibility_m))
+    used = {piece.lane for path in paths for piece in path.pieces}
+    near = net.lanes_near(shared[0].shape[0], SURROUNDINGS_M)
     return Corridor(
         path=net.path,
         sha256=net.sha256,
@@ -85,12 +87,12 @@ def find_corridor(
         mainline=paths[0],
         ramp=paths[1],
         junction_type=junction_type,
-        junction_id=net.junction_id(meeting.ramp.source),
+        junction_id=junction_id,
         mainline_approach=approaches[0],
         ramp_approach=approaches[1],
         lane_drop=meeting.drop is not None,
         drawn_after_m=end_m + _length_m(onward),
-        surroundings=_surroundings(net, paths, shared[0].shape[0]),
+        surroundings=tuple(lane.shape for lane in near if lane.id not in used),
         lane_m=lane_m and (begin_m, end_m),
         acceleration_lane=_lane_of_road(net, meeting, along, end_m if lane_m else None),
     )
@@ -120,7 +122,7 @@ class _Meeting(NamedTuple):
 def _paths(
     net: NetFile, mainline: _Edges, ramp: _Edges, edge_at_m: str | None = None
 ) -> tuple[_Meeting, list[list[Lane]], list[Lane]]:
-    """Return how the paths meet, the lanes of mainline and ramp before that, and those behind."""
+    """Return the meeting of the paths, the lanes of both before it, and those behind."""
     own, tail = _split(net, mainline, ramp, edge_at_m)
     layers = [_layers(net, edges + tail, len(edges)) for edges in own]
     meeting = _meeting(net, own, tail, layers)
@@ -177,7 +179,7 @@ def _lane_of_road(
 
 
 def _window_m(net: NetFile, meeting: _Meeting, length_m: float, lane_m: Bounds) -> Bounds:
-    """Return where a lane begins and ends, if that of a scenario, `lane_m`, is on it."""
+    """Return begin and end of a lane, if that of a scenario, `lane_m`, is on it."""
     if meeting.drop is meeting.mainline:
         raise net.broken(
             "the lane that ends is that of the mainline, and lane_m is one of the ramp"
@@ -255,7 +257,7 @@ def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
 def _meeting(
     net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
 ) -> _Meeting:
-    """Return where the paths meet: by connections, or where a lane of one of them ends."""
+    """Return the meeting of the paths: by connections, or where a lane of one of them ends."""
     mainline, ramp = (path[len(edges) :] for path, edges in zip(layers, own, strict=True))
     for place, edge in enumerate(tail):
         common = mainline[place].keys() & ramp[place].keys()
@@ -299,7 +301,7 @@ def _lane_drop(
 
 
 def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
-    """Return the way from a lane that ends to where a link of the lane beside it leads."""
+    """Return the link from a lane that ends to the target of a link of the lane beside it."""
     via: tuple[Lane, ...] = ()
     if beside.via:
         crossing = replace(
@@ -308,7 +310,7 @@ def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
             shape=(last.shape[-1], beside.target.shape[0]),
         )
         via = (crossing,)
-    state = "Z" if net.junction_type(last) == "zipper" else "m"
+    state = "Z" if net.junction(last)[1] == "zipper" else "m"
     # A driver on it sees all along the lane beside.
     return Link(last, beside.target, via, state, visibility_m=last.length_m)
 
@@ -379,15 +381,6 @@ def _placed(
         pieces.append(Piece(lane.id, start_m, lane.length_m, lane.speed_limit_mps, shape))
         start_m += lane.length_m
     return pieces if behind is None else pieces[1:]
-
-
-def _surroundings(
-    net: NetFile, paths: Sequence[LanePath], centre: Point
-) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of the lanes near a point that are on no path."""
-    used = {piece.lane for path in paths for piece in path.pieces}
-    near = net.lanes_near(centre, SURROUNDINGS_M)
-    return tuple(lane.shape for lane in near if lane.id not in used)
 
 
 def _corners(shape: tuple[Point, ...]) -> tuple[Point, ...]:

@@ -1,4 +1,4 @@
-"""What a SUMO net file says of lanes: edges, lengths, shapes, connections and right of way."""
+"""SUMO net files: edges, lanes, lengths, shapes, connections and right of way."""
 
 from __future__ import annotations
 
@@ -148,22 +148,15 @@ class NetFile:
         names = {str(element.get("to")) for element in elements if _open_to_cars(element)}
         return sorted(name for name in names if not name.startswith(":"))
 
-    def junction_id(self, source: Lane) -> str:
-        """Return the id of the junction at the end of a lane; `UserError` where there is none."""
-        return str(self._junction(source).get("id"))
-
-    def junction_type(self, source: Lane) -> str:
-        """Return the type of the junction at the end of a lane; `UserError` when SUMO has none."""
-        kind = str(self._junction(source).get("type"))
-        if kind not in JUNCTION_TYPES:
-            raise self.broken(f"SUMO has no junctions of type {kind}")
-        return kind
-
-    def _junction(self, source: Lane) -> etree._Element:
+    def junction(self, source: Lane) -> tuple[str, str]:
+        """Return id and type of the junction at the end of a lane; `UserError` without one."""
         junction = self._junctions.get(source.id)
         if junction is None:
             raise self.broken(f"there is no junction at the end of lane {source.id}")
-        return junction
+        kind = str(junction.get("type"))
+        if kind not in JUNCTION_TYPES:
+            raise self.broken(f"SUMO has no junctions of type {kind}")
+        return str(junction.get("id")), kind
 
     def yields(self, link: Link, to: Link) -> bool:
         """Return whether the junction's rules make a link yield to another one of it."""
@@ -302,7 +295,7 @@ def _point(text: str) -> Point:
 
 
 def _open_to_cars(element: etree._Element) -> bool:
-    """Return what "allow" and "disallow" of a lane or a connection say; all may without them."""
+    """Whether "allow" and "disallow" of a lane or a connection let cars drive, as without them."""
     allowed, refused = element.get("allow"), element.get("disallow", "")
     if allowed is not None:
         return not {"all", VEHICLE_CLASS}.isdisjoint(allowed.split())

@@ -36,7 +36,7 @@ _NUMBER: Final = re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d{1,3})?"
 
 @dataclass(frozen=True, slots=True)
 class Values:
-    """What an attribute may hold: a test, and the words for it in a sentence."""
+    """The values of an attribute: a test, and the words for it in a sentence."""
 
     words: str
     include: Callable[[str], bool]
@@ -44,7 +44,7 @@ class Values:
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """What an element may have; what it must have is named in `required`."""
+    """The attributes and children of an element, and the names of those that are `required`."""
 
     attributes: Mapping[str, Values] = field(default_factory=dict)
     children: Mapping[str, Allowed] = field(default_factory=dict)
@@ -110,7 +110,7 @@ def check_text(content: bytes, name: str) -> None:
 def parse(
     content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
 ) -> etree._Element:
-    """Return what is allowed of an XML file as a tree.
+    """Return the allowed part of an XML file as a tree.
 
     Raises `UserError` when it is no UTF-8, is no XML, declares a document type, has more elements
     than `max_elements`, or has a value that its attribute does not take; `name` is what the
@@ -136,7 +136,7 @@ def parse(
 def cleaned(
     content: bytes, allowed: Mapping[str, Allowed], name: str, max_elements: int = MAX_ELEMENTS
 ) -> bytes:
-    """Return what is allowed of an XML file; raises as `parse`."""
+    """Return the allowed part of an XML file as a file; raises as `parse`."""
     return serialize(parse(content, allowed, name, max_elements))
 
 
@@ -147,7 +147,7 @@ def serialize(root: etree._Element) -> bytes:
 
 
 class _Cleaner:
-    """Builds the tree of what is allowed while the parser reads, and holds nothing else."""
+    """Builds the allowed tree while the parser reads, and holds nothing else."""
 
     def __init__(self, allowed: Mapping[str, Allowed], name: str, max_elements: int) -> None:
         self._name, self._max_elements = name, max_elements

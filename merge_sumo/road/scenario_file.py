@@ -103,7 +103,7 @@ COMMENTS: Final = {
     "lane_m": "where the acceleration lane begins, at the gore or behind it, and ends",
     "lane_end": 'its end moves a VUT to the mainline; "stop" brakes it to a stand before it',
 }
-"""What stands beside a value in a file that we write."""
+"""Comments beside the values of a file that we write."""
 
 
 def to_toml(scenario: Scenario, found: Sequence[str]) -> str:

@@ -38,7 +38,7 @@ class Blame(Generic[T]):
         """Count a death; return whether the item is to blame. If not, it is to run again alone.
 
         Args:
-            item: what was running.
+            item: the work that was running.
             alone: whether nothing ran beside it.
             named: whether it is known that it was at work at that moment.
             repeatable: whether it would do the same again: it hung, and did not die.
@@ -50,7 +50,7 @@ class Blame(Generic[T]):
 
 
 def how_it_ended(code: int | None) -> str:
-    """Return how a process ended, by its exit code; None where its channel alone is broken."""
+    """Return the end of a process in words, by its exit code; None for a broken channel."""
     if code is None:
         return "broke the channel to its process"
     if code >= 0:

@@ -23,7 +23,7 @@ from typing import BinaryIO, Final
 from merge_sumo.errors import UserError
 
 TEMPORARY: Final = ".merge-sumo-"
-"""How the name begins under which a file is written; the name has 28 bytes."""
+"""Begin of the name, of 28 bytes, under which a file is written."""
 LONGEST_NAME: Final = 255
 """Bytes of a name that file systems take."""
 ROOM: Final = 64
@@ -37,10 +37,10 @@ DEFAULT: Final = Path("runs")
 """Folder of what nobody gave a name to."""
 
 
-def check_new(path: Path, option: str = "--out") -> None:
+def check_new(path: Path, option: str = "`out`") -> None:
     """Raise `UserError` where no new folder or file can be made at `path`; make nothing.
 
-    `option` is what the person named it by. Folders above it that are missing can be made.
+    Folders above it that are missing can be made; `option` names it in the sentence.
     """
     if path.name in ("", ".."):
         raise UserError(f"{option} is {str(path)!r} or empty: write the name of what is to be made")
@@ -57,9 +57,7 @@ def check_new(path: Path, option: str = "--out") -> None:
     except OSError as error:
         raise cannot_write(path, error) from error
     except ValueError as error:
-        raise UserError(
-            f"{option} is {str(path)!r}: no folder or file can have that name"
-        ) from error
+        raise UserError(f"{option} is {str(path)!r}: nothing can have that name") from error
 
 
 def _try(folder: Path) -> None:
@@ -69,7 +67,7 @@ def _try(folder: Path) -> None:
 
 
 def _is_there(path: Path) -> bool:
-    """Return whether anything has that name, be it a link that leads nowhere."""
+    """Whether anything has that name, be it a link that leads nowhere."""
     try:
         path.lstat()
     except FileNotFoundError:
@@ -77,14 +75,14 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-def check_new_file(path: Path, option: str = "--out") -> None:
+def check_new_file(path: Path, option: str = "`out`") -> None:
     """Raise `UserError` where no new file can be written at `path`, in a folder that is there."""
     check_new(path, option)
     if not path.parent.is_dir():
         raise UserError(f"{option} is {str(path)!r}: there is no folder {path.parent}")
 
 
-def check_place(folder: Path, option: str = "--out") -> None:
+def check_place(folder: Path, option: str = "`out`") -> None:
     """Raise `UserError` where `folder` is neither a folder to add to nor one that can be made."""
     if folder.name in ("", "..") or not _is_folder(folder):
         check_new(folder, option)
@@ -145,10 +143,9 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
                     file.touch(exist_ok=False)
                     undo.callback(file.unlink, missing_ok=True)
                 if file.lstat().st_size < len(content):
-                    with open(file, "r+b", opener=_not_a_link) as opened:
-                        opened.write(content)
-                        opened.flush()
-                        os.fsync(opened.fileno())
+                    descriptor = os.open(file, os.O_RDWR | NO_LINK)
+                    with os.fdopen(descriptor, "r+b") as opened:
+                        _sync(opened, content)
             sync_folder(path)
             sync_folder(path.parent)
         except OSError as error:
@@ -163,16 +160,21 @@ def _begins(path: Path, content: bytes | None) -> bool:
     return found.st_size <= len(content) and content.startswith(path.read_bytes())
 
 
-def _not_a_link(path: str, flags: int) -> int:
-    return os.open(path, flags | NO_LINK, 0o666)
+def _sync(file: BinaryIO, content: bytes) -> None:
+    file.write(content)
+    file.flush()
+    os.fsync(file.fileno())
 
 
-def make_folder(path: Path, option: str = "--out") -> None:
+def make_folder(path: Path, option: str = "`out`") -> None:
     """Make an empty folder; `UserError` where it exists or cannot be made."""
     check_new(path, option)
     with ExitStack() as undo:
         try:
-            _make_above(path, undo)
+            for folder in reversed([parent for parent in path.parents if not parent.is_dir()]):
+                with suppress(FileExistsError):  # as "a/..", or by somebody else since
+                    folder.mkdir()
+                    undo.callback(_remove_if_empty, folder)
             path.mkdir()
         except FileExistsError as error:
             raise _exists(path, option) from error
@@ -181,7 +183,7 @@ def make_folder(path: Path, option: str = "--out") -> None:
         undo.pop_all()
 
 
-def make_place(folder: Path, option: str = "--out") -> None:
+def make_place(folder: Path, option: str = "`out`") -> None:
     """Make a folder unless it is there; `UserError` where it cannot be."""
     try:
         check_place(folder, option)
@@ -193,24 +195,13 @@ def make_place(folder: Path, option: str = "--out") -> None:
         check_place(folder, option)  # made by another process since
 
 
-def _make_above(path: Path, undo: ExitStack) -> None:
-    """Make the folders above a path; `undo` removes those of them that were made here."""
-    missing = [parent for parent in path.parents if not parent.is_dir()]
-    for folder in reversed(missing):
-        try:
-            folder.mkdir()
-        except FileExistsError:  # as "a/..", or by somebody else since
-            continue
-        undo.callback(_remove_if_empty, folder)
-
-
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
 
 
 @contextmanager
-def new_file(path: Path, option: str = "--out", mode: int = 0o666) -> Iterator[BinaryIO]:
+def new_file(path: Path, option: str = "`out`", mode: int = 0o666) -> Iterator[BinaryIO]:
     """Give a new file to write, readable as `mode` says; it is at `path` in the end, or nowhere.
 
     Raises `UserError` where something is at `path` or it cannot be written.
@@ -257,7 +248,7 @@ def _temporary(path: Path, mode: int = 0o666) -> Iterator[tuple[Path, BinaryIO]]
             new.unlink(missing_ok=True)
 
 
-def write_new(path: Path, content: bytes, option: str = "--out") -> None:
+def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
     """Write a new file; `UserError` where something is there or it cannot be written."""
     with new_file(path, option) as file:
         file.write(content)
@@ -275,7 +266,8 @@ def check_ours(path: Path, keys: Iterable[str] = ()) -> None:
             with path.open("rb") as file:
                 ours = GENERATOR in file.read(HEAD_BYTES)
         elif path.suffix in (".json", ".jsonl"):
-            ours = _is_like(path.read_bytes(), path.suffix, set(keys))
+            found, expected = _keys(path.read_bytes(), path.suffix), set(keys)
+            ours = len(found & expected) > len(found ^ expected)
         else:
             return
     except FileNotFoundError:
@@ -284,11 +276,6 @@ def check_ours(path: Path, keys: Iterable[str] = ()) -> None:
         raise cannot_write(path, error) from error
     if not ours:
         raise UserError(f"{path} is not of our making and is not replaced: move it away")
-
-
-def _is_like(content: bytes, suffix: str, keys: set[str]) -> bool:
-    found = _keys(content, suffix)
-    return len(found & keys) > len(found ^ keys)
 
 
 def _keys(content: bytes, suffix: str) -> set[str]:
@@ -308,9 +295,7 @@ def replace_own(path: Path, content: bytes) -> None:
     check_ours(path, _keys(content, path.suffix))
     try:
         with _temporary(path) as (new, file):
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
+            _sync(file, content)
             new.replace(path)
         sync_folder(path.parent)
     except OSError as error:
@@ -326,9 +311,7 @@ def add_to(path: Path, content: bytes, *, new: bool) -> None:
     try:
         descriptor = os.open(path, flags, 0o666)
         with os.fdopen(descriptor, "ab") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(descriptor)
+            _sync(file, content)
     except OSError as error:
         raise cannot_write(path, error) from error
 
@@ -345,7 +328,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def dated(what: str) -> Path:
-    """Return where something goes that nobody gave a name to; `what` becomes part of its name."""
+    """Return a dated name below `runs/`, of which `what` becomes a part."""
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
     return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
 
@@ -379,9 +362,9 @@ def link_latest(folder: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:
-    """Return what to say when something could not be written."""
+    """Return the error for a path that cannot be written."""
     return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
-def _exists(path: Path, option: str = "--out") -> TakenError:
+def _exists(path: Path, option: str = "`out`") -> TakenError:
     return TakenError(f"{path} exists: choose another name with {option}, or remove it first")

@@ -20,14 +20,14 @@ EXHAUSTED: Final = {
     errno.EMFILE: "too many files are open: raise the limit (`ulimit -n`)",
     errno.ENFILE: "too many files are open in the whole system: close some of its programs",
     errno.EAGAIN: "the system starts no more processes or threads: raise the limit (`ulimit -u`)",
-    errno.ENOMEM: "the memory is full: take fewer --workers, or raise the limit (`ulimit -v`)",
+    errno.ENOMEM: "the memory is full: take fewer `workers`, or raise the limit (`ulimit -v`)",
     errno.EFBIG: "a file would be larger than the limit allows: raise it (`ulimit -f`)",
-    errno.ENOSPC: "the disk is full: make room, or take another folder with --out and TMPDIR",
+    errno.ENOSPC: "the disk is full: make room, or take another folder with `out` and TMPDIR",
     errno.EDQUOT: "the quota of the disk is used up: make room, or take another folder",
-    errno.EROFS: "the disk is read-only: take another folder with --out and TMPDIR",
+    errno.EROFS: "the disk is read-only: take another folder with `out` and TMPDIR",
     errno.EIO: "a disk or a terminal failed: try it again",
 }
-"""What to do where the system refuses more, by its error."""
+"""Advice where the system refuses more, by its error."""
 
 
 def check_limits() -> None:
@@ -36,7 +36,15 @@ def check_limits() -> None:
     OpenBLAS starts a thread for each core when NumPy is imported, and ends the process where that
     fails.
     """
-    _check_address_space()
+    with suppress(ImportError):  # Windows
+        import resource
+
+        most, _ = resource.getrlimit(resource.RLIMIT_AS)
+        if most != resource.RLIM_INFINITY and most < ADDRESS_SPACE_GIB * 2**30:
+            raise UserError(
+                f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: it takes "
+                f"{ADDRESS_SPACE_GIB:g} GiB or more"
+            )
     check_threads((os.cpu_count() or 1) + OWN_THREADS)
 
 
@@ -63,30 +71,16 @@ def check_threads(count: int) -> None:
 
 def lower_limits(**most: int) -> None:
     """Let something run out in this process before it runs out for everybody: `RLIMIT_DATA=...`."""
-    try:
+    with suppress(ImportError):  # Windows
         import resource
-    except ImportError:  # Windows
-        return
-    for name, limit in most.items():
-        with suppress(ValueError, OSError):  # a limit of the system may be lower
-            resource.setrlimit(getattr(resource, name), (limit, limit))
 
-
-def _check_address_space() -> None:
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if most != resource.RLIM_INFINITY and most < ADDRESS_SPACE_GIB * 2**30:
-        raise UserError(
-            f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: it takes "
-            f"{ADDRESS_SPACE_GIB:g} GiB or more"
-        )
+        for name, limit in most.items():
+            with suppress(ValueError, OSError):  # a limit of the system may be lower
+                resource.setrlimit(getattr(resource, name), (limit, limit))
 
 
 def exhausted(error: BaseException) -> str | None:
-    """Return what to do about an error of the system that is no fault of the program, or None."""
+    """Return advice on an error of the system that is no fault of the program, or None."""
     if isinstance(error, OSError) and error.errno in EXHAUSTED:
         where = f"{error.filename}: " if isinstance(error.filename, str) else ""
         return where + EXHAUSTED[error.errno]

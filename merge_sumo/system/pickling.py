@@ -22,9 +22,8 @@ def quickly_pickled(cls: type[T]) -> type[T]:
         for set_value, value in zip(setters, values, strict=True):
             set_value(self, value)
 
-    def get_state(self: T) -> tuple[Any, ...]:
-        values: tuple[Any, ...] = state(self)
-        return values
+    def get_state(self: T) -> Any:
+        return state(self)
 
     cls.__getstate__ = get_state  # type: ignore[assignment]
     cls.__setstate__ = set_state  # type: ignore[attr-defined]

@@ -24,7 +24,7 @@ class Pulse:
         self._pauses = 0
 
     def pauses(self) -> int:
-        """Return how often this process was stopped so far."""
+        """Return the number of pauses so far."""
         return self._pauses + (monotonic() - self._last_s > PAUSE_S)
 
     def __enter__(self) -> Self:

@@ -56,7 +56,7 @@ _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(
 
 
 class RecordError(UserError):
-    """What is read is no record of its type."""
+    """Something that is read and is no record of its type."""
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,7 +69,7 @@ def record_type(name: str, fields: Sequence[tuple[Any, ...]]) -> Any:
 
 
 def decode(content: bytes | str, kind: Any = Any) -> Any:
-    """Return what JSON says as a value of a type; `RecordError` where it is none."""
+    """Return JSON as a value of a type; `RecordError` where it is none."""
     try:
         return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
@@ -82,7 +82,7 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
 
 
 def read_record(path: Path, kind: type[T]) -> T | None:
-    """Return what a JSON file says as a value of a type; None without the file.
+    """Return a JSON file as a value of a type; None without the file.
 
     Raises `UserError` for a file that is not as it was written.
     """
@@ -203,7 +203,7 @@ def replaced(value: T, **changes: Any) -> T:
 
 
 def in_words(hint: Any) -> str:
-    """Return what a field of a type may hold, for "it must be ..."."""
+    """Return the values of a type in words, for "it must be ..."."""
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         meta: Meta = parts[1]
@@ -233,13 +233,16 @@ def _unknown(name: object, kind: Any) -> str:
 
 
 def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
-    """Return what is wrong in a record: the field, what it holds, and what it must be."""
+    """Return a sentence on a record: the field, its value, and what it must be."""
     message = str(error)
     place = re.search(r" - at `\$([^`]*)`$", message)
     names = re.findall(r"\.(\w+)", place[1]) if place else []
     for name in names:
         table = record if isinstance(record, dict) else {}
-        kind, record = _type_of(name, table, kind), table.get(name)
+        # The type of a field, or the tags that tell records of a union apart.
+        tags = tuple(_tag(known) for known in get_args(kind) if _is_record(known))
+        kind = _hints(_class_of(table, kind)).get(name, Literal[tags])
+        record = table.get(name)
     name = names[-1] if names else "it"
     wrong = _NAMED.match(message)
     if wrong and wrong[1] == "missing required":
@@ -247,12 +250,6 @@ def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
     if wrong:
         return _unknown(wrong[2], _class_of(record, kind))
     return _not_a_value(name, record, kind, message)
-
-
-def _type_of(name: str, table: dict[str, Any], hint: Any) -> Any:
-    """Return the type of a field, or the tags that tell records of a union apart."""
-    tags = tuple(_tag(known) for known in get_args(hint) if _is_record(known))
-    return _hints(_class_of(table, hint)).get(name, Literal[tags])
 
 
 def _class_of(table: dict[str, Any], hint: Any) -> Any:

@@ -134,7 +134,10 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
-    """Return the installed entry points of a group, by name and then by package."""
+    """Return the installed entry points of a group, by name and then by package.
+
+    Nothing is imported, and nothing in the working folder, where lies what somebody sent, is found.
+    """
     with suppress(OSError):  # the working folder may be gone
         return _installed(group, tuple(sys.path), os.getcwd())  # noqa: PTH109
     return {}
@@ -144,14 +147,6 @@ def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
 def _installed(
     group: str, folders: tuple[str, ...], working_folder: str
 ) -> dict[str, dict[str, EntryPoint]]:
-    """Return the entry points of a group, by name and then by package; nothing is imported.
-
-    Args:
-        group: group of entry points.
-        folders: folders in which packages are installed; those that are the working folder, in
-            which lies what somebody sent, are left out.
-        working_folder: absolute path of the working folder.
-    """
     here = os.path.realpath(working_folder)
     searched = [folder for folder in folders if folder and os.path.realpath(folder) != here]
     entries: dict[str, dict[str, EntryPoint]] = {}

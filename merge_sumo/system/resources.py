@@ -17,7 +17,7 @@ def resource(name: str) -> Path:
 
 
 def cache_folder() -> Path:
-    """Return where what is kept for the user is: MERGE_SUMO_CACHE, or the user's cache folder."""
+    """Return the folder of the cache: MERGE_SUMO_CACHE, or the user's cache folder."""
     named = os.environ.get("MERGE_SUMO_CACHE")
     if named:
         return Path(named)

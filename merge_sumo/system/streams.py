@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 from io import BufferedWriter, FileIO, TextIOWrapper
-from typing import TYPE_CHECKING, Final, NoReturn
+from typing import TYPE_CHECKING, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
@@ -43,15 +43,13 @@ class _Output(FileIO):
             except OSError as error:
                 self._failed = True
                 if self.fileno() == STDOUT:
-                    _result_lost(error)
+                    if error.errno == errno.EPIPE and hasattr(signal, "SIGPIPE"):
+                        # The reader has gone: it ends as other programs do.
+                        raise Stopped(signal.SIGPIPE) from None
+                    raise UserError(
+                        f"cannot write the result to standard output: {error.strerror}"
+                    ) from error
         return memoryview(content).nbytes
-
-
-def _result_lost(error: OSError) -> NoReturn:
-    """Raise `UserError`, or `Stopped` where the reader has gone, as for other programs."""
-    if error.errno == errno.EPIPE and hasattr(signal, "SIGPIPE"):
-        raise Stopped(signal.SIGPIPE)
-    raise UserError(f"cannot write the result to standard output: {error.strerror}") from error
 
 
 def prepare_streams() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import stat
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -41,10 +42,7 @@ def check_private(folder: Path) -> None:
 
 
 def _written_by_others(path: Path, *, of_root: bool = True) -> str | None:
-    """Return who else may write a file or a folder, in a clause; None for nobody.
-
-    Where nothing is, there is nothing to be said; root may write anything.
-    """
+    """Return a clause on others who may write a file or a folder, besides root, or None."""
     if sys.platform == "win32":  # the folders of a profile are the user's there
         return None
     try:
@@ -52,7 +50,12 @@ def _written_by_others(path: Path, *, of_root: bool = True) -> str | None:
     except OSError:
         return None
     if found.st_uid not in {os.geteuid(), *([0] if of_root else [])}:
-        return f"{printable(str(path))} belongs to {_name_of(found.st_uid)}"
+        import pwd
+
+        owner = f"the user {found.st_uid}"
+        with suppress(KeyError):
+            owner = pwd.getpwuid(found.st_uid).pw_name
+        return f"{printable(str(path))} belongs to {owner}"
     sticky = of_root and stat.S_ISDIR(found.st_mode) and found.st_mode & stat.S_ISVTX
     return f"others can write {printable(str(path))}" if _others_can(found) and not sticky else None
 
@@ -75,12 +78,3 @@ def _others_can(found: os.stat_result) -> bool:
         return True
     is_own = group.gr_name == owner.pw_name and group.gr_gid == owner.pw_gid
     return not is_own or bool(set(group.gr_mem) - {owner.pw_name})
-
-
-def _name_of(user: int) -> str:
-    import pwd
-
-    try:
-        return pwd.getpwuid(user).pw_name
-    except KeyError:
-        return f"the user {user}"

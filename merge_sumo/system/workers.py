@@ -1,4 +1,4 @@
-"""Where work is done: in this process, in worker processes, or on a cluster.
+"""Workers: this process, worker processes, or a cluster.
 
 What is above submits chunks of its items to a standard `concurrent.futures.Executor` and never
 sees which one. A worker that dies takes nothing with it: its chunks run again.
@@ -30,7 +30,6 @@ from concurrent.futures import (
 from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from multiprocessing.synchronize import Semaphore
 from numbers import Integral
@@ -120,11 +119,11 @@ class Workers(AbstractContextManager["Workers"]):
 
     @property
     def here(self) -> bool:
-        """Whether the work is done in this process, by now."""
+        """True as long as the work is done in this process."""
         return isinstance(self._executor, InProcess)
 
     def chunk_size(self, items: int) -> int:
-        """Return how many of so many items a worker takes at a time."""
+        """Return the number of items that a worker takes at a time."""
         share = math.ceil(items / self.count)
         if self._here_s is not None:
             # As many as there is time for here.
@@ -370,8 +369,13 @@ class LocalProcesses(ProcessPoolExecutor):
         """Submit; workers that are started here, now or later, never see SIGINT."""
         with _sigint_blocked(), without_main(), without_cwd():
             future = super().submit(fn, *args, **kwargs)
-        # The thread that ends a broken pool would die of a future that was cancelled.
-        future.set_exception = partial(_fail, future)  # type: ignore[method-assign]
+
+        def fail(exception: BaseException | None) -> None:
+            # The thread that ends a broken pool would die of a future that was cancelled.
+            with suppress(InvalidStateError):
+                Future.set_exception(future, exception)
+
+        future.set_exception = fail  # type: ignore[method-assign]
         return future
 
     def __exit__(self, *exception: Any) -> bool | None:
@@ -394,12 +398,6 @@ class LocalProcesses(ProcessPoolExecutor):
         queue: Any = getattr(self, "_call_queue", None)
         if queue is not None:
             queue._reader.close()
-
-
-def _fail(future: Future[Any], error: BaseException | None) -> None:
-    """Have a future fail, unless it is cancelled."""
-    with suppress(InvalidStateError):
-        Future.set_exception(future, error)
 
 
 _endings: list[Callable[[], None]] = []
@@ -439,15 +437,14 @@ def _begin_worker(cores: Semaphore, preload: str | None, scratch: str) -> None:
 def leave_signals_to_parent() -> None:
     """Leave Ctrl-C to the parent of this process, and end with it however it ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent is gone, even if that was killed."""
     parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+
+    def end_with_parent() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 @contextmanager

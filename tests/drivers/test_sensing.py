@@ -253,12 +253,12 @@ class TestSettings:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
-            ("delay=1", "--sense: 'delay' is unknown: did you mean delay_s?"),
-            ("delay_s=x", "--sense: delay_s is 'x': give a number, or a range as 0..0.5"),
-            ("", "--sense is empty: give NAME=NUMBER, with a name of delay_s, "),
-            ("delay_s=1,delay_s=2", "--sense: delay_s is given twice"),
-            ("delay_s=9", "--sense: delay_s is 9: choose 0 to 5"),
-            ("delay_s=0.5..0.2", "--sense: delay_s is 0.5..0.2: the first number of a range must"),
+            ("delay=1", "`sense`: 'delay' is unknown: did you mean delay_s?"),
+            ("delay_s=x", "`sense`: delay_s is 'x': give a number, or a range as 0..0.5"),
+            ("", "`sense` is empty: give NAME=NUMBER, with a name of delay_s, "),
+            ("delay_s=1,delay_s=2", "`sense`: delay_s is given twice"),
+            ("delay_s=9", "`sense`: delay_s is 9: choose 0 to 5"),
+            ("delay_s=0.5..0.2", "`sense`: delay_s is 0.5..0.2: the first number of a range must"),
         ],
     )
     def test_that_make_no_sensors_are_refused_in_a_sentence(self, text, said):
@@ -267,7 +267,7 @@ class TestSettings:
         assert str(error.value).startswith(said)
 
     def test_of_a_range_need_a_number_in_a_case(self):
-        with pytest.raises(UserError, match="sense_delay_s=NUMBER is missing"):
+        with pytest.raises(UserError, match="sense_delay_s, which `at` gives, is missing"):
             ms.run("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
-        with pytest.raises(UserError, match="sense_delay_s=NUMBER is none of the coordinates"):
+        with pytest.raises(UserError, match="sense_delay_s, which `at` gives, is none of"):
             ms.run("design2", {"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)

@@ -218,7 +218,7 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
 
 def test_nothing_that_is_there_is_overwritten(campaigns, tmp_path):
     (tmp_path / "out").mkdir()
-    with pytest.raises(UserError, match="exists: choose another name with --out"):
+    with pytest.raises(UserError, match="exists: choose another name with `out`"):
         repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", **FEW)
     with pytest.raises(UserError, match="cannot be read"):
         repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", resume=True, **FEW)
