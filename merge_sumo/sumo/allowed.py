@@ -1,6 +1,6 @@
-"""What is allowed of the XML of a road, a replay and a record: elements, attributes and values.
+"""The elements, attributes and values that are allowed in the XML of roads, replays and records.
 
-What is not here, no scenario needs.
+No scenario needs others.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ SURROUNDINGS: Final = {
         },
     )
 }
-"""What is drawn beside the road."""
+"""Shapes beside the road."""
 
 _LABEL = matching(
     r"(?:[A-Za-z0-9_ ,:+\-]|(?<=[0-9])\.(?=[0-9])|(?<=m)/(?=s)){0,250}",
@@ -220,7 +220,7 @@ LABELS: Final = {
         },
     )
 }
-"""What is written beside the road."""
+"""Texts beside the road."""
 
 _MOTION: Final = {"id": _WHO, "x": _PLACE, "y": _PLACE, "pos": _METRES, "speed": _SPEED}
 _RECORDED: Final = {
@@ -249,4 +249,4 @@ def _fcd(vehicle: Mapping[str, Values]) -> Mapping[str, Allowed]:
 RECORD: Final = _fcd(_RECORDED)
 """The record that SUMO plays."""
 REPLAYED: Final = _fcd(_MOTION)
-"""What SUMO writes of a replay, where only motion is compared."""
+"""SUMO's own record of a replay, of which only motion is compared."""

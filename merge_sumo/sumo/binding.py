@@ -141,8 +141,8 @@ def ending_with_us(command: Sequence[str]) -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
-    """How a program ended: its exit code, and why where that is not 0."""
+class ProgramEnd:
+    """The end of a program: its exit code, and a reason where that is not 0."""
 
     code: int
     reason: str
@@ -150,7 +150,7 @@ class Ended:
 
 def run_program(
     name: str, arguments: Sequence[str], folder: Path, limit_s: float | None = PROGRAM_LIMIT_S
-) -> Ended:
+) -> ProgramEnd:
     """Run a SUMO program in a folder of ours, and kill it and what it started after `limit_s`.
 
     What SUMO takes from the environment is that of the installation. Without a limit, what the
@@ -173,12 +173,13 @@ def run_program(
         except BaseException as error:
             _kill(process)
             if isinstance(error, subprocess.TimeoutExpired):
-                return Ended(-1, f"it did not end within {limit_s:g} s")
+                return ProgramEnd(-1, f"it did not end within {limit_s:g} s")
             raise
     reason = ((said or "").strip() or "no message").splitlines()[0]
     if process.returncode == LOADER_FAILED:
         raise _library_missing(name, reason.rpartition("libraries: ")[2])
-    return Ended(process.returncode, reason.removeprefix("Error: ") if process.returncode else "")
+    said = reason.removeprefix("Error: ") if process.returncode else ""
+    return ProgramEnd(process.returncode, said)
 
 
 def _kill(process: subprocess.Popen[str]) -> None:

@@ -178,7 +178,7 @@ class SumoChild:
         return ""
 
     def _death(self) -> ChildDiedError:
-        """Return how it ended."""
+        """Return its end as an error."""
         with suppress(subprocess.TimeoutExpired):
             code = self.process.wait(2.0)
             if code < 0:

@@ -21,7 +21,7 @@ ROAD: Final = "road.xodr"
 ENTRY: Final = "entry"
 """OpenDRIVE's type of an acceleration lane."""
 SAME_M: Final = 0.5
-"""Where a lane ends in SUMO and in OpenDRIVE may be this far apart."""
+"""Distance of the ends of one lane in SUMO and in OpenDRIVE, at most."""
 MAX_ELEMENTS: Final = 10**6
 """Of the net of a corridor, which a user chose: that of a city."""
 
@@ -31,8 +31,15 @@ def opendrive(road: Corridor) -> bytes:
 
     Raises `UserError` when the net file is gone or is another one now, or netconvert refuses it.
     """
+    limit = received.MAX_NET_BYTES
+    content = received.read_bytes(road.path, "the net", follow_links=True, limit=limit)
+    if hashlib.sha256(content).hexdigest() != road.sha256:
+        raise UserError(
+            f"the net {road.path} is not the one that was driven in: it changed; put that one there"
+        )
+    net = received.cleaned(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
     with scratch_folder() as stage:
-        (stage / NET).write_bytes(_net_of(road))
+        (stage / NET).write_bytes(net)
         arguments = [
             *("--sumo-net-file", NET, "--opendrive-output", ROAD),
             *("--offset.disable-normalization", "true"),
@@ -44,17 +51,6 @@ def opendrive(road: Corridor) -> bytes:
         if ended.code == 0 and (stage / ROAD).is_file():
             return _with_paths((stage / ROAD).read_bytes(), road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")
-
-
-def _net_of(road: Corridor) -> bytes:
-    """Return what netconvert may see of the net file of a road."""
-    limit = received.MAX_NET_BYTES
-    content = received.read_bytes(road.path, "the net", follow_links=True, limit=limit)
-    if hashlib.sha256(content).hexdigest() != road.sha256:
-        raise UserError(
-            f"the net {road.path} is not the one that was driven in: it changed; put that one there"
-        )
-    return received.cleaned(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
 
 
 _Place = tuple[float, float]
@@ -112,19 +108,15 @@ def _joined(
     source, target = (roads.get(str(link.get("elementId"))) for link in (before, after))
     for lane in element.iterfind("lanes/laneSection/right/lane"):
         ends = lane.find("link/predecessor"), lane.find("link/successor")
-        if (
-            source is not None
-            and target is not None
-            and ends[0] is not None
-            and ends[1] is not None
-        ):
-            begin = _end_of_lane(source, int(ends[0].get("id", "")), last=True)
-            end = _end_of_lane(target, int(ends[1].get("id", "")), last=False)
-            yield int(lane.get("id", "")), begin, end
+        if source is None or target is None or ends[0] is None or ends[1] is None:
+            continue
+        begin = _end_of_lane(source, int(ends[0].get("id", "")), last=True)
+        end = _end_of_lane(target, int(ends[1].get("id", "")), last=False)
+        yield int(lane.get("id", "")), begin, end
 
 
 def _end_of_lane(element: etree._Element, lane: int, *, last: bool) -> _Place:
-    """Return where the centre of a lane of a road of straight lines begins or ends."""
+    """Return begin or end of the centre of a lane of a road of straight lines."""
     line = element.findall("planView/geometry")[-1 if last else 0]
     x, y, heading, length_m = (float(line.get(name, "")) for name in ("x", "y", "hdg", "length"))
     along_m = length_m if last else 0.0
@@ -135,7 +127,7 @@ def _end_of_lane(element: etree._Element, lane: int, *, last: bool) -> _Place:
 
 
 def _centre_m(element: etree._Element, lane: int) -> float:
-    """Return how far to the left of the reference line the centre of a lane is, without offset."""
+    """Return the distance of a lane's centre to the left of the reference line, without offset."""
     widths_m = {
         int(other.get("id", "")): float(width.get("a", ""))
         for other in element.iterfind("lanes/laneSection/right/lane")

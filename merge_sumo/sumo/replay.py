@@ -66,7 +66,7 @@ class Replay(Result):
 
     @property
     def identical(self) -> bool:
-        """Whether no row differs."""
+        """True where no row differs."""
         return self.diverged_at_s is None
 
     def lines(self) -> list[str]:
@@ -109,7 +109,7 @@ class _OnPath(NamedTuple):
     """Lane coordinate on it."""
 
     def is_at(self, x: float, y: float) -> bool:
-        """Return whether a point in the plane is this one."""
+        """Whether a point in the plane is this one."""
         lane = self.path.point(self.x_m)
         return math.hypot(x - lane.x_m, y - lane.y_m) <= LANE_END_M
 
@@ -120,7 +120,7 @@ Places = dict[tuple[float, str], _OnPath | None]
 
 @dataclass(frozen=True, slots=True)
 class _Episode:
-    """What is allowed of a received folder."""
+    """The allowed content of a received folder."""
 
     road: Road
     types: etree._Element
@@ -222,7 +222,7 @@ def _difference(episode: _Episode, replayed: Rows) -> tuple[float, str] | None:
 
 
 def _is_told(x_m: float, path: LanePath) -> bool:
-    """Return whether a replay tells the position on the lane; elsewhere x and y tell.
+    """Whether a replay tells the position on the lane; elsewhere x and y tell.
 
     SUMO keeps a vehicle a millimetre before the end of a lane, and where lanes overlap inside of a
     junction it may take the one before.
@@ -258,7 +258,7 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
 
 
 def _places(record: etree._Element, road: Corridor) -> Places:
-    """Return where the vehicles are in the rows of a record that was checked.
+    """Return the places of the vehicles in the rows of a record that was checked.
 
     The VUT has the lanes of the ramp, and that of the mainline beside an acceleration lane.
     """

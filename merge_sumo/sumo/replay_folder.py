@@ -27,7 +27,6 @@ from merge_sumo.road.netfile import NetFile, Point
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
 from merge_sumo.system.records import to_json
-from merge_sumo.values.case import Case
 from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Outcome
@@ -61,14 +60,12 @@ SMALLEST_M: Final = 100.0
 SEEN_BESIDE: Final = 1.15
 """The same with an acceleration lane, where cars are drawn smaller."""
 EXAGGERATED: Final = 1.0 / 175.0
-"""How much larger cars are drawn than they are, for a metre of the picture's width."""
+"""Enlargement of the cars for a metre of the picture's width."""
 MOST_BESIDE: Final = 1.7
 """At most, with an acceleration lane: cars side by side do not look as if they touched."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
-SURROUNDINGS_COLOUR: Final = "0.70,0.70,0.68"
-LANE_WIDTH_M: Final = 3.2
 MAX_SURROUNDINGS: Final = 2_000
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
@@ -89,7 +86,7 @@ LINES: Final = (0.45, 0.40)
 LEGEND: Final = 0.36
 """Height of the dots."""
 RAISED: Final = 0.022
-"""How much higher than its place a text is drawn, as a share of the picture's height."""
+"""Height at which a text is drawn above its place, as a share of the picture's height."""
 LETTER: Final = 0.0065
 """Width of a letter, as a share of the picture's width."""
 DOT: Final = 0.012
@@ -100,7 +97,7 @@ APART: Final = 0.13
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """What sumo-gui shows at first: its zoom, its middle, and how much of the road that is."""
+    """The first picture of sumo-gui: its zoom, its middle, and its size on the road."""
 
     exaggeration: str
     zoom: str
@@ -109,7 +106,7 @@ class Picture:
     width_m: float
     height_m: float
     borders: bool = False
-    """Whether lines are drawn between lanes."""
+    """True for lines between lanes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,21 +249,13 @@ def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
             root,
             "poly",
             id=f"lane{number}",
-            color=SURROUNDINGS_COLOUR,
+            color="0.70,0.70,0.68",
             fill="0",
             layer="-1",
-            # To either side.
-            lineWidth=f"{LANE_WIDTH_M / 2.0}",
+            lineWidth="1.6",  # to either side
             shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
         )
     return root
-
-
-def _picture(road: Road, record: etree._Element) -> Picture:
-    """Return what the window shows at first."""
-    if road.surroundings is None:
-        return Picture("4", "440", -110.0, -20.0, WHOLE_WIDTH_M, WHOLE_WIDTH_M * SHAPE)
-    return _picture_of(road.corridor, record)
 
 
 def _view(picture: Picture) -> etree._Element:
@@ -293,11 +282,11 @@ def _view(picture: Picture) -> etree._Element:
     return root
 
 
-def _picture_of(road: Corridor, record: etree._Element) -> Picture:
-    """Return a picture of where the cars drove, and how they are enlarged in it.
-
-    At a zoom of 100 the picture has the whole net.
-    """
+def _picture(shown: Road, record: etree._Element) -> Picture:
+    """Return a picture of the way of the cars; at a zoom of 100 it has the whole net."""
+    if shown.surroundings is None:
+        return Picture("4", "440", -110.0, -20.0, WHOLE_WIDTH_M, WHOLE_WIDTH_M * SHAPE)
+    road = shown.corridor
     paths = (road.mainline, road.ramp)
     net = [point[:2] for path in paths for piece in path.pieces for point in piece.shape]
     cars = [(float(car.get("x", "0")), float(car.get("y", "0"))) for car in record.iter("vehicle")]
@@ -350,23 +339,7 @@ def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Ele
 def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
     """Return the labels of an episode as an additional file."""
     root = etree.Element("additional")
-    lines = (case_line(outcome.case, outcome.index), verdict_line(outcome))
-    for number, (line, height) in enumerate(zip(lines, LINES, strict=True)):
-        at = picture.x_m, picture.y_m + height * picture.height_m
-        _label(root, f"line{number}", at, line)
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
-    dot_m, apart_m = DOT * picture.width_m, APART * picture.width_m
-    y = picture.y_m + LEGEND * picture.height_m
-    for place, name in enumerate(cars):
-        x = picture.x_m + (place - (len(cars) - 0.5) / 2.0) * apart_m
-        _label(root, name, (x, y), "", COLOURS[name], dot_m)
-        middle = x + (DOT + 0.5 * LETTER * len(NAMES[name])) * picture.width_m
-        _label(root, f"{name}-name", (middle, y - RAISED * picture.height_m), NAMES[name])
-    return root
-
-
-def case_line(case: Case, index: int | None = None) -> str:
-    """Return which case it is, with its index where it has one."""
+    case, found = outcome.case, outcome.measures
     notation = case.scenario.notation.items()
     values = ((getattr(case, field), written) for field, written in notation)
     parts = [
@@ -374,18 +347,26 @@ def case_line(case: Case, index: int | None = None) -> str:
         for value, written in values
         if value is not None
     ]
-    named = "" if index is None else f"case {index}, "
-    return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
-
-
-def verdict_line(outcome: Outcome) -> str:
-    """Return what became of it."""
-    found = outcome.measures
     severity = "" if found.severity is None else f"{found.severity}, "
     failed = "fails" if outcome.failed else "does not fail"
     end = found.end.value.replace("_", " ").lower()
     place = "" if found.lane_share is None else f", at {found.lane_share:.2f} of the lane"
-    return f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}"
+    lines = (
+        f"case {outcome.index}, POV level {level_name(case.level)}: {', '.join(parts)}",
+        f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}",
+    )
+    for number, (line, height) in enumerate(zip(lines, LINES, strict=True)):
+        at = picture.x_m, picture.y_m + height * picture.height_m
+        _label(root, f"line{number}", at, line)
+    cars = VEHICLES[: case.scenario.vehicles]
+    dot_m, apart_m = DOT * picture.width_m, APART * picture.width_m
+    y = picture.y_m + LEGEND * picture.height_m
+    for row, name in enumerate(cars):
+        x = picture.x_m + (row - (len(cars) - 0.5) / 2.0) * apart_m
+        _label(root, name, (x, y), "", COLOURS[name], dot_m)
+        middle = x + (DOT + 0.5 * LETTER * len(NAMES[name])) * picture.width_m
+        _label(root, f"{name}-name", (middle, y - RAISED * picture.height_m), NAMES[name])
+    return root
 
 
 def _label(

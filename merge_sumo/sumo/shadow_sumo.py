@@ -29,7 +29,7 @@ COMMANDED_VUT: Final = 38
 COLOURS: Final = (230, 64, 38, 255), (26, 89, 230, 255)
 """Of the cars of the mainline, and of the VUT."""
 FASTEST_MPS: Final = 45.0
-"""What a car can drive wherever the road allows less; the limit of the shipped road."""
+"""Speed that a car can drive wherever the road allows less; the limit of the shipped road."""
 WIDTH_M: Final = 1.8
 HEIGHT_M: Final = 1.5
 NAME_OF_VUT: Final = VEHICLES[VUT]
@@ -41,7 +41,7 @@ State = tuple[float, float, float]
 
 
 class _Setup(msgspec.Struct, frozen=True):
-    """What a shadow SUMO needs to know besides its net."""
+    """The input of a shadow SUMO besides its net."""
 
     road: Corridor
     names: tuple[str, ...]
@@ -89,7 +89,7 @@ class ShadowSumo:
 
     @property
     def has_lane(self) -> bool:
-        """Whether the scenario has an acceleration lane."""
+        """True where the scenario has an acceleration lane."""
         return self.road.lane_m is not None
 
     @property
@@ -118,7 +118,7 @@ class ShadowSumo:
         self.at_m = {}
 
     def call(self, function: str, *arguments: Any) -> Any:
-        """Return what libsumo's function says, named as "vehicle.getSpeed".
+        """Call a function of libsumo, named as "vehicle.getSpeed".
 
         Raises `RefusedError` where SUMO refuses, or has no such function of these arguments.
         """
@@ -199,7 +199,7 @@ class ShadowSumo:
         self.at_m = {}
 
     def point(self, name: str) -> LanePoint:
-        """Return where a vehicle is; SUMO's own answer is that before it was put there."""
+        """Return the place of a vehicle; SUMO's own answer is that before it was put there."""
         return self.path(name).point(self.at_m[name])
 
     def _change_lanes(self) -> list[str]:
@@ -223,7 +223,7 @@ class ShadowSumo:
         return moved
 
     def _start(self, name: str, state: State) -> dict[str, str]:
-        """Return where a vehicle departs; it can do so on the first edge of its route only."""
+        """Return the departure of a vehicle, which must be on the first edge of its route."""
         path = self.path(name)
         point = path.point(state[0])
         edge, lane = _edge_of(point.lane), point.lane.rpartition("_")[2]

@@ -1,4 +1,4 @@
-"""What TraCI's commands are called, from SUMO's own client: (command, variable) to functions.
+"""Names of TraCI's commands, from SUMO's own client: (command, variable) to functions.
 
 Every function of the client's domains is called once with a connection that only notes what it
 would send.
@@ -115,7 +115,7 @@ def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
 
 
 def name_of(command: int, variable: int | None = None) -> str:
-    """Return what a command is called, on a variable if it is on one."""
+    """Return the name of a command, on a variable if it is on one."""
     if variable is not None and (command, variable) in named():
         return named()[command, variable].name
     constants = vars(load_traci().constants)

@@ -48,7 +48,7 @@ from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 PARKING_M: Final = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
 EXACT_M: Final = 1e-9
-"""What SUMO may differ from eq. (4) in a step; more on one lane is a position on another lane."""
+"""Largest difference of SUMO from eq. (4) in a step; more is a position on another lane."""
 MAX_SPEED_MPS: Final = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
 
@@ -344,7 +344,7 @@ class World:
         return self._start_m_of_lane.get(self._get_lane(name), math.nan)
 
     def _of_all(self, get: Callable[[str], float]) -> FloatArray:
-        """Return what SUMO says of all vehicles, (A, corridors)."""
+        """Return a value of SUMO for all vehicles, (A, corridors)."""
         return np.fromiter(map(get, self._ids), float, len(self._ids)).reshape(self.x_m.shape)
 
     def acceleration_mps2(self) -> FloatArray:
@@ -377,20 +377,16 @@ def _types(
         (OWN_CAR, scenario.pov_length_m, car_type),
     ):
         if model is not None:
-            careful = _careful(scenario, length_m)
+            # A driver who knows the limits and wants the level-0 speed.
+            careful = {
+                "length": repr(length_m),
+                "maxSpeed": repr(scenario.level0_v_mps),
+                "accel": repr(scenario.a_max_mps2),
+                "decel": repr(-scenario.a_min_mps2),
+                "emergencyDecel": repr(-scenario.a_min_mps2),
+            }
             etree.SubElement(root, "vType", {"id": name, **careful, **model})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
-
-
-def _careful(scenario: Scenario, length_m: float) -> dict[str, str]:
-    """Return the attributes of a driver who knows the limits and wants the level-0 speed."""
-    return {
-        "length": repr(length_m),
-        "maxSpeed": repr(scenario.level0_v_mps),
-        "accel": repr(scenario.a_max_mps2),
-        "decel": repr(-scenario.a_min_mps2),
-        "emergencyDecel": repr(-scenario.a_min_mps2),
-    }
 
 
 @contextmanager

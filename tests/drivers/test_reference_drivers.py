@@ -23,8 +23,6 @@ from merge_sumo.drivers.safety_models import (
     FsmModel,
     Pair,
     Reaction,
-    Reg157Model,
-    RssModel,
     rss_distance_m,
     ttc_s,
 )
@@ -81,20 +79,6 @@ class TestFormulas:
 
 
 class TestModels:
-    @pytest.mark.parametrize(("gap_m", "unsafe"), [(9.9, True), (10.1, False)])
-    def test_the_careful_driver_fears_a_time_to_collision_of_two_seconds(self, gap_m, unsafe):
-        assert CarefulModel().is_unsafe(Pair(one(gap_m), one(30), one(25))) == unsafe
-
-    @pytest.mark.parametrize(("gap_m", "unsafe"), [(5.09, True), (5.11, False)])
-    def test_reg157_waits_until_it_has_to(self, gap_m, unsafe):
-        # v_rel / 12 + 0.35 = 0.85 s at 6 m/s.
-        assert Reg157Model().is_unsafe(Pair(one(gap_m), one(30), one(24))) == unsafe
-
-    def test_rss_keeps_its_distance(self):
-        # 15 + 3 * 0.75^2 / 2 + 22.25^2 / 12 - 20^2 / 12
-        assert RssModel().is_unsafe(Pair(one(23.7), one(20), one(20)))
-        assert not RssModel().is_unsafe(Pair(one(23.9), one(20), one(20)))
-
     def test_fsm_brakes_as_far_as_the_situation_is_unsafe(self):
         # CFS 0.48 between 4 and 6 m/s2.
         assert FsmModel().demand_mps2(Pair(one(18), one(20), one(10))) == pytest.approx(4.96)
@@ -175,19 +159,6 @@ class TestRampDrivers:
     def test_who_leads_at_m_must_not_make_another_run_into_it(self, driver, dx_m, brakes):
         found = answers(started(driver), at_m(dx_m, x_vut_m=-112.0), 14)[-1]
         assert (found < 0.0) == brakes
-
-    def test_corridors_do_not_know_of_each_other(self):
-        pair = FsmVut(2)
-        for corridor in (0, 1):
-            pair.begin(corridor, CASE)
-        both = [
-            np.array([a[0], b[0]])
-            for a, b in ((at_m(0.0).x_m[row], at_m(100.0).x_m[row]) for row in (0, 1))
-        ]
-        state = both[0], np.full(2, 30.0), both[1], np.full(2, 28.0)
-        seen = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), *state)
-        found = [pair.act(seen).tolist() for _ in range(12)]
-        assert found[-1] == [-4.0, 0.0]
 
 
 class TestTheCarefulPov:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from controllers import STOCK_CLIENT, program
 from plans import plan_for
-from vut_contract import factory, in_process
+from vut_contract import factory
 
 import merge_sumo as ms
 from merge_sumo.drivers.base import Driver, Scene
@@ -23,22 +23,12 @@ from merge_sumo.values.scenario import POV, US23, VUT
 
 FAR_M = -522.0
 """340 m, where a POV may start, behind -182 m, where the VUT starts."""
-LAWS = """
-import numpy as np
-def law(x_pov, v_pov, x_vut):
-    return 0.05 * (v_pov - 27.0) + 0.001 * (x_vut - x_pov)
-def each(seen):
-    return float(law(seen.x_pov_m, seen.v_pov_mps, seen.x_vut_m))
+LAW = """
 class Reset:
     def reset(self, seen):
         self.offset = 0.001 * seen.x_pov_m
     def act(self, seen):
-        return each(seen) + self.offset
-class All:
-    def __init__(self, corridors):
-        pass
-    def act_batch(self, seen):
-        return law(seen.x_pov_m, seen.v_pov_mps, seen.x_vut_m)
+        return 0.05 * (seen.v_pov_mps - 27.0) + 0.001 * (seen.x_vut_m - seen.x_pov_m) + self.offset
 """
 TRACI_LAW = (
     STOCK_CLIENT
@@ -206,23 +196,16 @@ def test_zeros_of_a_range_give_the_same_bits(vut):
 
 
 class TestEveryKindOfVut:
-    @pytest.mark.parametrize("name", ["each", "Reset", "All"])
-    def test_in_python_answers_to_the_log_of_before(self, tmp_path, name):
-        (tmp_path / "laws.py").write_text(LAWS)
-        assert_sees_late(in_process(f"{tmp_path / 'laws.py'}:{name}"))
+    """Beside those of `VutContract`."""
 
-    def test_in_a_process_of_its_own(self, tmp_path):
-        (tmp_path / "laws.py").write_text(LAWS)
-        assert_sees_late(factory(f"{tmp_path / 'laws.py'}:Reset"))
+    def test_in_python_with_a_reset(self, tmp_path):
+        (tmp_path / "law.py").write_text(LAW)
+        assert_sees_late(factory(f"{tmp_path / 'law.py'}:Reset"))
 
     @pytest.mark.slow
     def test_behind_traci(self, tmp_path):
         pytest.importorskip("traci")
         assert_sees_late(factory("traci:" + program(tmp_path, TRACI_LAW)))
-
-    @pytest.mark.parametrize("name", ["level1", "level2", "design2", "careful", "gap"])
-    def test_of_this_package(self, name):
-        assert_sees_late(factory(name))
 
     def test_but_for_those_that_see_in_sumo(self):
         with pytest.raises(UserError, match="sees other cars in SUMO itself"):

@@ -263,9 +263,9 @@ class TestAMergeFromALane:
 class TestAReplayThatIsNotTheRecord:
     """What SUMO plays is made to differ from the record that the replay is compared with."""
 
-    @pytest.mark.parametrize("by", [0.5, -0.5])
-    @pytest.mark.parametrize("column", ["x", "y", "speed"])
-    @pytest.mark.parametrize("who", ["pov", "vut"])
+    @pytest.mark.parametrize(
+        ("who", "column", "by"), [("pov", "x", 0.5), ("vut", "y", -0.5), ("vut", "speed", 0.5)]
+    )
     def test_diverges_where_a_vehicle_is_elsewhere_or_at_another_speed(
         self, folder, sumo_plays, who, column, by
     ):
