@@ -17,7 +17,7 @@ from lxml import html
 
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
-from merge_sumo.reports import report_model as report_facts
+from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.road.scenario_file import named_scenario
@@ -196,7 +196,7 @@ class TestTheMotion:
 
 class TestALongCampaign:
     def test_shows_some_cases_and_counts_the_others(self, made, monkeypatch):
-        monkeypatch.setattr(report_facts, "SHOWN", 50)
+        monkeypatch.setattr(report_model, "SHOWN", 50)
         page = report_page(made)
         data = data_of(page)
         assert len(data["cases"]["index"]) == 50
