@@ -48,15 +48,6 @@ class Trouble:
         """Number of cases."""
         return len(self.cases)
 
-    def to_record(self) -> dict[str, Any]:
-        """Return it as JSON shows it: how many cases, and the first of them."""
-        return {
-            "end": self.end.value,
-            "message": self.message,
-            "cases": self.count,
-            "example": self.cases[0],
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
@@ -124,7 +115,10 @@ class Verdict:
             "contacts": self.contacts,
             "errors": self.errors,
             "timeouts": self.timeouts,
-            "troubles": [trouble.to_record() for trouble in self.troubles],
+            "troubles": [
+                {"end": t.end, "message": t.message, "cases": t.count, "example": t.cases[0]}
+                for t in self.troubles
+            ],
         }
 
 

@@ -28,18 +28,11 @@ TINY = Scale(seeds=1, truth_cases=(100, 100, 100), batches=2, batch=6)
 
 
 @pytest.fixture(scope="module")
-def said():
-    return {}
-
-
-@pytest.fixture(scope="module")
-def tiny(tmp_path_factory, said) -> Reproduction:
+def tiny(tmp_path_factory) -> Reproduction:
     """Return what is found with very little."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("MERGE_SUMO_CACHE", str(tmp_path_factory.mktemp("cache")))
-        return reproduce(
-            TINY, on_part=lambda title, done, total, *_: said.update({title: (done, total)})
-        )
+        return reproduce(TINY)
 
 
 class TestATinyReproduction:
@@ -79,11 +72,6 @@ class TestATinyReproduction:
         found = replace(one, study=replace(one.study, dense={0: dense}))
         table = replace(tiny, columns={title: found}).lines()
         assert "| dense truth | 0.0079 |" in table
-
-    def test_says_how_far_it_is(self, tiny, said):
-        assert said["design1 v level 0"] == (5, 5)
-        assert said["design2 v level 0/1/2"] == (2, 2)
-        assert said["truth of design2 at level 2"] == (100, 100)
 
 
 def test_the_papers_table_is_the_papers():
