@@ -81,7 +81,7 @@ class Unit:
             )
         output = self._checked(variables, names.get(OUTPUT, OUTPUT))
         wish = None
-        if MERGE in names or _is_output(variables.get(MERGE)):
+        if MERGE in names or getattr(variables.get(MERGE), "causality", "") == "output":
             wish = self._checked(variables, names.get(MERGE, MERGE), (*_FLOATS, _BOOLEAN))
         self.input_places = [place for place, _ in inputs]
         self.input_references = [variable.valueReference for _, variable in inputs]
@@ -194,10 +194,6 @@ class FmuVut(PerCorridor):
         values = [seen[1 + place] for place in unit.input_places]
         write = instance.setReal if unit.version == "2" else instance.setFloat64
         write(unit.input_references, values)
-
-
-def _is_output(variable: Any) -> bool:
-    return variable is not None and variable.causality == "output"
 
 
 def _free(instance: Any) -> None:

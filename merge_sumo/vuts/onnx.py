@@ -104,17 +104,16 @@ class Network:
     def decision(self, state: tuple[float, ...], of_actions: FloatArray) -> Decision:
         """Return the acceleration, or that of the action of the highest value, and any wish."""
         output = self.run(state)
-        if output.size in (1, ACTIONS):
-            return _acceleration_mps2(output, of_actions)
-        return _acceleration_mps2(output[:-WISH], of_actions), as_merge(float(output[-WISH]))
-
-
-def _acceleration_mps2(output: np.ndarray[Any, Any], of_actions: FloatArray) -> float:
-    if output.size == 1:
-        return float(output[0])
-    if not np.isfinite(output).all():
-        return float("nan")
-    return float(of_actions[int(output.argmax())])
+        values = output if output.size in (1, ACTIONS) else output[:-WISH]
+        if values.size == 1:
+            acceleration_mps2 = float(values[0])
+        elif np.isfinite(values).all():
+            acceleration_mps2 = float(of_actions[int(values.argmax())])
+        else:
+            acceleration_mps2 = float("nan")
+        if values is output:
+            return acceleration_mps2
+        return acceleration_mps2, as_merge(float(output[-WISH]))
 
 
 class OnnxVut(PerCorridor):

@@ -10,6 +10,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from inspect import Parameter
 from types import MemberDescriptorType
@@ -23,6 +24,7 @@ from merge_sumo.vuts.base import VutSpec
 DIGITS: Final = 3
 """A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
 MOST_DIGITS: Final = 100
+BY_NAME: Final = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,14 +51,17 @@ class Parameters:
         `in_order` arguments are given by their place. Raises `UserError` for a parameter that a
         function does not have.
         """
-        is_code = isinstance(target, type) or inspect.isroutine(target)
-        defaults = _keywords(target, in_order) if is_code else {}
+        defaults: dict[str, Any] = {}
+        if isinstance(target, type) or inspect.isroutine(target):
+            with suppress(TypeError, ValueError):  # Python does not know the signature
+                known = list(inspect.signature(target).parameters.values())[in_order:]
+                defaults = {p.name: p.default for p in known if p.kind in BY_NAME}
         keywords = {name: value for name, value in given.items() if name in defaults}
         attributes = {name: value for name, value in given.items() if name not in defaults}
         if attributes and inspect.isroutine(target):
             raise spec.has_no(next(iter(attributes)), defaults)
-        known = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
-        return cls(spec, keywords, attributes, known)
+        present = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
+        return cls(spec, keywords, attributes, present)
 
     def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function that has its keywords, and is called with what the VUT sees."""
@@ -85,16 +90,6 @@ class Parameters:
         """Return all parameters of an object, or of a function, that have a number."""
         found = {} if inspect.isroutine(made) else _attributes(made)
         return found | {name: value for name, value in self.known.items() if value is not None}
-
-
-def _keywords(function: Any, in_order: int) -> dict[str, Any]:
-    """Return the keywords of a function or a class, with their defaults, without those in order."""
-    try:
-        parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
-        return {}
-    kinds = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
-    return {p.name: p.default for p in parameters[in_order:] if p.kind in kinds}
 
 
 def _attributes(made: Any) -> dict[str, float]:

@@ -63,7 +63,7 @@ def installed_vut(spec: VutSpec, options: VutOptions) -> Vut:
 def python_vut(spec: VutSpec, options: VutOptions) -> Vut:
     """Return the VUT `module:Name` or `file.py:Name`; `UserError` when it cannot be loaded."""
     source, _, name = spec.argument.rpartition(":")
-    module = _load_file(Path(source)) if source.endswith(".py") else _load_module(source)
+    module = _module_of(source)
     target: Any = module
     for part in name.split("."):
         target = getattr(target, part, None)
@@ -369,29 +369,25 @@ def _close(vut: Any, deadline_s: float) -> None:
         sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
 
 
-def _load_module(name: str) -> ModuleType:
+def _module_of(source: str) -> ModuleType:
+    """Return the module of a file or of a name; `UserError` where it cannot be loaded."""
+    is_file = source.endswith(".py")
     # A program does not look for modules in the folder where it is started; a person does.
-    folder = str(Path.cwd())
-    if folder not in sys.path:
-        sys.path.append(folder)
+    if not is_file and str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
     try:
-        found = importlib.util.find_spec(name.partition(".")[0])
+        if is_file:
+            return module_of_file(Path(source))
+        found = importlib.util.find_spec(source.partition(".")[0])
         if found is not None and found.has_location and found.origin is not None:
             check_code(Path(found.origin))
-        return importlib.import_module(name)
+        return importlib.import_module(source)
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        raise UserError(_cannot_load(name, error)) from error
-
-
-def _load_file(path: Path) -> ModuleType:
-    try:
-        return module_of_file(path)
-    except OSError as error:
-        raise UserError(f"cannot read the VUT {path}: {error.strerror}") from error
-    except (Exception, SystemExit) as error:
-        raise UserError(_cannot_load(str(path), error)) from error
+        if is_file and isinstance(error, OSError):
+            raise UserError(f"cannot read the VUT {source}: {error.strerror}") from error
+        raise UserError(_cannot_load(source, error)) from error
 
 
 def _cannot_load(what: str, error: BaseException) -> str:

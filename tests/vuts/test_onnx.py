@@ -109,22 +109,9 @@ def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
     assert not np.array_equal(before, after)
 
 
-@pytest.mark.parametrize(
-    "answer", [[np.nan], pytest.param([np.inf], marks=pytest.mark.long), [0, 0, 0, 0, np.nan, 0, 0]]
-)
+@pytest.mark.parametrize("answer", [[np.nan], [0, 0, 0, 0, np.nan, 0, 0]])
 def test_an_answer_that_is_no_number_is_a_vut_error(tmp_path, answer):
-    path = network(tmp_path / "bad.onnx", answer=np.zeros(len(answer)))
-    model = onnx.load(path)
-    model.graph.output[0].name = "shown"
-    model.graph.node.append(
-        onnx.helper.make_node("Log", ["negative"], ["spoilt"])
-        if np.isnan(answer).any()
-        else onnx.helper.make_node("Reciprocal", ["zero"], ["spoilt"])
-    )
-    for name, value in (("negative", -1.0), ("zero", 0.0)):
-        model.graph.initializer.append(onnx.numpy_helper.from_array(np.array([value]), name))
-    model.graph.node.append(onnx.helper.make_node("Add", ["out", "spoilt"], ["shown"]))
-    path.write_bytes(model.SerializeToString())
+    path = network(tmp_path / "bad.onnx", answer=answer)
     assert run_cases(in_process(f"onnx:{path}"), cases_of(1))[0].end is End.VUT_ERROR
 
 

@@ -181,10 +181,6 @@ class Session:
             self.notes.append(sentence)
 
 
-def _expected(session: Session, _: str) -> bytes:
-    return pack("i", max(len(session.sumo.at_m), EXPECTED * session.expected))
-
-
 OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
     # SUMO's own answers to these are those before the vehicle was put back.
     (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.sumo.point(name)[2:4]),  # getPosition
@@ -197,6 +193,6 @@ OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
     (GET_SIMULATION, 0x72): lambda s, _: pack("l", s.departed),
     (GET_SIMULATION, 0x79): lambda s, _: pack("i", len(s.arrived)),
     (GET_SIMULATION, 0x7A): lambda s, _: pack("l", s.arrived),
-    (GET_SIMULATION, 0x7D): _expected,  # getMinExpectedNumber
+    (GET_SIMULATION, 0x7D): lambda s, _: pack("i", max(len(s.sumo.at_m), EXPECTED * s.expected)),
 }
 """What is answered here and not by SUMO, by the numbers of domain and variable."""
