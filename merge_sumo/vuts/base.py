@@ -25,7 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT, Bounds, lane_of
-from merge_sumo.values.signals import Left, as_signals
+from merge_sumo.values.signals import Left
 from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 
@@ -456,10 +456,6 @@ class PerCorridor(Driver):
     def reason(self, corridor: int) -> str | None:
         """Return what the controller of a corridor did wrong."""
         return self._reasons[corridor]
-
-    def leave(self, corridor: int, left: object) -> None:
-        """Keep what a controller has left with its answer."""
-        self._signals[corridor] = as_signals(left)
 
     def signals(self) -> Mapping[int, Left]:
         """Return what the controllers left with their last answers, by corridor."""

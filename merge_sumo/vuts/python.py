@@ -25,6 +25,7 @@ from merge_sumo.system.source_files import module_of_file
 from merge_sumo.system.trust import check_code
 from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.scenario import DT_S, VUT, lane_of
+from merge_sumo.values.signals import as_signals
 from merge_sumo.vuts.base import (
     Deadline,
     PerCorridor,
@@ -167,7 +168,7 @@ class PythonVut(PerCorridor):
         answer = vut.act(seen) if self._acts else vut(seen)
         left = getattr(vut, "signals", None)
         if left is not None:
-            self.leave(corridor, left)
+            self._signals[corridor] = as_signals(left)
         return answer
 
     def parameters(self) -> Mapping[str, float]:

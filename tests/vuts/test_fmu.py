@@ -112,6 +112,7 @@ def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
         f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",
         f"{good}?v_vut_mps=wrong": "has no variable 'wrong'",
         f"{good}?speed=v": "there is no variable 'speed' to name",
+        f"{good}?merge=nothing": "has no variable 'nothing'",
     }.items():
         with pytest.raises(UserError, match=r"fmu|FMU") as refused:
             in_process(f"fmu:{spec}")
@@ -142,10 +143,3 @@ def test_an_output_merge_may_have_another_name_and_must_be_a_number_or_a_boolean
     assert np.isnan(answer)[0]
     assert vut.reason(0) == "WrongAnswerError: wishes nan instead of a number, to merge or not"
     vut.close()
-    without = in_process(f"fmu:{unit()}")(1)
-    begin(without)
-    without.act(on_lane([-51.0]))
-    assert without.wishes() is None
-    without.close()
-    with pytest.raises(UserError, match="has no variable 'nothing'"):
-        in_process(f"fmu:{unit()}?merge=nothing")

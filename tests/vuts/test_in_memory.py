@@ -47,9 +47,6 @@ class TestASpec:
         assert spec_of(vut) == f"{__name__}:{vut.__name__}"
         assert travels(parse(spec_of(vut)))
 
-    def test_of_a_text_is_that_text(self):
-        assert spec_of("sumo:IDM") == "sumo:IDM"
-
     def test_of_another_object_of_the_same_name_is_another(self):
         specs = [spec_of(lambda _: 0.0), spec_of(lambda _: 1.0)]
         assert len(set(specs)) == 2

@@ -7,11 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from conftest import some
-from vut_contract import ON_LANE, begin, factory, in_process, on_lane, run_on
+from vut_contract import ON_LANE, begin, factory, in_process, on_lane
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
-from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
 from merge_sumo.vuts.host.hosted import HostedVut
 from merge_sumo.vuts.spec import parse
@@ -202,17 +200,3 @@ def Vut(seen):
             driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:
         driver.close()
-
-
-@pytest.mark.parametrize("process", some(["this", "own"], "own"))
-def test_a_wish_that_is_none_ends_its_case_alone_as_an_error(spec, process):
-    wish = "'yes' if seen.v_pov_mps > 30.0 and seen.x_vut_m > -80.0 else False"
-    vut = factory(spec(f"def Vut(seen):\n    return 1.0, {wish}\n"), in_process=process == "this")
-    ran = run_on(vut, named_scenario("us23-lane"), 0, 8)
-    for trajectory in ran:
-        if trajectory.v_pov_mps[0] > 30.0:
-            assert trajectory.end is End.VUT_ERROR
-            assert trajectory.error.startswith("WrongAnswerError: wishes 'yes' (str) instead of")
-        else:
-            assert trajectory.x_vut_m[-2] < 130.0 <= trajectory.x_vut_m[-1], "it is forced"
-    assert len({trajectory.end for trajectory in ran}) == 2

@@ -5,6 +5,7 @@ SUMO's own results are those before the vehicles are put back, so every value is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -47,10 +48,6 @@ class Subscription:
     def of(self) -> tuple[int, str, int | None]:
         """What it is about."""
         return self.getter, self.object_id, self.domain
-
-    def is_due(self, now_s: float) -> bool:
-        """Return whether its values are sent with a step to a simulation time."""
-        return self.begin_s <= now_s and (self.end_s == FOR_EVER or now_s <= self.end_s)
 
 
 class Subscriptions:
@@ -111,7 +108,8 @@ class Subscriptions:
         """Return the values of all subscriptions: the answer to a step behind its status."""
         answers = []
         for subscription in self.all:
-            if subscription.is_due(now_s):
+            end_s = math.inf if subscription.end_s == FOR_EVER else subscription.end_s
+            if subscription.begin_s <= now_s <= end_s:
                 # Of what SUMO cannot tell any more, nothing is sent.
                 with suppress(RefusedError):
                     answers.append(self._result(subscription))
