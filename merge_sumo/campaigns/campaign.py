@@ -128,20 +128,13 @@ def resume_campaign(
     have more cases than it had, if those ended with a whole batch. Raises `UserError` with the name
     of the field where something differs that decides outcomes: settings, versions, net, policies.
 
-    Args:
-        settings: those of the folder, and what a person named again (`settings_of`).
-        plan: as of `run_campaign`, and so are `on_case`, `workers`, `check` and `begin`.
-        folder: where the campaign is.
-        on_case: called with every outcome of a case that runs.
-        on_before: called with the outcomes of cases that ran before.
-        workers: where cases run.
-        check: called after every batch.
-        begin: called before the first case.
-        warn: called with a sentence on what was dropped.
+    `settings` are those of the folder, and what a person named again (`settings_of`). `on_before`
+    is called with the outcomes of cases that ran before, `warn` with a sentence on what was
+    dropped. The other arguments are those of `run_campaign`.
     """
     check_own(folder / SCENARIOS, folder / AGAINST)
     versions = _versions(folder, settings, plan, workers)
-    campaign = versions[0]
+    campaign, before = versions[0], list[Run]()
     with workers_or_here(workers) as available, ExitStack() as opened:
         for one in versions:
             if one is not campaign and not campaign.outcomes:
@@ -149,16 +142,19 @@ def resume_campaign(
                 record = record_of(one.settings, one.plan)
                 with suppress(TakenError), Journal.create(one.folder, record):
                     pass
-            journal, one.before, dropped = Journal.reopen(one.folder)
-            one.journal, one.outcomes = opened.enter_context(journal), one.before.outcomes
+            journal, run, dropped = Journal.reopen(one.folder)
+            one.journal, one.before = opened.enter_context(journal), run
+            one.outcomes = run.outcomes
+            before.append(run)
             if dropped:
                 warn(
                     f"{one.folder}: dropped {dropped} outcomes of a batch that was stopped; it "
                     "runs again"
                 )
-        records = [_compared(one, one.before) for one in versions if one.before is not None]
-        for one in versions[1:]:
-            _keep_cases_of(campaign, one)
+        records = [_compared(one, run) for one, run in zip(versions, before, strict=True)]
+        for one, run in zip(versions[1:], before[1:], strict=True):
+            before[0].earlier()  # raises where cases are missing; more of them run again
+            one.journal.keep(run, len(campaign.outcomes))
         for one, rewritten in zip(versions, records, strict=True):
             open_simulators(one.plan, available, first=settings.in_flight is not None)
             if rewritten is not None:
@@ -221,20 +217,6 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
     if before.ran_again:
         record[RAN_AGAIN] = before.ran_again
     return record if moved or grown else None
-
-
-def _keep_cases_of(campaign: _Version, earlier: _Version) -> None:
-    """Drop the cases of the earlier version that a campaign does not have.
-
-    Raises `UserError` where cases are missing.
-    """
-    count = len(campaign.outcomes)
-    if [o.case for o in earlier.outcomes[:count]] != [o.case for o in campaign.outcomes]:
-        raise UserError(
-            f"{earlier.folder} has other cases than {campaign.folder}: take both from a copy"
-        )
-    if earlier.before is not None and len(earlier.outcomes) > count:
-        earlier.journal.keep(earlier.before, count)
 
 
 def _run(
