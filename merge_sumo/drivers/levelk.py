@@ -281,47 +281,35 @@ class LevelKDriver(Driver):
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
         """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
-        self._scenarios: list[Scenario] = [US23]
-        self._limited: list[Scenario] = [network.limited(US23)]
-        """The same scenarios with the network's limit of braking."""
-        self._scenario = np.zeros(corridors, dtype=np.int64)
-        """Which of them is a corridor's; a campaign has one."""
-        self._last: tuple[Scenario, int] = US23, 0
-        """The scenario of the last case, and its number."""
+        self._scenario: Scenario = US23
+        self._limited = network.limited(US23)
+        """The scenario, which all corridors share, with the network's limit of braking."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the scenario and the social value orientation of the case."""
         self._svo_rad[corridor] = case.svo_rad or 0.0
-        if case.scenario is not self._last[0]:  # to compare scenarios takes a while
-            if case.scenario not in self._scenarios:
-                self._scenarios.append(case.scenario)
-                self._limited.append(self.network.limited(case.scenario))
-            self._last = case.scenario, self._scenarios.index(case.scenario)
-        self._scenario[corridor] = self._last[1]
+        if case.scenario is not self._scenario:
+            self._scenario, self._limited = case.scenario, self.network.limited(case.scenario)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the held accelerations, decided anew where a decision is due."""
+        """Return the held accelerations, decided anew where a decision is due.
+
+        They are NaN where an action value is not finite.
+        """
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
         if not due.size:
             return self._held
-        for number, scenario in enumerate(self._limited):
-            mine = due[self._scenario[due] == number]
-            if mine.size:
-                self._decide(mine, scene, scenario)
-        return self._held
-
-    def _decide(self, due: NDArray[np.int64], scene: Scene, scenario: Scenario) -> None:
-        """Choose anew in corridors of a scenario; NaN where an action value is not finite."""
         inputs = features(
             scene.x_pov_m[due],
             scene.v_pov_mps[due],
             scene.x_vut_m[due],
             scene.v_vut_mps[due],
             self._svo_rad[due] if self.network.sees_svo else None,
-            scenario=scenario,
+            scenario=self._limited,
         )
         actions = self.network.greedy(inputs)
-        self._held[due] = np.where(actions < 0, np.nan, actions_mps2(scenario)[actions])
+        self._held[due] = np.where(actions < 0, np.nan, actions_mps2(self._limited)[actions])
+        return self._held
 
     def reason(self, corridor: int) -> str | None:
         """Return why the answer for a corridor is NaN."""

@@ -163,24 +163,16 @@ def _hops(lanes: Sequence[_HostedLane], *, lane_goes_on: bool) -> Iterator[_Hop]
         if following < len(lanes) and lanes[here].leads_on:
             yield _Hop(lanes[here], lanes[here + 1 : following], lanes[following])
         elif following < len(lanes) and lane_goes_on:
-            via = _crossing(lanes[here], lanes[here + 1 : following], lanes[following])
-            yield _Hop(lanes[here], via, lanes[following])
+            # From the end of the acceleration lane, beside the way of the mainline's lanes.
+            beside, via, target = lanes[here + 1 : following], [], lanes[following]
+            if beside:
+                length_m = math.fsum(other.piece.length_m for other in beside)
+                shape = (lanes[here].piece.shape[-1], target.piece.shape[0])
+                piece = replace(beside[0].piece, length_m=length_m, shape=shape)
+                via = [_HostedLane(f":{AT_M}_lane0", AT_M, piece)]
+            yield _Hop(lanes[here], via, target)
         else:
             yield _Hop(lanes[here], [], None)
-
-
-def _crossing(
-    lane: _HostedLane, beside: Sequence[_HostedLane], target: _HostedLane
-) -> list[_HostedLane]:
-    """Return the way from the end of an acceleration lane, beside that of the mainline's lanes."""
-    if not beside:
-        return []
-    piece = replace(
-        beside[0].piece,
-        length_m=math.fsum(other.piece.length_m for other in beside),
-        shape=(lane.piece.shape[-1], target.piece.shape[0]),
-    )
-    return [_HostedLane(f":{AT_M}_lane0", AT_M, piece)]
 
 
 def _elements(road: Corridor, *, lane_goes_on: bool) -> list[etree._Element]:

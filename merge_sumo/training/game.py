@@ -71,6 +71,7 @@ class Game:
         """Hold accelerations, (n,), for one decision; return states, rewards, and what is over."""
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         of_pov, reward = self.role == "pov", self.reward
+        profile = self.scenario.level0_a_mps2, self.scenario.level0_v_mps
         learned = None
         if self.opponent is not None:
             choices = actions_mps2(self.opponent.limited(self.scenario))
@@ -78,7 +79,12 @@ class Game:
         safe, pov_ego, vut_ego = np.zeros((3, len(state)))
         live = np.ones(len(state), dtype=bool)
         for _ in range(DECISION_STEPS):
-            other = self._level0_answer(v_vut) if learned is None else learned
+            if learned is not None:
+                other = learned
+            elif of_pov:
+                other = level0_acceleration(v_vut, *profile)
+            else:
+                other = np.zeros_like(v_vut)
             a_pov, a_vut = (a_mps2, other) if of_pov else (other, a_mps2)
             pov_ego += live * reward.pov_step(v_pov, a_pov)
             vut_ego += live * reward.vut_step(v_vut, a_vut)
@@ -134,13 +140,6 @@ class Game:
     def improved(self, policy: Policy) -> Policy:
         """Return the policy that plays every action out before it chooses (Tesauro, 1996)."""
         return lambda state, svo_rad: self.action_returns(state, svo_rad, policy).argmax(axis=1)
-
-    def _level0_answer(self, v_vut_mps: FloatArray) -> FloatArray:
-        """Return the level-0 opponent's acceleration at a step, (n,)."""
-        if self.role == "vut":
-            return np.zeros_like(v_vut_mps)
-        profile = self.scenario.level0_a_mps2, self.scenario.level0_v_mps
-        return np.asarray(level0_acceleration(v_vut_mps, *profile), dtype=np.float64)
 
 
 def greedy(network: QNetwork, scenario: Scenario) -> Policy:

@@ -7,7 +7,7 @@ is worth can be found by playing it out. Each round
 1. plays the present policy from many starts and searches, from some of them, for a better game;
    part of the latter are near those where the last search was most successful;
 2. plays every action out, held for one decision and for two, in the states of all these games that
-   are worth it (`_worth_labels`), with the policy going on after it (Lagoudakis and Parr, 2003);
+   are worth it (`_label`), with the policy going on after it (Lagoudakis and Parr, 2003);
    where the game that was found is better, its return counts (a lower bound of the best return, as
    that of any game that was played: He et al., 2016);
 3. trains the network so that the loss of return which its choice means is small, and that Q stays
@@ -152,7 +152,11 @@ def _label(
     """Return states that were tried, with the worth of each action."""
     policy = greedy(network, game.scenario)
     inputs = inputs_of(network, tried.state, tried.svo_rad, game.scenario)
-    kept = _worth_labels(network.values_at_once(inputs), tried.better, rng, s)
+    # A network changes its choice where two actions are nearly equal. So these states are kept,
+    # those of games that are better than the policy's, and a share of the others.
+    second, first = np.partition(network.values_at_once(inputs), -2, axis=1)[:, -2:].T
+    some = rng.random(len(inputs)) < s.sure_share
+    kept = np.flatnonzero((first - second < s.unsure) | tried.better | some)
     state, svo_rad = tried.state[kept], tried.svo_rad[kept]
     of_holds = [
         game.action_returns(state, svo_rad, policy, decisions) for decisions in range(1, s.held + 1)
@@ -161,22 +165,6 @@ def _label(
     row, action = np.arange(len(kept)), tried.action[kept]
     returns[row, action] = np.maximum(returns[row, action], tried.to_go[kept])
     return _Labelled(inputs[kept].astype(np.float32), returns.astype(np.float32))
-
-
-def _worth_labels(
-    values: NDArray[np.float32],
-    better: NDArray[np.bool_],
-    rng: np.random.Generator,
-    s: RefineSettings,
-) -> IntArray:
-    """Return the places of the states that are labelled, by their Q, (n, 7).
-
-    A network changes its choice where two actions are nearly equal. So these states are labelled,
-    those of games that are better than the policy's, and a share of the others, (n,).
-    """
-    second, first = np.partition(values, -2, axis=1)[:, -2:].T
-    unsure = first - second < s.unsure
-    return np.flatnonzero(unsure | better | (rng.random(len(values)) < s.sure_share))
 
 
 def _try(

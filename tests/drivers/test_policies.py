@@ -7,10 +7,9 @@ import dataclasses
 import make_scenarios
 import numpy as np
 import pytest
-from merges import HALF, LIKE_A_ROUNDABOUT, SMALLER
+from merges import HALF, SMALLER
 from plans import POVS
 
-from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.levelk import (
     FEATURES,
@@ -22,7 +21,6 @@ from merge_sumo.drivers.levelk import (
 from merge_sumo.drivers.policies import (
     HUMAN,
     NETWORKS,
-    load_driver,
     load_network,
     policies_in,
     policies_of,
@@ -174,24 +172,6 @@ class TestOtherScenarios:
         half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
         assert np.array_equal(half, features(*states(20_000).T, scenario=US23))
         assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
-
-    def test_a_driver_of_corridors_with_two_scenarios_acts_in_each_as_if_alone(self):
-        scenarios = [US23, HALF, LIKE_A_ROUNDABOUT, US23, HALF, LIKE_A_ROUNDABOUT]
-        cases = [from_unit(np.array([[0.4, 0.6]]), 1, scenario=s)[0] for s in scenarios]
-        rows = np.array([[*zip(*case.starts(), strict=True)] for case in cases])
-        every = np.ones(1, dtype=bool), np.zeros(1, dtype=np.int64)
-
-        def act(which):
-            driver = load_driver("vut1", len(which))
-            for corridor, number in enumerate(which):
-                driver.begin(corridor, cases[number])
-            x_m, v_mps = rows[which].transpose(1, 2, 0)
-            active, step = (np.repeat(one, len(which)) for one in every)
-            return driver.act(Scene(active, step, x_m, v_mps)).tolist()
-
-        together = act(list(range(6)))
-        assert together == [act([number])[0] for number in range(6)]
-        assert together[1] == together[0] / 2 != 0.0
 
     @pytest.mark.parametrize("name", ["pov1", "vut1"])
     def test_on_a_ramp_like_ours_they_are_nearly_rational_as_they_would_not_be_unscaled(self, name):
