@@ -73,7 +73,10 @@ class BaseRate:
         begun = int(place[distance < SAME].max(initial=-1)) + 1
         anywhere = distance[: len(history.points)] < SAME
         scored = cKDTree(offered).query(history.points)[0] < SAME
-        chances = [self._rate(of) for of in (scored, anywhere)]
+        chances = [
+            (float(history.share[of].sum()) + PRIOR_FAILURES) / (float(of.sum()) + PRIOR_CASES)
+            for of in (scored, anywhere)
+        ]
         self.chance = max(chances)
         share = max(chances[1] / sum(chances), LEAST_OF_SEQUENCE)
         spread = int((anywhere & (history.batch > history.batch.min(initial=0))).sum())
@@ -90,11 +93,6 @@ class BaseRate:
         promised = np.bincount(far, said[picks], minlength=2)
         failed = np.bincount(far, history.share[picks], minlength=2)
         self._credit = np.minimum((failed + 1.0) / (promised + 1.0), 1.0)
-
-    def _rate(self, of: NDArray[np.bool_]) -> float:
-        """Return the share of failures among some cases, (N,)."""
-        failures = float(self._history.share[of].sum())
-        return (failures + PRIOR_FAILURES) / (float(of.sum()) + PRIOR_CASES)
 
     def mixed(self, picks: Proposal, following: Proposal) -> Proposal:
         """Return picks with points of the sequence, which come last, in the place of worse ones."""

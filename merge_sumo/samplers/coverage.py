@@ -8,7 +8,6 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
@@ -62,7 +61,7 @@ class CoverageSampler(Sampler):
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
-        proposals = self.search(self.pool.levels, n)
+        proposals = self._search(n)
         shares = self._shares(proposals, n)
         self._predictions = [
             prediction
@@ -89,19 +88,15 @@ class CoverageSampler(Sampler):
         most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
         return max(most, a_level * levels)
 
-    def allocate(self, n: int) -> dict[int, int]:
-        """Return the number of cases for each level; they add up to `n`."""
-        return self._shares(self.search(self.pool.levels, n), n)
-
-    def search(self, levels: Sequence[int], n: int) -> dict[int, Proposal]:
-        """Return the batch of each of some levels.
+    def _search(self, n: int) -> dict[int, Proposal]:
+        """Return a batch of each level.
 
         Their searches go in step, so that the predictor answers all of them at once.
         """
         from threadpoolctl import threadpool_limits
 
         proposals: dict[int, Proposal] = {}
-        searches = {level: self._propose(level, n) for level in levels}
+        searches = {level: self._propose(level, n) for level in self.pool.levels}
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
             answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
@@ -117,7 +112,7 @@ class CoverageSampler(Sampler):
                 if queries and self.predictor is not None:
                     gaps = self.predictor.predict(list(queries.values()))
                     answers.update(zip(queries, gaps, strict=True))
-        return {level: proposals[level] for level in levels}
+        return {level: proposals[level] for level in self.pool.levels}
 
     def _propose(self, level: int, n: int) -> Asking[Proposal]:
         history, rng, pending = self.history(level), self.rng(level), self.pending(level)

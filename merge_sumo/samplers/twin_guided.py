@@ -109,7 +109,6 @@ class _Candidates:
         surrogate: None without outcomes at the level.
         points: candidates, (m, d).
         gaps: predicted gaps at M, (E, G, m).
-        p_fail: P(fail) by twin and surrogate together, (m,).
         above: probability of failing in more runs than are tolerated, (m,).
     """
 
@@ -126,10 +125,6 @@ class _Candidates:
     @property
     def gaps(self) -> FloatArray:
         return self._predictions[0]
-
-    @property
-    def p_fail(self) -> FloatArray:
-        return self._predictions[-2]
 
     @property
     def above(self) -> FloatArray:

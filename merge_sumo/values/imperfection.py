@@ -88,22 +88,17 @@ class Imperfection:
                 raise UserError(f"{option}: {name} is given twice")
             if not equals:
                 raise UserError(f"{option}: {name} has no number: give {name}=NUMBER")
-            values[name] = _amount(name, number, option)
+            low, dots, high = number.partition("..")
+            try:
+                values[name] = (float(low), float(high)) if dots else float(low)
+            except ValueError:
+                raise UserError(
+                    f"{option}: {name} is {number!r:.60}: give a number, or a range as 0..0.5"
+                ) from None
         try:
             return cls(**values)
         except UserError as error:
             raise UserError(f"{option}: {error}") from error
-
-
-def _amount(name: str, text: str, option: str) -> Amount:
-    """Return the number or the range in a text; `UserError` for none."""
-    low, dots, high = text.partition("..")
-    try:
-        return (float(low), float(high)) if dots else float(low)
-    except ValueError:
-        raise UserError(
-            f"{option}: {name} is {text!r:.60}: give a number, or a range as 0..0.5"
-        ) from None
 
 
 def _in_words(value: Amount) -> str:

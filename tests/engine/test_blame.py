@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import sys
-from functools import partial
-from pathlib import Path
 
 import pytest
 from campaigning import campaign_settings, run_campaign
@@ -15,10 +11,7 @@ from campaigning import campaign_settings, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.system import pulse
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
-from merge_sumo.system.pulse import AwakeClock
-from merge_sumo.system.workers import cut, open_workers
 from merge_sumo.values.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
@@ -106,23 +99,6 @@ class TestBlame:
         assert MAX_DEATHS < MAX_KILLS
 
 
-class TestClocks:
-    @pytest.fixture
-    def now(self, monkeypatch):
-        now = [100.0]
-        monkeypatch.setattr(pulse, "monotonic", lambda: now[0])
-        return now
-
-    def test_that_are_awake_count_no_pause(self, now):
-        clock = AwakeClock(0.5)
-        for passed_s in (0.25, 0.25, 9.0, 0.25):
-            now[0] += passed_s
-            found_s = clock.elapsed_s()
-        assert found_s == 0.25 + 0.25 + 0.5 + 0.25
-        clock.restart()
-        assert clock.elapsed_s() == 0.0
-
-
 class TestKills:
     @pytest.mark.slow
     @pytest.mark.parametrize(
@@ -166,37 +142,6 @@ if not flag.exists():
         assert outcomes(campaign("once", once + CALM)) == outcomes(calm)
         with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
             campaign("always", f"import os, signal\n{KILLED}\n{CALM}")
-
-    @pytest.mark.slow
-    def test_of_a_vut_that_is_opened_again_are_not_those_of_all_cases(self, campaign, calm):
-        """The process dies at a case, and again when it starts anew: the other cases pass."""
-        source = DIES.format(how="(FLAGS / 'again').touch(); os._exit(3)", times=1)
-        source += """
-if (FLAGS / "again").exists():
-    (FLAGS / "again").unlink()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-        assert outcomes(campaign("struck", source)) == outcomes(calm)
-
-    @pytest.mark.slow
-    def test_of_a_worker_mark_what_ran_again(self, tmp_path):
-        with open_workers(2) as workers:
-            work = partial(killed_once, tmp_path / "flag")
-            chunks = cut(range(6), 2)
-            found = dict(workers.run_chunks(work, chunks, lambda _: (0, False), ran_again=marked))
-        assert [square for first in (0, 2, 4) for square, _ in found[first]] == [0, 1, 4, 9, 16, 25]
-        assert any(again for _, again in found[2])
-
-
-def killed_once(flag: Path, items):
-    if 3 in items and not flag.exists():
-        flag.touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return [(item * item, False) for item in items]
-
-
-def marked(result):
-    return result[0], True
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from processes import none_left
 from vut_contract import cases_of, factory
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
@@ -140,17 +140,6 @@ class TestTheSeat:
         assert (seen.x_pov_m[1], seen.v_pov_mps[1]) == (-150.0, 18.0)
         assert seen.active.tolist() == [False, True]
         assert answer[1] == -2.0
-
-    def test_passes_on_what_its_driver_loses_as_the_povs(self):
-        class Losing(Noting):
-            def act(self, _scene):
-                raise VutLostError("died", 3, final=True)
-
-        zeros = np.zeros(4)
-        nothing = Scene.of_pair(zeros > 0, zeros.astype(int), zeros, zeros, zeros, zeros)
-        with pytest.raises(PovLostError, match=r"^died$") as lost:
-            PovAdapter(Losing(4)).act(nothing)
-        assert (lost.value.corridor, lost.value.final) == (3, True)
 
 
 class TestAPov:

@@ -11,7 +11,6 @@ import pytest
 from scipy.special import expit, logit
 
 from merge_sumo.samplers.belief import Belief
-from merge_sumo.samplers.gpr import NOISE, _noise
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
 from merge_sumo.samplers.registry import make_sampler
@@ -67,12 +66,6 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert history.variance[0] == pytest.approx(np.var([0.96, -0.4, 0.95, -0.2], ddof=1))
     assert np.isnan(history.variance[1])
     assert history.varies
-
-
-def test_more_runs_leave_less_noise():
-    history = told(*RUNS)
-    single, four = (float(value) for value in np.asarray(_noise(history))[[1, 0]])
-    assert single - NOISE == pytest.approx(4.0 * (four - NOISE))
 
 
 class TestTheLogOdds:

@@ -129,15 +129,6 @@ class TestWatching:
         assert seen[NOW + 4 : NOW + 8].tolist() == [0.0] * 4
         assert seen[NOW + 8 : NOW + 10].tolist() == [-101.0, 10.0]
 
-    def test_forgets_the_others_when_some_are_kept(self):
-        some, alone = Observation(US23, 2), Observation(US23, 1)
-        x, v = np.array([[-200.0, -150.0], [-100.0, -90.0]]), np.array([[30.0, 31.0], [20.0, 21.0]])
-        some.see(x, v, np.zeros(2))
-        alone.see(x[:, 1:], v[:, 1:], np.zeros(1))
-        some.keep(np.array([False, True]))
-        again = some.see(x[:, 1:] + 2.0, v[:, 1:], np.ones(1))
-        assert again.tolist() == alone.see(x[:, 1:] + 2.0, v[:, 1:], np.ones(1)).tolist()
-
 
 class TestForest:
     @pytest.mark.parametrize("count", [1, 2, 5, 8])

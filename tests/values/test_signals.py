@@ -8,10 +8,8 @@ import json
 import numpy as np
 import pytest
 from campaigning import run_campaign
-from typer.testing import CliRunner
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
@@ -71,15 +69,6 @@ def test_every_step_has_what_was_left_at_it(campaign):
         yields = np.array(found.signals["mode"][:-1]) == "yield"
         begins = (found.x_vut_m[:-1] > -60.0) & (np.abs(gap_m[:-1]) < 15.0)
         assert np.array_equal(yields, np.maximum.accumulate(begins))
-
-
-def test_run_prints_them_beside_the_motion(tmp_path):
-    (tmp_path / "my_vut.py").write_text(LEAVES)
-    given = ["run", "--vut", f"{tmp_path}/my_vut.py:Vut", "--x", "-250", "--v", "30"]
-    said = CliRunner().invoke(cli.app, given).stdout
-    assert "  mode go  gap_m " in said
-    record = json.loads(CliRunner().invoke(cli.app, [*given, "--json"]).stdout)
-    assert len(record["signals"]["gap_m"]) == len(record["motion"])
 
 
 HOSTILE = """

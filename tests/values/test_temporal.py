@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from calling import assert_refused
 from conftest import require
 from test_score import CASE, ending
 
@@ -144,22 +142,3 @@ class TestRobustness:
         outcome = Criterion(require=formula).outcome(0, 0, ending(20.0))
         assert outcome.margin == pytest.approx(margin)
         assert outcome.failed is (margin < 0.0)
-
-    def test_decides_a_campaign(self, tmp_path, command_line):
-        code, out, err = command_line(
-            *("campaign", "--vut", "design1", "--level", 0, "--cases", 20, "--json", "-q"),
-            *("--sampler", "gpr"),
-            *("--require", NEAR, "--out", tmp_path / "run"),
-        )
-        assert (code, err) == (0, "")
-        record = json.loads((tmp_path / "run" / "campaign.json").read_text(encoding="utf-8"))
-        assert (record["fail_when"], record["require"]) == ("paper", NEAR)
-        lines = (tmp_path / "run" / "outcomes.jsonl").read_text(encoding="utf-8").splitlines()
-        failing = [line for line in map(json.loads, lines) if line["margin"] < 0.0]
-        assert json.loads(out)["failures"] == len(failing)
-        assert_refused(
-            command_line(
-                "campaign", "--resume", tmp_path / "run", "--require", "always (bumper_gap_m > 3)"
-            ),
-            "a campaign has one criterion",
-        )
