@@ -117,11 +117,8 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_sentence(tmp_path,
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
-    fails, passes, ends = (
-        CaseVerdict(-900.0, True),
-        CaseVerdict(-1.0, True),
-        CaseVerdict(-1.0, False),
-    )
+    fails, passes = CaseVerdict(-1.0, True), CaseVerdict(1.0, True)
+    ends = CaseVerdict(1.0, False)
     both = [failed, passed]
     assert flips_of(both, {0: fails, 1: passes}) == Flips()
     assert flips_of(both, {0: passes, 1: fails}) == Flips((failed.index,), (passed.index,))
