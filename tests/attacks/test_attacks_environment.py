@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import errno
-import os
 import shlex
 import shutil
 import sys
-from pathlib import Path
 from threading import Thread
 
 import pytest
 from attacks import World
-from conftest import require, some
+from conftest import some
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.limits import EXHAUSTED, check_threads
+from merge_sumo.system.limits import check_threads
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX is needed")
 
-SETPRIV = shutil.which("setpriv")
 CAMPAIGN = (
     "campaign --vut design1 --level 0 --cases 4 --sampler uniform --quiet --workers {workers} "
     "--out new"
@@ -45,15 +41,14 @@ COMMANDS = {
     "truth --vut design1 --level 0 --cases 100": 0,
     "benchmark --vut design1 --level 0 --cases 8 --seeds 1 --samplers uniform --truth-cases 100": 0,
 }
-"""Commands, and the exit codes that they have; None where it is as without the attack."""
+"""Commands, and the exit codes that they have."""
 
 
 @pytest.fixture
 def world(run, tmp_path):
     shutil.copytree(run.folder, tmp_path / "run")
     (tmp_path / "own.py").write_text("class Vut:\n    def act(self, seen):\n        return 0.5\n")
-    world = World(tmp_path)
-    return world
+    return World(tmp_path)
 
 
 def shell(world: World, command: str, streams: str = "", before: str = "") -> tuple[int, str, str]:
@@ -72,18 +67,13 @@ class TestStreams:
     @pytest.mark.parametrize("command", some(COMMANDS, "scenario list"))
     def test_that_are_closed_change_nothing_else(self, world, command):
         code, out, _ = shell(world, command)
-        assert COMMANDS[command] in (None, code)
+        assert COMMANDS[command] == code
         for streams in CLOSED:
             found, said, errors = shell(world, command, streams)
             assert found == code, (streams, errors)
             assert "Traceback" not in errors
             if ">&-" not in streams.split() and "--version" in command:
                 assert said == out
-
-    @pytest.mark.slow
-    def test_that_are_all_closed_leave_a_campaign_as_it_is(self, world):
-        code, out, errors = shell(world, CAMPAIGN.format(workers=2), CLOSED[-1])
-        assert (code, out, errors) == (0, "", "")
 
     @pytest.mark.slow
     @pytest.mark.parametrize("command", some(COMMANDS, "scenario list"))
@@ -128,20 +118,13 @@ class TestLimits:
             "-v 1000000",
         ),
     )
-    @pytest.mark.parametrize("command", [CAMPAIGN.format(workers=2)])
-    def test_of_files_and_memory(self, world, limit, command):
-        assert_refused_or_run(world, command, limit)
-
-    @pytest.mark.parametrize(
-        "processes", some((1, 2, 3, 4, 5, 6, 8, 9, 10, 12, 14, 16, 18, 20, 24, 32), 4)
-    )
-    def test_of_processes(self, world, processes):
-        require(SETPRIV is not None and os.geteuid() == 0, "setpriv needs root")
-        code, _, errors = in_a_narrow_account(world, processes, CAMPAIGN.format(workers=2))
-        assert code in (0, 2), errors
+    def test_of_files_and_memory(self, world, limit):
+        code, _, errors = shell(world, CAMPAIGN.format(workers=2), before=f"ulimit {limit}")
         assert "Traceback" not in errors
-        if code == 2:
-            assert errors == f"merge-sumo: {EXHAUSTED[errno.EAGAIN]}\n"
+        if code != 0:
+            assert code == 2, errors
+            assert errors.splitlines()[-1].startswith("merge-sumo: ")
+        assert not [n for n in world.left_in_temporary() if not n.startswith("merge-sumo")]
 
     def test_of_threads_are_named(self, monkeypatch):
         def refuse(_: object) -> None:
@@ -151,30 +134,3 @@ class TestLimits:
         monkeypatch.setattr(Thread, "start", refuse)
         with pytest.raises(UserError, match="no more processes or threads"):
             check_threads(3)
-
-
-def assert_refused_or_run(world: World, command: str, limit: str) -> None:
-    code, _, errors = shell(world, command, before=f"ulimit {limit}")
-    assert "Traceback" not in errors
-    if code != 0:
-        assert code == 2, errors
-        assert errors.splitlines()[-1].startswith("merge-sumo: ")
-    assert not [name for name in world.left_in_temporary() if not name.startswith("merge-sumo")]
-
-
-def in_a_narrow_account(world: World, processes: int, command: str) -> tuple[int, str, str]:
-    """Run a command as a user that nobody is, who reads everything and has so many processes."""
-    assert SETPRIV is not None, "required"
-    for folder in (world.root, *world.root.rglob("*")):
-        os.chown(folder, NOBODY, NOBODY)
-    drop = [SETPRIV, f"--reuid={NOBODY}", f"--regid={NOBODY}", "--clear-groups"]
-    drop += [f"--{which}=-all,+dac_override" for which in ("inh-caps", "bounding-set")]
-    drop += ["--ambient-caps=+dac_override"]
-    run = f"{shlex.quote(sys.executable)} -m merge_sumo.cli {command}"
-    script = f"ulimit -u {processes}\nexec {run}"
-    Path(world.cache).mkdir(exist_ok=True)
-    return World(world.root, prefix=(*drop, "bash", "-c", script)).run()
-
-
-NOBODY = 47_811
-"""An account that has no name, and no other process."""

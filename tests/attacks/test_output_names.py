@@ -24,7 +24,6 @@ from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
-from merge_sumo.reports import figures
 from merge_sumo.road.merge import default_net_path
 from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
 from merge_sumo.system import folders
@@ -151,12 +150,6 @@ def test_a_name_that_no_file_can_have_is_refused(world, no_cases, name):
 def test_a_name_of_the_root_is_refused_by_its_looks(name):
     with pytest.raises(UserError, match="write the name of what is to be made"):
         folders.check_new(Path(name))
-
-
-def test_a_figure_of_no_known_kind_is_refused(tmp_path):
-    for name in ("figure", "figure.pdf", "figure.json"):
-        with pytest.raises(UserError):
-            figures.check_figure(tmp_path / name)
 
 
 FILES = {"first": b"12345", "empty": b"", "last": b"67"}
