@@ -16,7 +16,7 @@ from calling import invoke
 from export_policy import export_onnx
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import vector as vector_wrappers
-from merges import HALF, LIKE_A_ROUNDABOUT
+from merges import LIKE_A_ROUNDABOUT
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
@@ -240,20 +240,6 @@ class TestGame:
     @pytest.fixture
     def policy(self, network):
         return greedy(network, US23)
-
-    @pytest.mark.parametrize("role", ["pov", "vut"])
-    @pytest.mark.parametrize("learned", [False, True])
-    def test_a_merge_of_half_the_size_is_the_same_game_to_the_last_bit(
-        self, role, network, learned
-    ):
-        torch.manual_seed(3)
-        opponent = ddqn.export(ddqn.make_network(FEATURES, 16)) if learned else None
-        start, psi = pool_starts(200, np.random.default_rng(9), scenario=US23), np.zeros(200)
-        one, half = (
-            Game(role, opponent, reward.Reward.of(s)).play(start * size, psi, greedy(network, s))
-            for s, size in ((US23, 1.0), (HALF, 0.5))
-        )
-        assert np.array_equal(one, half)
 
     def test_a_decision_is_half_a_second_of_eq_4(self):
         game = Game("vut", None, REWARD)
