@@ -718,10 +718,6 @@ class Repair(Recorded):
     )
     seed: int = _seed("Same seed, same values.")
     out: AnyPath | None = _out("New folder to write.", "runs/repair-RUN-DATE")
-    resume: bool = keyword(False, "Go on in the folder `out`.")
-    check: Callable[[], None] | None = keyword(
-        None, "Called after every trial and every batch; may raise to stop there."
-    )
 
 
 # Verbs: bring your own

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import statistics
+import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,11 +40,13 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.values.case import Case, FloatArray, to_unit
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.fmc import radius_for
+
+sys.path.append(str(Path(__file__).parent / "benchmark"))
+from oracle import greedy_cover
 
 TRIALS = Path(__file__).parent / "trial_vuts.py"
 LATER = "design2?x1_m=120"

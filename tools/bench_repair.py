@@ -58,11 +58,11 @@ def main() -> None:
                 out=Path(folder) / "repair",
                 progress=False,
             )
-        print(f"seed {seed}", *found.lines()[:-1], sep="\n  ")
-        if found.spec is not None:
+        print(f"seed {seed}", *found.lines(), sep="\n  ")
+        if found.repaired is not None:
             truths = [
                 api.truth(spec, cases=asked.truth_cases, seed=TRUTH_SEED, workers=None).truths
-                for spec in (asked.vut, found.spec)
+                for spec in (asked.vut, found.repaired)
             ]
             figures[str(seed)] = {
                 str(level): row(*(t[level] for t in truths)) for level in truths[0]

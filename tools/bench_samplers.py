@@ -27,6 +27,7 @@ from __future__ import annotations
 import argparse
 import math
 import pickle
+import sys
 import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
@@ -44,7 +45,6 @@ from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.studies.sampler_study import greedy_cover
 from merge_sumo.studies.truth import DENSE_CASES, Truth, ground_truth
 from merge_sumo.twin.twin import Twin
 from merge_sumo.values.case import Pool, to_unit
@@ -53,6 +53,9 @@ from merge_sumo.values.prediction import Prediction
 from merge_sumo.values.scenario import LEVELS, US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End
+
+sys.path.append(str(Path(__file__).parent / "benchmark"))
+from oracle import greedy_cover
 
 CASES, BATCH = 400, 20
 WITHOUT = "coverage without its twin"

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.engine.evaluate import evaluation_workers
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError
 from merge_sumo.options import (
+    AnyPath,
     Asked,
     Benchmark,
     Campaign,
@@ -21,17 +26,20 @@ from merge_sumo.options import (
     Judged,
     Limits,
     OfScenario,
+    Recorded,
     Search,
     SearchOfTest,
     Test,
     Truth,
 )
-from merge_sumo.reports.progress import Counter
+from merge_sumo.reports.progress import Bars, Counter
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies.sampler_study import Study
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
 from merge_sumo.values.imperfection import Actuation, Sensing
 from merge_sumo.values.scenario import Scenario
-from merge_sumo.vuts.in_memory import AnyVut, drivers_of
+from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 
 
 def opened(where: Execution, plan: SimulationPlan, *, at_once: bool = False) -> Workers:
@@ -43,9 +51,58 @@ def opened(where: Execution, plan: SimulationPlan, *, at_once: bool = False) -> 
     return evaluation_workers(plan.workers(where.workers), here_s)
 
 
-def counter(where: Execution, title: str, total: int, unit: str = "cases") -> Counter:
-    """Return a bar that counts things called `unit`, to be used in `with`."""
-    return Counter(title, total, unit, shown=where.progress)
+@contextmanager
+def opened_study(
+    run: Run,
+    asked: Recorded,
+    title: str,
+    total: int | Mapping[Engine, int],
+    unit: str = "cases",
+    *,
+    engine: str | None = None,
+) -> Iterator[RunStudy]:
+    """Open a campaign for a study that runs cases of it, with a bar that counts `total` of them.
+
+    "{vut}" in the title stands for the VUT; a total may depend on the engine.
+    """
+    settings, plan, where = today(run, asked)
+    plan = plan.with_engine(engine)
+    number = total if isinstance(total, int) else total[plan.engine]
+    bar = Counter(title.format(vut=settings.vut), number, unit, shown=where.progress)
+    with opened(where, plan) as workers, bar:
+        yield RunStudy(run, settings, plan, workers, bar.ended)
+
+
+def today(run: Run, asked: Recorded) -> tuple[CampaignSettings, SimulationPlan, Execution]:
+    """Return how and where cases of a campaign run today: settings, their plan, and the place."""
+    fields, where = stated(asked, asked.vut, {"vut": run.vut})
+    settings = settings_of(run.folder, run.settings, fields)
+    return settings, resolve(settings), where
+
+
+@contextmanager
+def opened_truths(
+    settings: CampaignSettings, where: Execution, engine: str | None = None
+) -> Iterator[Study]:
+    """Open a study of truths; the cache of objects of this process is a passing one.
+
+    Raises `UserError` for an engine that a level does not allow.
+    """
+    plan = resolve(settings)
+    for level in settings.levels:
+        plan.at_level(level).with_engine(engine)
+    passing = is_here(settings.vut) or is_here(settings.pov or "")
+    with (
+        opened(where, plan, at_once=True) as workers,
+        tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder,
+        Bars(shown=where.progress) as bars,
+    ):
+        yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
+
+
+def path_of(path: AnyPath | None) -> Path | None:
+    """Return what a person names as a path."""
+    return None if path is None else Path(path)
 
 
 def scenario_of(

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
-
-import numpy as np
+from typing import Any, Final
 
 from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.plausibility import doubts
@@ -28,22 +25,17 @@ from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.stopping import LITTLE, WINDOW
+from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.studies.comparison import Change, Comparison, compare_against
-from merge_sumo.studies.truth import REAL_REGION, Truth
-from merge_sumo.system.printable import counted, printable, quoted
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.episode import Episode
-from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import US23, level_name
+from merge_sumo.values.scenario import US23
 from merge_sumo.values.score import Measures, Outcome
 from merge_sumo.values.trajectory import End, Trajectory
-
-if TYPE_CHECKING:
-    from merge_sumo.training.check import PolicyCheck
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""
@@ -306,126 +298,11 @@ class CaseRun(Result):
         return lines_of(self.outcome, self.trajectory)
 
 
-@dataclass(frozen=True, repr=False)
-class TruthResult(Result):
-    """The ground truth of a VUT at one or more POV levels.
-
-    Attributes:
-        vut: the VUT.
-        truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
-            points of the `failures`, (m, d).
-        criterion: what counts as a failure.
-        tolerated: share of its runs in which a case may fail.
-    """
-
-    vut: str
-    truths: dict[int, Truth]
-    criterion: Criterion
-    tolerated: float = 0.0
-
-    @property
-    def cases(self) -> int:
-        """Number of cases, over all levels."""
-        return sum(len(truth.margin) for truth in self.truths.values())
-
-    @property
-    def failures(self) -> int:
-        """Number of failures, over all levels."""
-        return sum(len(truth.failures) for truth in self.truths.values())
-
-    @property
-    def fmc(self) -> float:
-        """Failure mode coverage, summed over the levels."""
-        return sum(fmc(truth.failures) for truth in self.truths.values())
-
-    @property
-    def real_regions(self) -> int | None:
-        """Number of failing regions with at least 3 % of the failures of their level.
-
-        None where the failures of a level are too few to tell regions.
-        """
-        if not all(truth.tells_regions for truth in self.truths.values()):
-            return None
-        return sum(len(truth.real_regions()) for truth in self.truths.values())
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints: that of the level, or sums with a list of the levels."""
-        records = [
-            {
-                "vut": self.vut,
-                "level": level,
-                "cases": len(truth.margin),
-                "failures": len(truth.failures),
-                "fmc": fmc(truth.failures),
-                "region_sizes": np.bincount(regions(truth.failures)).tolist(),
-                "real_regions": len(truth.real_regions()) if truth.tells_regions else None,
-                "fmc_growth": truth.growth,
-                "too_small": truth.is_small,
-                "fail_when": self.criterion.text,
-                "in_sumo": truth.in_sumo,
-                **(
-                    {}
-                    if truth.runs is None
-                    else {"runs": truth.all_runs, "tolerated": self.tolerated}
-                ),
-            }
-            for level, truth in self.truths.items()
-        ]
-        if len(records) == 1:
-            return records[0]
-        sums = {name: getattr(self, name) for name in ("cases", "failures", "fmc", "real_regions")}
-        text = self.criterion.text
-        return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": records}
-
-    def lines(self) -> list[str]:
-        """Return a line for each level, and any criterion but the default one in words."""
-        lines = []
-        for level, truth in self.truths.items():
-            lines.append(
-                f"{self.vut} at level {level_name(level)}: "
-                f"{counted(len(truth.failures), 'failure')} in "
-                f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
-                f"{_regions_of(truth)}{_engine_of(truth)}"
-            )
-            lines += [f"  {remark}" for remark in truth.remarks()]
-            if truth.runs is not None:
-                said = f"more than {self.tolerated:.0%} of its runs do" if self.tolerated else ""
-                lines.append(
-                    f"  {truth.all_runs} runs; a case fails where {said or 'any of its runs does'}"
-                )
-        return [*lines, f"  a case fails when {self.criterion.words}"]
+def campaign_of(run: AnyRun) -> CampaignRun:
+    """Open a campaign that a person names."""
+    return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
 
 
-def _regions_of(truth: Truth) -> str:
-    """Return in words how many regions there are; "" where too few failures tell them."""
-    if not truth.tells_regions:
-        return ""
-    regions = counted(len(truth.real_regions()), "region")
-    return f", {regions} with at least {REAL_REGION:.0%} of the failures"
-
-
-def _engine_of(truth: Truth) -> str:
-    """Return in words which cases SUMO did not run; "" where it ran all."""
-    if truth.in_sumo == truth.all_runs:
-        return ""
-    cases = counted(truth.in_sumo, "case")
-    return f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-
-
-class PolicyChecks(Result, dict[str, "PolicyCheck"]):
-    """`PolicyCheck` by the name of the network."""
-
-    def lines(self) -> list[str]:
-        """Return a table of the checks."""
-        titles = (
-            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
-        )
-        return [
-            titles,
-            *(
-                f"{name:<7}  {one.mean_regret:11.2%}  {one.p99_regret:10.2%}  "
-                f"{one.collisions:10d}  {one.avoidable_collisions:9d}  "
-                f"{one.mean_return:11.3f}  {one.mean_best:.3f}  {one.mean_level0:.3f}"
-                for name, one in self.items()
-            ),
-        ]
+def folder_of(run: AnyRun) -> Path:
+    """Return the folder of a campaign that a person names."""
+    return Path(run) if isinstance(run, str | Path) else run.folder

@@ -55,6 +55,8 @@ OPTIONS: Final[Mapping[str, str]] = {
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
     "campaign --batch": "a sampler chooses the size of its batches; `ms.campaign(batch=20)` in "
     "Python has another",
+    "repair --resume": "a repair begins anew in a folder of its own: the same seed gives the same "
+    "values, and `trials.jsonl` of the other folder has its trials",
     "compare --vut": "`merge-sumo benchmark` compares samplers on a VUT",
 }
 """What replaces an option, by its name with dashes, in every command that does not have it.

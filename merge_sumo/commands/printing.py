@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from merge_sumo.analysis.result import Result
 
 __all__ = ["folder_of", "notices_printed", "print_json", "print_result", "quoted"]
-__all__ += ["same_command", "say", "show", "stoppable"]
+__all__ += ["say", "show", "stoppable"]
 
 
 def show(line: object) -> None:
@@ -78,12 +78,6 @@ def folder_of(out: Path | None, resume: Path | None, what: str) -> Path:
     if resume is not None and out is not None:
         raise UserError("--resume names the folder: leave --out away")
     return resume or out or dated(what)
-
-
-def same_command(folder: Path) -> str | None:
-    """Return how to go on with what was stopped in a folder; None where nothing was written."""
-    same = f"stopped; go on with the same command and --resume {quoted(folder)}, without --out"
-    return same if folder.exists() else None
 
 
 @contextmanager

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -11,8 +9,6 @@ import typer
 from merge_sumo import options
 from merge_sumo.commands.application import Given, app
 from merge_sumo.commands.campaigns import RunArgument, VutOption
-from merge_sumo.commands.printing import folder_of, same_command, stoppable
-from merge_sumo.options import WHERE
 
 
 @app.verb(options.Truth)
@@ -33,7 +29,8 @@ def benchmark(given: Given, vut: VutOption) -> None:
 def probability(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
-    given.print(api.probability(run, **given.written))
+    file = given.keywords["out"] or run / "probability.json"
+    given.print(api.probability(run, **given.written), file=file)
 
 
 @app.verb(options.Explain)
@@ -51,23 +48,11 @@ def explain(
 
 
 @app.verb(options.Repair)
-def repair(
-    given: Given,
-    run: RunArgument,
-    resume: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR", help="Go on with the repair in this folder.", rich_help_panel=WHERE
-        ),
-    ] = None,
-) -> None:
+def repair(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
-    folder = folder_of(given.keywords["out"], resume, f"repair-{run.name}")
-    again = {"out": folder, "resume": resume is not None}
-    with stoppable("trial or batch", partial(same_command, folder)) as check:
-        result = api.repair(run, **{**given.written, **again, "check": check})
-    given.print(result)
+    result = api.repair(run, **given.written)
+    given.print(result, page=result.folder / "repair.html")
     raise typer.Exit(0 if result.verified else 1)
 
 

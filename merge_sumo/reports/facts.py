@@ -15,9 +15,9 @@ from merge_sumo.analysis.summary import LevelSummary, Summary
 from merge_sumo.analysis.verdict import Verdict
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.studies.counterfactuals import AVOIDANCE, read_avoidance
-from merge_sumo.studies.probability import RESULT, probability_of
-from merge_sumo.studies.stress import STRESS, stress_of
+from merge_sumo.studies.counterfactuals import AVOIDANCE
+from merge_sumo.studies.probability import PROBABILITY
+from merge_sumo.studies.stress import STRESS
 from merge_sumo.system.printable import printable
 from merge_sumo.values.chance import MOST_RUNS, by_case, is_decided
 from merge_sumo.values.fmc import radius_for
@@ -235,32 +235,32 @@ def _motion(run: Run) -> Iterator[Fact]:
 
 
 def _avoided(run: Run) -> Iterator[Fact]:
-    known = list(read_avoidance(run).values())
+    known = list(AVOIDANCE.read_lines(run).values())
     if not known:
         return
     if len(known) < sum(outcome.failed for outcome in run.cases):
-        yield Fact("failures that reference drivers drove", len(known), "", AVOIDANCE, "lines")
+        yield Fact("failures that reference drivers drove", len(known), "", AVOIDANCE.name, "lines")
     for name in REFERENCES:
         number = sum(name in one.avoided_by for one in known)
-        yield Fact(f"failures that driver {name} avoids", number, "", AVOIDANCE, "avoided_by")
+        yield Fact(f"failures that driver {name} avoids", number, "", AVOIDANCE.name, "avoided_by")
     times = [one.latest_takeover_s for one in known if one.latest_takeover_s is not None]
     if times:
         middle = statistics.median_low(times)
         name = "last time at which driver fsm may take over, in the median"
-        yield Fact(name, middle, "s", AVOIDANCE, "latest_takeover_s")
+        yield Fact(name, middle, "s", AVOIDANCE.name, "latest_takeover_s")
     number = sum(one.pov_careful for one in known)
-    yield Fact("failures that a careful POV avoids", number, "", AVOIDANCE, "pov_careful")
+    yield Fact("failures that a careful POV avoids", number, "", AVOIDANCE.name, "pov_careful")
 
 
 def _studies(run: Run) -> Iterator[Fact]:
-    stress = stress_of(run.folder)
+    stress = STRESS.read(run.folder)
     if stress is not None and stress.failures:
         name = f"failures that stay failures in all {stress.runs} runs of the stress test"
-        yield Fact(name, len(stress.robust), "", STRESS, "rungs")
-    known = probability_of(run.folder)
+        yield Fact(name, len(stress.robust), "", STRESS.name, "rungs")
+    known = PROBABILITY.read(run.folder)
     if known is not None and known.overall is not None:
         for name in ("probability", "low", "high"):
             end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
             value, key = 100.0 * getattr(known.overall, name), f"overall.{name}"
-            yield Fact(f"probability that a case fails{end}", value, PERCENT, RESULT, key)
-        yield Fact("fresh cases of that", known.cases, "", RESULT, "cases")
+            yield Fact(f"probability that a case fails{end}", value, PERCENT, PROBABILITY.name, key)
+        yield Fact("fresh cases of that", known.cases, "", PROBABILITY.name, "cases")

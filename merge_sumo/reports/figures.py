@@ -98,7 +98,7 @@ def colour(name: str) -> str:
 
 
 def coverage_curves(title: str, study: SamplerStudy) -> Figure:
-    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit, oracle."""
+    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit."""
     with _drawing(title, 7.5, 4.6) as figure:
         axes = figure.subplots()
         for name, result in study.samplers.items():
@@ -107,8 +107,6 @@ def coverage_curves(title: str, study: SamplerStudy) -> Figure:
             axes.fill_between(cases, low, high, color=colour(name), alpha=0.18, linewidth=0)
             axes.plot(cases, median, color=colour(name), lw=2, label=name)
             axes.set_xlim(0, cases[-1])
-        oracle = study.oracle_fmc
-        axes.plot([*oracle], [*oracle.values()], color="black", lw=1.2, ls="--", label="oracle")
         axes.axhline(study.truth_fmc, color="black", lw=1.2, label=TRUTH)
         axes.axhline(study.limit_fmc, color="black", lw=1.2, ls=":", label="limit")
         axes.set_ylim(0.0)

@@ -5,18 +5,21 @@ It is one HTML file without scripts that loads nothing.
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import Final
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.reports.comparison_page import STYLES, comparison_page
 from merge_sumo.reports.pages import page
 from merge_sumo.studies.comparison import cut
-from merge_sumo.studies.repair import CHANGES, MEASURED_BY, PAGE, RESULT, Repair
+from merge_sumo.studies.repair import MEASURED_BY, RepairResult
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import to_json
 
+PAGE: Final = "repair.html"
+CHANGES: Final = "changes.html"
 
-def write_repair(repair: Repair, before: Run) -> None:
+
+def write_repair(repair: RepairResult, before: Run) -> None:
     """Write the result of a repair of a campaign, its page, and that of its last comparison."""
     html = page(
         "repair.html.jinja",
@@ -27,9 +30,8 @@ def write_repair(repair: Repair, before: Run) -> None:
         cut=cut,
         changes=CHANGES,
     )
-    files = {RESULT: to_json(repair.to_record(), indent=1).decode(), PAGE: html}
-    best = repair.best
-    if best.compared is not None:
+    files = {"repair.json": to_json(repair.to_record(), indent=1).decode(), PAGE: html}
+    if (best := repair.best) is not None:
         files[CHANGES] = comparison_page(best.compared, [None, best.campaign])
     for name, text in files.items():
-        replace_own(Path(repair.folder) / name, text.encode(errors="backslashreplace"))
+        replace_own(repair.folder / name, text.encode(errors="backslashreplace"))

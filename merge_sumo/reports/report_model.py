@@ -20,9 +20,9 @@ from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.studies.comparison import compare_against
-from merge_sumo.studies.counterfactuals import read_avoidance
-from merge_sumo.studies.explanation import read_explanations
-from merge_sumo.studies.stress import stress_of
+from merge_sumo.studies.counterfactuals import AVOIDANCE
+from merge_sumo.studies.explanation import EXPLANATIONS
+from merge_sumo.studies.stress import STRESS
 from merge_sumo.values.chance import by_case
 from merge_sumo.values.scenario import LEVELS
 from merge_sumo.values.score import Outcome
@@ -81,9 +81,9 @@ class ReportModel:
             self.surfaces[level] = learn_surface(run.outcomes, level, run.tolerated)
             on_part(done, len(self.levels))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
-        self.stress = stress_of(run.folder)
-        self.avoidance = read_avoidance(run)
-        self.explanations = read_explanations(run)
+        self.stress = STRESS.read(run.folder)
+        self.avoidance = AVOIDANCE.read_lines(run)
+        self.explanations = EXPLANATIONS.read_lines(run)
         self.against = compare_against(run)
         self._choose_cases()
         self.motion = run.trajectories(outcome.index for outcome in self.shown)

@@ -27,23 +27,19 @@ from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import LevelSummary, summarise
 from merge_sumo.analysis.verdict import judge
-from merge_sumo.campaigns.repeats import cause
 from merge_sumo.campaigns.run import Run
-from merge_sumo.campaigns.settings import CampaignSettings, same_pov
+from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
-from merge_sumo.engine.plan import versions as versions_of_packages
 from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.system.hashing import changed
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_plain
-from merge_sumo.values.case import Case, FloatArray, to_unit
+from merge_sumo.values.case import Case, to_unit
 from merge_sumo.values.chance import RunsOfCase, by_case, one_per_case
 from merge_sumo.values.fmc import fmc, radius_for, regions
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.values.severity import Severity
-from merge_sumo.vuts.spec import is_built_in
 
 LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""
@@ -200,7 +196,6 @@ class Region(Record, frozen=True):
         fmc: their volume.
         cases: cases in the region that the other version tested.
         failed: those of them that failed.
-        looked_at: share of the volume that these cases cover.
     """
 
     change: Change
@@ -211,7 +206,6 @@ class Region(Record, frozen=True):
     fmc: float
     cases: int
     failed: int
-    looked_at: float
 
 
 @dataclass(frozen=True)
@@ -278,11 +272,9 @@ class Step:
         order = list(Change)
         return dict(sorted(found.items(), key=lambda row: (order.index(row[0][0]), -row[1])))
 
-    def count(self, change: Change, level: int | None = None) -> int:
-        """Return the number of cases of which that became, at a level or in all."""
-        return sum(
-            case.change is change for case in self.cases if level in (None, case.a.case.level)
-        )
+    def count(self, change: Change) -> int:
+        """Return the number of cases of which that became."""
+        return sum(case.change is change for case in self.cases)
 
     def table_lines(self) -> list[str]:
         """Return the table of transitions as lines."""
@@ -316,15 +308,12 @@ class Comparison(Result):
         steps: what changed.
         source: a sentence on where the cases come from.
         notes: sentences on what limits the comparison.
-        unrepeated: indices of the cases that went otherwise although the VUT is the same by its
-            name and its files; empty where it is another one.
     """
 
     versions: tuple[Version, ...]
     steps: tuple[Step, ...]
     source: str
     notes: tuple[str, ...] = ()
-    unrepeated: tuple[int, ...] = ()
 
     @property
     def broke(self) -> int:
@@ -383,15 +372,6 @@ class Comparison(Result):
             folder = self.versions[step.after - 1].folder
             if cases and folder is not None:
                 text.append(f"  look at one: merge-sumo replay {quoted(folder)} {cases[0].b.index}")
-        for level, regions_there in step.regions.items():
-            shown = [one for one in regions_there if one.change is Change.LATER_ALONE]
-            at = f"regions found in the later alone at level {level_name(level)}"
-            text += [f"{at}{cut(len(shown), LISTED)}:"] if shown else []
-            text += [
-                f"  {one.where}: {counted(one.failures, 'failure')}, the other version passed "
-                f"{counted(one.cases, 'case')} there"
-                for one in shown[:LISTED]
-            ]
         return text
 
     def fmc(self) -> dict[int, list[str]]:
@@ -416,16 +396,12 @@ class Comparison(Result):
             "versions": [version.to_record() for version in self.versions],
             "steps": [step.to_record() for step in self.steps],
             "notes": list(self.notes),
-            "unrepeated": list(self.unrepeated),
         }
 
 
 def cut(number: int, most: int) -> str:
     """Return how many of a list are shown, as behind its name."""
     return f", the first {most} of {number}" if number > most else f", {number}"
-
-
-# Recorded campaigns.
 
 
 def compare(runs: Sequence[Run]) -> Comparison:
@@ -468,44 +444,35 @@ def compare_against(run: Run) -> Comparison | None:
         run.levels,
     )
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
-    return _comparison_of_two(before, Version.of(run), source)
+    return _of_two(before, Version.of(run), source)
 
 
-def _comparison_of_two(
-    before: Version, after: Version, source: str, *more: tuple[Any, ...]
-) -> Comparison:
-    """Return the comparison of two versions that ran the same cases; `more` as in `Comparison`."""
-    return Comparison((before, after), (_step((before, after), 1),), source, *more)
+def _of_two(before: Version, after: Version, source: str) -> Comparison:
+    """Return the comparison of two versions that ran the same cases."""
+    return Comparison((before, after), (_step((before, after), 1),), source)
 
 
 def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
     """Compare a campaign with what another VUT does in its cases."""
     version = Version.of(after)
     earlier = Version(vut, None, before, after.tolerated, version.levels)
-    return _comparison_of_two(earlier, version, f"the cases come from the search of {after.vut}")
+    return _of_two(earlier, version, f"the cases come from the search of {after.vut}")
 
 
 def _check_comparable(a: Run, b: Run) -> None:
-    if a.scenario != b.scenario:
-        raise UserError(
-            f"{a.folder} is of the scenario {a.scenario.name} and {b.folder} of another or a "
-            f"changed one, {b.scenario.name}: compare campaigns of one scenario"
-        )
-    if a.criterion != b.criterion:
-        raise UserError(
-            f"a case of {a.folder} fails when {a.criterion.text}, and one of {b.folder} when "
-            f"{b.criterion.text}: compare campaigns with the same criterion"
-        )
-    if a.tolerated != b.tolerated:
-        raise UserError(
-            f"{a.folder} tolerates {a.tolerated:g} of the runs of a case and {b.folder} "
-            f"{b.tolerated:g}: compare campaigns with the same share"
-        )
-    for level in sorted(set(a.levels) & set(b.levels)):
-        if not same_pov(a.settings, b.settings, level):
+    differing = {
+        "the scenario": a.scenario != b.scenario,
+        "what counts as a failure": a.criterion != b.criterion,
+        "the share of its runs in which a case may fail": a.tolerated != b.tolerated,
+        **{
+            f"the POV of level {level_name(level)}": not same_pov(a.settings, b.settings, level)
+            for level in sorted(set(a.levels) & set(b.levels))
+        },
+    }
+    for name, differs in differing.items():
+        if differs:
             raise UserError(
-                f"the POV of level {level_name(level)} is another in {a.folder} than in "
-                f"{b.folder}: compare campaigns with the same POVs"
+                f"{a.folder} and {b.folder} differ in {name}: compare campaigns that have the same"
             )
 
 
@@ -519,10 +486,7 @@ def _notes(runs: Sequence[Run]) -> list[str]:
         )
     if len({str(run.settings.get("net_sha256")) for run in runs}) > 1:
         notes.append("The campaigns were not all run on the same net.")
-    for number, run in enumerate(runs, start=1):
-        wanted = run.settings.get("cases")
-        if run.torn or (isinstance(wanted, int) and len(run.outcomes) < wanted):
-            notes.append(f"Campaign {number} ended after {len(run.outcomes)} of {wanted} cases.")
+    notes += [f"{run.folder}: {run.interruption}" for run in runs if run.interruption]
     return notes
 
 
@@ -530,73 +494,58 @@ def _step(found: Sequence[Version], after: int) -> Step:
     """Return what changed to the version at a place from the one before it."""
     earlier, later = found[after - 1], found[after]
     cases = paired(earlier.outcomes, later.outcomes, later.tolerated)
-    own_regions = {}
+    regions_at = {}
     for level in sorted(set(earlier.levels) & set(later.levels)):
-        a, b = (_Tested(version, level) for version in (earlier, later))
-        at_level = sum(case.a.case.level == level for case in cases)
-        if at_level < max(a.count, b.count):
-            own_regions[level] = _regions(after, a, b)
-    return Step(after, after + 1, cases, own_regions)
+        sides = [[o for o in one.cases if o.case.level == level] for one in (earlier, later)]
+        if sum(case.a.case.level == level for case in cases) < max(map(len, sides)):
+            regions_at[level] = _regions(after, *sides)
+    return Step(after, after + 1, cases, regions_at)
 
 
-class _Tested:
-    """The cases of a version at a level that have a verdict, and their points, (n, d)."""
-
-    def __init__(self, version: Version, level: int) -> None:
-        own = [outcome for outcome in version.cases if outcome.case.level == level]
-        self.count = len(own)
-        self.outcomes = [outcome for outcome in own if outcome.is_tested]
-        self.failures = [outcome for outcome in self.outcomes if outcome.failed]
-        self.points, self.failing = (
-            to_unit((o.case for o in some), level) for some in (self.outcomes, self.failures)
-        )
-        self._tree = cKDTree(self.points) if self.outcomes else None
-
-    def near(self, points: FloatArray, radius: float) -> list[int]:
-        """Return the places of cases no further than a radius from one of some points, (m, d)."""
-        if self._tree is None:
-            return []
-        return sorted(set().union(*self._tree.query_ball_point(points, radius * (1.0 + ROUNDING))))
-
-    def regions(self, number: int, other: _Tested, none_failed: Change) -> list[Region]:
-        """Return the regions of failures, and what the other version's cases say of them.
-
-        A region where the other one's cases do not fail became `none_failed`.
-        """
-        radius, labels = radius_for(self.points.shape[1]), regions(self.failing)
-        found = []
-        for label in range(int(labels.max(initial=-1)) + 1):
-            points = self.failing[labels == label]
-            own = [self.failures[place] for place in np.flatnonzero(labels == label)]
-            inside, around = (other.near(points, radius * r) for r in (1.0, 2.0))
-            failed = sum(other.outcomes[place].failed for place in inside)
-            volume, seen = fmc(points), other.points[around]
-            shared = volume + fmc(seen) - fmc(np.concatenate([points, seen]))
-            change = none_failed if inside else Change.NOT_SEEN
-            found.append(
-                Region(
-                    change=Change.NEITHER if failed else change,
-                    version=number,
-                    failures=len(own),
-                    worst=min(own, key=lambda o: (o.margin, o.index)).index,
-                    where=_box_in_words([o.case for o in own]),
-                    fmc=volume,
-                    cases=len(inside),
-                    failed=failed,
-                    looked_at=min(max(shared / volume, 0.0), 1.0),
-                )
-            )
-        return found
-
-
-def _regions(number: int, earlier: _Tested, later: _Tested) -> list[Region]:
-    """Return the regions of two versions, of which the earlier one has a number; as `Change`."""
-    own = earlier.regions(number, later, Change.EARLIER_ALONE)
-    new = later.regions(number + 1, earlier, Change.LATER_ALONE)
+def _regions(number: int, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> list[Region]:
+    """Return the regions of two versions at a level, of which the earlier one has a number."""
+    own = _regions_of(number, earlier, later, Change.EARLIER_ALONE)
+    new = _regions_of(number + 1, later, earlier, Change.LATER_ALONE)
     # Where both fail the region is given once, as one of the earlier version.
     both = [*own, *(region for region in new if not region.failed)]
     order = list(Change)
     return sorted(both, key=lambda one: (order.index(one.change), -one.fmc, one.worst))
+
+
+def _regions_of(
+    number: int, outcomes: Sequence[Outcome], others: Sequence[Outcome], none_failed: Change
+) -> list[Region]:
+    """Return the regions of failures of a version, and what the other one's cases say of them.
+
+    A region where the other one's cases do not fail became `none_failed`.
+    """
+    failing, tested = [o for o in outcomes if o.failed], [o for o in others if o.is_tested]
+    if not failing:
+        return []
+    level = failing[0].case.level
+    points, of_others = (to_unit((o.case for o in some), level) for some in (failing, tested))
+    labels, limit = regions(points), radius_for(points.shape[1]) * (1.0 + ROUNDING)
+    found = []
+    for label in np.unique(labels):
+        at = points[labels == label]
+        own = [failing[place] for place in np.flatnonzero(labels == label)]
+        near = cKDTree(at).query(of_others)[0] <= limit if tested else ()
+        inside = [tested[place] for place in np.flatnonzero(near)]
+        failed = sum(outcome.failed for outcome in inside)
+        change = none_failed if inside else Change.NOT_SEEN
+        found.append(
+            Region(
+                change=Change.NEITHER if failed else change,
+                version=number,
+                failures=len(own),
+                worst=min(own, key=lambda o: (o.margin, o.index)).index,
+                where=_box_in_words([o.case for o in own]),
+                fmc=fmc(at),
+                cases=len(inside),
+                failed=failed,
+            )
+        )
+    return found
 
 
 def _box_in_words(cases: Sequence[Case]) -> str:
@@ -610,25 +559,35 @@ def _box_in_words(cases: Sequence[Case]) -> str:
     return ", ".join(parts)
 
 
-# Recorded cases with a changed VUT.
+def chosen(run: Run, indices: Sequence[int], level: str = "all") -> list[Outcome]:
+    """Return cases of a campaign by their indices, by default all, of a level or of all.
 
-
-def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
-    """Run cases of a campaign again, by default all, with the settings of the study and their plan.
-
-    Raises `UserError` for an index without a case, and where net or POV are not the campaign's:
-    then not only the VUT would have changed.
+    Raises `UserError` for an index without a case, and where there is no such case.
     """
-    run, settings, plan = study.run, study.settings, study.plan
-    before = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
-    if not before:
-        raise UserError(f"{run.folder} has no case yet")
+    found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
+    names = {level_name(number): number for number in run.levels}
+    if level != "all" and level not in names:
+        there = ", ".join(names)
+        raise UserError(f"{run.folder} has no cases at level {level}: it has {there}, or all")
+    found = [one for one in found if level == "all" or one.case.level == names[level]]
+    if not found:
+        raise UserError(f"{run.folder} has none of these cases: name others, or another level")
+    return found
+
+
+def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
+    """Run cases of a campaign again, with the settings of the study and their plan.
+
+    Raises `UserError` where net or POV are not the campaign's: then not only the VUT would have
+    changed.
+    """
+    run, settings = study.run, study.settings
     levels = sorted({outcome.case.level for outcome in before})
-    study.check_same_road(levels)
+    study.check_same_system(levels)
     # In another order than the campaign's, which a VUT that remembers would repeat.
     order, by_index = before[::-1], dict[int, Outcome]()
+    plan = study.plan.for_cases(len(before))
     with workers_or_here(study.workers) as processes:
-        plan = plan.for_cases(len(before))
         open_simulators(plan, processes)
         for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
             old = order[place]
@@ -642,43 +601,8 @@ def rerun(study: RunStudy, indices: Sequence[int] = ()) -> Comparison:
         f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
         f"now alone fails may lie elsewhere: `{search}` searches there"
     )
-    unrepeated = _unrepeated(before, after) if _same_vut(run, settings) else ()
-    notes: tuple[str, ...] = ()
-    if unrepeated:
-        notes = (
-            f"{len(unrepeated)} of {counted(len(after), 'case')} went differently, and no file of "
-            f"the VUT has changed (the first is case {unrepeated[0]}). {cause()}.",
-        )
-    return _comparison_of_two(
+    return _of_two(
         Version(run.vut, str(run.folder), before, run.tolerated, levels),
         Version(settings.vut, None, after, run.tolerated, levels),
         source,
-        notes,
-        unrepeated,
-    )
-
-
-def _same_vut(run: Run, settings: CampaignSettings) -> bool:
-    """Return whether a VUT that is not of the package is the one that was recorded."""
-    recorded, files = run.settings, run.settings.get("vut_files")
-    return (
-        not is_built_in(settings.vut)
-        and settings.vut == recorded.get("vut")
-        and recorded.get("versions") == versions_of_packages()
-        and isinstance(files, dict)
-        and not changed(files)
-    )
-
-
-def _unrepeated(before: Sequence[Outcome], after: Sequence[Outcome]) -> tuple[int, ...]:
-    """Return the indices of the cases that did not go as before, except those with an error."""
-
-    def motion(outcome: Outcome) -> tuple[object, ...]:
-        found = outcome.measures
-        return found.end, found.t_end_s, found.dx_m, found.dv_mps, found.clipped_steps
-
-    return tuple(
-        a.index
-        for a, b in zip(before, after, strict=True)
-        if not (a.measures.end.is_error or b.measures.end.is_error) and motion(a) != motion(b)
     )

@@ -10,22 +10,16 @@ The cases of the failures of a campaign run again, without the VUT and without r
 
 The drivers of the package need nothing of SUMO, so the episodes are those of eq. (4)
 (`engine/kinematic_world.py`), many at a time. Where the POV is the tester's own they run in SUMO.
-
-avoidance.jsonl         in the folder of the campaign: one line per failure, in the order of cases;
-                        of very many, the worst
-
-The file of a folder which somebody sent is data as everything in it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -39,23 +33,20 @@ from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import povs_for
-from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.sumo.world import World
-from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import read_indexed, to_json
+from merge_sumo.system.records import Record
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.bodies import CentreLines
 from merge_sumo.values.case import Case, FloatArray, MergeCase
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import DT_S, EpisodeTime, Scenario
-from merge_sumo.values.score import Outcome
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.output import LOG
 
-AVOIDANCE: Final = "avoidance.jsonl"
 CAREFUL: Final = "careful"
 """The reference driver that takes the place of a careful one."""
 TAKES_OVER: Final = "fsm"
@@ -76,8 +67,7 @@ CORRIDORS: Final = 1024
 1024, 1.0 s with 512, 1.5 s with 256."""
 
 
-@dataclass(frozen=True, slots=True)
-class Avoidance:
+class Avoidance(Record, frozen=True):
     """Which drivers would have avoided a failure.
 
     Attributes:
@@ -90,38 +80,13 @@ class Avoidance:
     """
 
     index: int
-    avoided_by: tuple[str, ...]
+    avoided_by: tuple[Literal[*REFERENCES], ...]  # type: ignore[valid-type]
     latest_takeover_s: EpisodeTime | None
     pov_careful: bool
 
-    def __post_init__(self) -> None:
-        """Raise `UserError` for other drivers than the reference drivers, or another order."""
-        if [name for name in REFERENCES if name in self.avoided_by] != list(self.avoided_by):
-            raise UserError(f"avoided_by is {self.avoided_by}: choose from {', '.join(REFERENCES)}")
 
-
-# The file of a campaign.
-
-
-def write_avoidance(folder: Path, avoidances: Iterable[Avoidance]) -> Path:
-    """Write avoidances into the folder of a campaign, in the place of an older one."""
-    path = folder / AVOIDANCE
-    replace_own(path, b"".join(map(to_json, avoidances)))
-    return path
-
-
-def read_avoidance(run: Run) -> dict[int, Avoidance]:
-    """Return by index what the folder of a campaign says of its failures.
-
-    Empty where it says nothing. Raises `UserError` for a line that is not of one of its failures.
-    """
-    failing = {outcome.index for outcome in run.cases if outcome.failed}
-    return read_indexed(run.folder / AVOIDANCE, Avoidance, failing)
-
-
-# The failures of a campaign.
-
-
+AVOIDANCE: Final = StudyFile("avoidance.jsonl", Avoidance)
+"""One line per failure; of very many, the worst."""
 Failure = tuple[int, Trajectory]
 """The index of a failing case, and its recorded motion."""
 
@@ -147,8 +112,8 @@ def avoidance(
         check: called whenever a worker is done with some of them; may raise to stop there.
         on_part: told how many failures are done, and how many there are, from 0 on.
     """
-    worst = sorted(failures(run.cases)[:MOST], key=lambda outcome: outcome.index)
-    failing = [(o.index, motion) for o in worst if (motion := _trajectory(run, o)) is not None]
+    worst = sorted(outcome.index for outcome in failures(run.cases)[:MOST])
+    failing = list(run.trajectories(worst).items())
     if not failing:
         return []
     # No code of the VUT: a driver of the package is in its place.
@@ -168,18 +133,8 @@ def avoidance(
     return sorted(avoided, key=lambda one: one.index)
 
 
-def _trajectory(run: Run, outcome: Outcome) -> Trajectory | None:
-    try:
-        return run.trajectory(outcome.index)
-    except UserError:
-        return None
-
-
 def _unknown(_: Failure) -> None:
     """Return nothing for a failure that ended every worker that ran it."""
-
-
-# The episodes.
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

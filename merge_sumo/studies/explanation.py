@@ -8,11 +8,6 @@ of the grid is missed, so the step of the grid is recorded.
 
 A case passes where it has a verdict and does not fail; a value that the controller refuses does not
 pass. What is said of a case runs a second time, in SUMO.
-
-explanations.jsonl      in the folder of a campaign: one line per explained failure, in the order of
-                        cases
-
-The file of a folder which somebody sent is data as everything in it.
 """
 
 from __future__ import annotations
@@ -20,7 +15,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any, Final
 
 from msgspec import Meta
@@ -32,11 +26,11 @@ from merge_sumo.campaigns.settings import named_again
 from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
-from merge_sumo.studies.counterfactuals import Avoidance, read_avoidance
+from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.system.folders import replace_own
+from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.records import Record, read_indexed, replaced, to_json, to_plain
+from merge_sumo.system.records import Record, replaced, to_plain
 from merge_sumo.system.suggestions import either
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import Case
@@ -46,7 +40,6 @@ from merge_sumo.vuts.base import VutSpec
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
 
-EXPLANATIONS: Final = "explanations.jsonl"
 START_STEPS: Final = 160
 """Values of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
 PARAMETER_STEPS: Final = 40
@@ -161,6 +154,9 @@ class Explanation(Record, frozen=True):
         return None if axis is None else (axis.name, axis.passing[0])
 
 
+EXPLANATIONS: Final = StudyFile("explanations.jsonl", Explanation)
+
+
 @dataclass(frozen=True, slots=True, repr=False)
 class ExplanationResult(Result):
     """The smallest changes with which a failure of a campaign passes.
@@ -168,21 +164,19 @@ class ExplanationResult(Result):
     Attributes:
         run: the campaign.
         found: what was found.
-        file: file that was written.
     """
 
     run: Run
     found: Explanation
-    file: Path
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
-        return {**to_plain(self.found), "file": str(self.file)}
+        return {**to_plain(self.found), "file": str(self.run.folder / EXPLANATIONS.name)}
 
     def lines(self) -> list[str]:
         """Return the failure, its changes, and a command that runs the smallest."""
         outcome, folder = self.run.outcome(self.found.index), quoted(self.run.folder)
-        avoidance = read_avoidance(self.run).get(self.found.index)
+        avoidance = AVOIDANCE.read_lines(self.run).get(self.found.index)
         words = in_words(self.found, outcome, avoidance)
         lines = [f"case {outcome.index}, POV level {level_name(outcome.case.level)}: "]
         lines[0] += described(outcome.case)
@@ -192,26 +186,7 @@ class ExplanationResult(Result):
             at = f"--at {name}={value!r}"
             at += named_again(self.run.settings)
             lines.append(f"look at it: merge-sumo run --case {folder} {outcome.index} {at}")
-        return [*lines, f"written: {self.file}; in the report: merge-sumo report {folder}"]
-
-
-# The file of a campaign.
-
-
-def read_explanations(run: Run) -> dict[int, Explanation]:
-    """Read what the folder of a campaign says of its failures, by index.
-
-    Raises `UserError` for a line that is not of one of them.
-    """
-    failing = {outcome.index for outcome in run.outcomes if outcome.failed}
-    return read_indexed(run.folder / EXPLANATIONS, Explanation, failing)
-
-
-def _write(run: Run, found: Explanation) -> None:
-    """Write an explanation into the folder of a campaign, beside those of other cases."""
-    known = {**read_explanations(run), found.index: found}
-    lines = b"".join(to_json(known[index]) for index in sorted(known))
-    replace_own(run.folder / EXPLANATIONS, lines)
+        return [*lines, f"in the report: merge-sumo report {folder}"]
 
 
 def failure_of(run: Run, index: int | None) -> Outcome:
@@ -220,18 +195,13 @@ def failure_of(run: Run, index: int | None) -> Outcome:
     Raises `UserError` for a case that is there no more, or did not fail.
     """
     worst = failures(run.cases)[:1]
-    if index is not None:
-        outcome = run.outcome(index)
-        if not outcome.failed:
-            such = "".join(f", such as {o.index}" for o in worst)
-            raise UserError(f"case {index} did not fail: name a failure{such}")
-        return outcome
-    if not worst:
+    if index is None and not worst:
         raise UserError(f"{run.folder} has no failure: nothing can be explained")
-    return worst[0]
-
-
-# The search.
+    outcome = worst[0] if index is None else run.outcome(index)
+    if not outcome.failed:
+        such = "".join(f", such as {o.index}" for o in worst)
+        raise UserError(f"case {index} did not fail: name a failure{such}")
+    return outcome
 
 
 def note_explanation(
@@ -249,33 +219,43 @@ def note_explanation(
     if plan.needs_sumo is not None or not worst:
         return
     try:
-        found = _Search(plan.with_engine(None), worst[0], workers=workers).found(check)
+        found = _Neighbours(plan.with_engine(None), worst[0], workers=workers).found(check)
     except UserError:
         return
     _write(run, found)
 
 
-def explain(study: RunStudy, outcome: Outcome, ranges: Sequence[Range] = ()) -> Explanation:
+def explain(
+    study: RunStudy, index: int | None = None, ranges: Sequence[Range] = ()
+) -> ExplanationResult:
     """Explain a failure of a campaign, and write that into its folder.
 
     Args:
         study: the campaign, and how its cases run.
-        outcome: the failure.
+        index: of the failure; the worst by default.
         ranges: parameters of the VUT that are searched, too.
 
     Raises:
-        UserError: for a campaign with a net or policies of another day, for a parameter that the
-            VUT does not have, and where a case that runs a second time ends otherwise.
+        UserError: for a case that is there no more or did not fail, for a campaign with a net or
+            POVs of another day, for a parameter that the VUT does not have, and where a case that
+            runs a second time ends otherwise.
     """
+    outcome = failure_of(study.run, index)
     study.check_same_system()
     with workers_or_here(study.workers) as opened:
-        found = _Search(study.plan, outcome, ranges, opened).found()
+        found = _Neighbours(study.plan, outcome, ranges, opened).found()
     _write(study.run, found)
     study.on_cases(1)
-    return found
+    return ExplanationResult(study.run, found)
 
 
-class _Search:
+def _write(run: Run, found: Explanation) -> None:
+    """Write an explanation beside those of other cases."""
+    known = {**EXPLANATIONS.read_lines(run), found.index: found}
+    EXPLANATIONS.write_lines(run.folder, [known[index] for index in sorted(known)])
+
+
+class _Neighbours:
     """Runs a failure with other values."""
 
     def __init__(
@@ -353,15 +333,12 @@ class _Search:
         passes = [False] * len(trials)
         for spec in dict.fromkeys(spec for spec, _ in trials):
             places = [place for place, (of, _) in enumerate(trials) if of == spec]
-            cases = [trials[place][1] for place in places]
+            cases, own = [trials[place][1] for place in places], spec == plan.vut.spec
             try:
-                if spec != plan.vut.spec:
-                    vut = VutFactory(spec, plan.vut.options)
-                    ran = list(evaluate(replace(plan, vut=vut), cases, self._workers, pass_of))
-                else:
-                    ran = list(evaluate(plan, cases, self._workers, pass_of))
+                vut = plan.vut if own else VutFactory(spec, plan.vut.options)
+                ran = list(evaluate(replace(plan, vut=vut), cases, self._workers, pass_of))
             except UserError:
-                if spec == plan.vut.spec:
+                if own:
                     raise
                 continue
             for place, passed in ran:
@@ -401,9 +378,6 @@ def _axis(
 def pass_of(results: Episodes) -> list[bool]:
     """Return of each result whether the case has a verdict and does not fail."""
     return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
-
-
-# Words.
 
 
 def in_words(

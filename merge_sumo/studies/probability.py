@@ -26,7 +26,6 @@ most of the levels.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -34,23 +33,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from merge_sumo import options
 from merge_sumo.analysis.exposure import Distribution, read_distribution
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.surface import learn_surface
-from merge_sumo.analysis.traffic import Traffic
+from merge_sumo.analysis.traffic import Traffic, named_traffic
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
-from merge_sumo.engine.plan import Engine, SimulationPlan
+from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
 from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.system.records import Record, read_record, to_json, to_plain
-from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import FloatArray
+from merge_sumo.system.records import Record, to_json
+from merge_sumo.values.case import Case, FloatArray
 from merge_sumo.values.chance import clopper_pearson
 from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.scenario import Scenario, level_name
 
-RESULT: Final = "probability.json"
 DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
 STREAM: Final = 7
 """Key of the random stream, so that it is none of a sampler's."""
@@ -126,8 +125,8 @@ class PerMerge(Record, frozen=True):
     high: float
 
 
-class Probability(Record, frozen=True):
-    """How likely a VUT is to fail, with all that decides it: what probability.json says.
+class ProbabilityResult(Result, Record, frozen=True):
+    """How likely a VUT is to fail, with all that decides it.
 
     Attributes:
         overall: over the levels as they were weighed; None where a traffic has no weights of them.
@@ -154,6 +153,53 @@ class Probability(Record, frozen=True):
     seed: int
     engine: str
     campaign: dict[str, Any]
+
+    def lines(self) -> list[str]:
+        """Return the probability and its interval, the strata, the levels, and what is counted."""
+        at = f"{100.0 * self.confidence:g} % interval"
+        lines = [] if self.per_merge is None else _per_merge_lines(self.per_merge, at)
+        if self.overall is not None:
+            lines.append(f"P(fail): {_interval(self.overall)}, {at}, by {self.cases:,} cases")
+            lines += map(_stratum_line, self.overall.strata)
+        if self.overall is None or len(self.levels) > 1:
+            lines += [
+                f"  level {level_name(level)}: P(fail) {_interval(one)}"
+                for level, one in self.levels.items()
+            ]
+        criterion = Criterion(self.campaign["fail_when"], self.campaign["require"])
+        lines.append(f"  a case fails when {criterion.words}")
+        if errors := sum(s.without_verdict for e in self.levels.values() for s in e.strata):
+            lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
+        if self.in_sumo < self.cases:
+            lines.append(f"  by the equations of motion; {self.in_sumo:,} in SUMO too, all alike")
+        return lines
+
+
+def _interval(one: Estimate) -> str:
+    return f"{one.probability:.3g} [{one.low:.3g}, {one.high:.3g}]"
+
+
+def _stratum_line(one: Stratum) -> str:
+    expected = "failures" if one.expects_failures else "no failure"
+    return (
+        f"  where the campaign expects {expected}, {one.share:.2%} of the cases: {one.failures:,} "
+        f"of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
+    )
+
+
+def _per_merge_lines(one: PerMerge, at: str) -> list[str]:
+    traffic = one.traffic
+    most = "" if one.most == one.least else f" to {one.most:.3g}"
+    return [
+        f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
+        f"{at}, whatever the shares of the POV levels",
+        f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
+        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
+        f"{one.counted_speeds:.0%} of the speeds of this traffic",
+    ]
+
+
+PROBABILITY: Final = StudyFile("probability.json", ProbabilityResult)
 
 
 class Cells(NamedTuple):
@@ -182,41 +228,26 @@ class Counted(NamedTuple):
 
 
 def failure_probability(
-    study: RunStudy,
-    out: Path,
-    *,
-    cases: int | None = None,
-    distribution: Path | None = None,
-    traffic: Traffic | None = None,
-    confidence: float = 0.95,
-    seed: int = 0,
-) -> Probability:
-    """Estimate how likely the VUT of a campaign is to fail, with fresh cases.
+    study: RunStudy, asked: options.Probability, out: Path
+) -> ProbabilityResult:
+    """Estimate how likely the VUT of a campaign is to fail, with fresh cases; write it to a file.
 
-    Args:
-        study: the campaign, and how its cases run.
-        out: new file for the result.
-        cases: fresh cases; None is that of `DEFAULT_CASES` for the engine of the study.
-        distribution: JSON file that states how often cases occur; uniform over the pool without.
-        traffic: traffic on the mainline, in the place of a distribution.
-        confidence: chance that an interval holds what it is of.
-        seed: of the draws.
-
-    Raises:
-        UserError: for a distribution or numbers that make no sense, a run whose net or policies are
-            not those of today, or a file that exists or cannot be written.
+    Raises `UserError` for a distribution, a traffic or numbers that make no sense, for a campaign
+    with a net or POVs of another day, and for a file that exists or cannot be written.
     """
-    cases = DEFAULT_CASES[study.plan.engine] if cases is None else cases
-    _check(cases, confidence, seed, both=distribution is not None and traffic is not None)
+    levels, scenario = study.settings.levels, study.settings.scenario
+    cases = DEFAULT_CASES[study.plan.engine] if asked.cases is None else asked.cases
+    _check(asked, cases)
     check_new_file(out)
     study.check_same_system()
-    levels, scenario = study.settings.levels, study.settings.scenario
+    traffic = None if asked.traffic is None else named_traffic(str(asked.traffic))
     if traffic is None:
-        stated = read_distribution(distribution, levels, scenario)
+        path = None if asked.distribution is None else Path(asked.distribution)
+        stated = read_distribution(path, levels, scenario)
     else:
         stated = traffic.in_pool(scenario, levels)
     cells = expected_cells(study, stated)
-    drawn = draw(cells, scenario, cases, np.random.default_rng([seed, STREAM]))
+    drawn = draw(cells, scenario, cases, np.random.default_rng([asked.seed, STREAM]))
     plan = study.plan.for_cases(cases)
     if study.workers is not None:
         open_simulators(plan, study.workers)
@@ -224,25 +255,28 @@ def failure_probability(
     missed: list[dict[str, float]] = []
     for one, chances in zip(cells, drawn, strict=True):
         at = CasesAt(study.settings.pool, one.level, stated.points(one.level, chances))
-        failed, judged, by_sumo = run_fresh(plan, at, study.workers, study)
+        failed, judged = np.zeros((2, len(at)), dtype=bool)
+        for place, (fails, has_verdict, by_sumo) in evaluate(plan, at, study.workers, _judged):
+            failed[place], judged[place] = fails, has_verdict
+            in_sumo += by_sumo
+            study.on_cases(1)
         counted.append(Counted(one, len(at), int(failed.sum()), int((~judged).sum())))
-        in_sumo += by_sumo
         if not one.expects_failures:
-            missed += [_named(at, int(place)) for place in np.flatnonzero(failed)[:NAMED]]
+            missed += [_named(at[place]) for place in np.flatnonzero(failed)[:NAMED].tolist()]
     by_level = {
-        level: estimate([one for one in counted if one.cells.level == level], confidence)
+        level: estimate([one for one in counted if one.cells.level == level], asked.confidence)
         for level in stated.levels
     }
-    result = Probability(
-        overall=estimate(counted, confidence) if traffic is None else None,
+    result = ProbabilityResult(
+        overall=estimate(counted, asked.confidence) if traffic is None else None,
         levels=by_level,
         per_merge=None if traffic is None else _per_merge(traffic, scenario, by_level),
-        confidence=confidence,
+        confidence=asked.confidence,
         cases=cases,
         in_sumo=in_sumo,
         missed=tuple(missed[:NAMED]),
         distribution=stated.record(),
-        seed=seed,
+        seed=asked.seed,
         engine=study.plan.engine,
         campaign=study.record(),
     )
@@ -250,27 +284,19 @@ def failure_probability(
     return result
 
 
-def probability_of(folder: Path) -> Probability | None:
-    """Return what the folder of a campaign says of a probability; None where it says nothing.
-
-    Raises `UserError` for a file that is not as it was written.
-    """
-    return read_record(folder / RESULT, Probability)
-
-
-def _check(cases: int, confidence: float, seed: int, *, both: bool) -> None:
-    if both:
+def _check(asked: options.Probability, cases: int) -> None:
+    if asked.distribution is not None and asked.traffic is not None:
         raise UserError("choose a distribution or a traffic: a traffic states its own")
     for name, number, fits, bounds in (
         ("cases", cases, cases >= 1, "it must be 1 or more"),
-        ("confidence", confidence, 0.5 <= confidence < 1.0, "choose 0.5 or more, and below 1"),
-        ("seed", seed, seed >= 0, "it must be 0 or more"),
+        (
+            *("confidence", asked.confidence, 0.5 <= asked.confidence < 1.0),
+            "choose 0.5 or more, and below 1",
+        ),
+        ("seed", asked.seed, asked.seed >= 0, "it must be 0 or more"),
     ):
         if not fits:
-            raise UserError(f"{name} is {number}: {bounds}")
-
-
-# Strata.
+            raise UserError(f"`{name}` is {number}: {bounds}")
 
 
 def expected_cells(study: RunStudy, stated: Distribution) -> list[Cells]:
@@ -320,22 +346,6 @@ def draw(
     return [drawn[place] for place in range(len(cells))]
 
 
-# Cases.
-
-
-def run_fresh(
-    plan: SimulationPlan, cases: CasesAt, workers: Workers | None, study: RunStudy
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_], int]:
-    """Run cases; return which failed and which had a verdict, (n,), and how many ran in SUMO."""
-    failed, judged = np.zeros((2, len(cases)), dtype=bool)
-    in_sumo = 0
-    for place, (fails, has_verdict, by_sumo) in evaluate(plan, cases, workers, _judged):
-        failed[place], judged[place] = fails, has_verdict
-        in_sumo += by_sumo
-        study.on_cases(1)
-    return failed, judged, in_sumo
-
-
 def _judged(results: Episodes) -> list[tuple[bool, bool, bool]]:
     """Return of each case whether it failed, had a verdict, and ran in SUMO."""
     return [
@@ -344,13 +354,9 @@ def _judged(results: Episodes) -> list[tuple[bool, bool, bool]]:
     ]
 
 
-def _named(cases: CasesAt, place: int) -> dict[str, float]:
-    case = cases[place : place + 1][0]
-    fields = (d.field for d in case.scenario.dimensions(case.level))
-    return {"level": case.level, **{name: getattr(case, name) for name in fields}}
-
-
-# Intervals.
+def _named(case: Case) -> dict[str, float]:
+    names = (dimension.field for dimension in case.scenario.dimensions(case.level))
+    return {"level": case.level, **{name: getattr(case, name) for name in names}}
 
 
 def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
@@ -405,68 +411,3 @@ def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]
         low=cars * low,
         high=cars * high,
     )
-
-
-# The result.
-
-
-@dataclass(frozen=True, repr=False)
-class ProbabilityResult(Result):
-    """How likely a VUT is to fail.
-
-    Attributes:
-        found: `overall`, `levels` and `per_merge`, with their intervals, and what they rest on.
-        file: file that was written.
-        criterion: what counts as a failure.
-    """
-
-    found: Probability
-    file: Path
-    criterion: Criterion
-
-    def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
-        return {**to_plain(self.found), "file": str(self.file)}
-
-    def lines(self) -> list[str]:
-        """Return the probability and its interval, the strata, the levels, and what is counted."""
-        found, at = self.found, f"{100.0 * self.found.confidence:g} % interval"
-        lines = [] if found.per_merge is None else _per_merge_lines(found.per_merge, at)
-        if found.overall is not None:
-            lines.append(f"P(fail): {_interval(found.overall)}, {at}, by {found.cases:,} cases")
-            lines += map(_stratum_line, found.overall.strata)
-        if found.overall is None or len(found.levels) > 1:
-            lines += [
-                f"  level {level_name(level)}: P(fail) {_interval(one)}"
-                for level, one in found.levels.items()
-            ]
-        lines.append(f"  a case fails when {self.criterion.words}")
-        if errors := sum(s.without_verdict for e in found.levels.values() for s in e.strata):
-            lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
-        if found.in_sumo < found.cases:
-            lines.append(f"  by the equations of motion; {found.in_sumo:,} in SUMO too, all alike")
-        return [*lines, f"written: {self.file}"]
-
-
-def _interval(one: Estimate) -> str:
-    return f"{one.probability:.3g} [{one.low:.3g}, {one.high:.3g}]"
-
-
-def _stratum_line(one: Stratum) -> str:
-    expected = "failures" if one.expects_failures else "no failure"
-    return (
-        f"  where the campaign expects {expected}, {one.share:.2%} of the cases: {one.failures:,} "
-        f"of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
-    )
-
-
-def _per_merge_lines(one: PerMerge, at: str) -> list[str]:
-    traffic = one.traffic
-    most = "" if one.most == one.least else f" to {one.most:.3g}"
-    return [
-        f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
-        f"{at}, whatever the shares of the POV levels",
-        f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
-        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
-        f"{one.counted_speeds:.0%} of the speeds of this traffic",
-    ]

@@ -14,8 +14,7 @@ the choice stays as good, and all cases of the campaign must pass that passed be
 campaign, which learns from nothing, tests the result. Its failures, with cases around them, join
 those of the next round of the search. The round with the least FMC in its fresh campaign counts.
 
-settings.json           in the folder of a repair: what was asked
-trials.jsonl            one line per trial, in their order, synced
+trials.jsonl            in the folder of a repair: one line per trial, in their order, synced
 campaign-1/             the fresh campaign of the first round
 repair.json             the result
 repair.html             its page, and changes.html that of the comparison with today's values
@@ -23,14 +22,10 @@ repair.html             its page, and changes.html that of the comparison with t
 
 from __future__ import annotations
 
-import hashlib
 import math
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from importlib.metadata import version
 from importlib.util import find_spec
 from operator import attrgetter, itemgetter
 from pathlib import Path
@@ -40,22 +35,21 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import numpy as np
 from msgspec import Meta, field
 
+from merge_sumo import options
 from merge_sumo.analysis.result import Result
 from merge_sumo.analysis.summary import summarise
-from merge_sumo.campaigns.run import OUTCOMES, Run, spread_failures
+from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
-from merge_sumo.system.arrays import regular
-from merge_sumo.system.folders import add_to, make_folder, replace_own
+from merge_sumo.studies.run_study import OnPart, RunStudy
+from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted, quoted
-from merge_sumo.system.records import Record, decode, to_json, to_plain
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.records import Record, replaced, to_json, to_plain
 from merge_sumo.values.case import Case, from_unit, to_unit
 from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
@@ -64,14 +58,8 @@ from merge_sumo.vuts.spec import parse
 if TYPE_CHECKING:
     import optuna
 
-SETTINGS: Final = "settings.json"
 TRIALS: Final = "trials.jsonl"
-RESULT: Final = "repair.json"
 CAMPAIGN: Final = "campaign-{}"
-PAGE: Final = "repair.html"
-CHANGES: Final = "changes.html"
-DEFAULT_TRIALS: Final = 60
-DEFAULT_ROUNDS: Final = 3
 SHARE: Final = 0.2
 """Share of the passing cases, besides near misses, that run in each trial."""
 COST_STEP: Final = 0.1
@@ -92,9 +80,11 @@ each, and so on."""
 CONFIRMED: Final = 5
 """Most trials that run all cases, the best first."""
 
+Index = Annotated[int, Meta(ge=0)]
+
 
 class Cost(StrEnum):
-    """What a repair may cost."""
+    """Cost of a repair."""
 
     TIME = "time"
     BRAKING = "braking"
@@ -102,9 +92,6 @@ class Cost(StrEnum):
 
 MEASURED_BY: Final = {Cost.TIME: ("t_end_s", "s"), Cost.BRAKING: ("vut_max_brake_mps2", "m/s2")}
 """The measure of a cost, whose mean over the cases is compared, and its unit."""
-
-
-Index = Annotated[int, Meta(ge=0)]
 
 
 class Trial(Record, frozen=True):
@@ -137,119 +124,93 @@ class Trial(Record, frozen=True):
         """Whether it was run and broke nothing."""
         return not self.refused and not self.broke
 
+    def aims(self, cost: Cost) -> tuple[int, int]:
+        """Return what is compared before the change: failures, and steps of extra cost."""
+        return len(self.fails), math.ceil(round(self.costs_more(cost) / COST_STEP, 9))
+
     def costs_more(self, cost: Cost) -> float:
         """Return the extra cost, 0 where it costs no more than today."""
         return max(self.extra.get(cost, 0.0), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class RepairSettings:
-    """What is searched for.
-
-    Attributes:
-        ranges: the parameters that may change.
-        cost: what the repair is to cost least of.
-        trials: trials of a round, as proposed by optuna.
-        rounds: most rounds of search and fresh campaign.
-        cases: cases of a fresh campaign.
-        seed: same seed, same result.
-    """
-
-    ranges: tuple[Range, ...]
-    cost: Cost = Cost.TIME
-    trials: int = DEFAULT_TRIALS
-    rounds: int = DEFAULT_ROUNDS
-    cases: int | None = None
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Raise `UserError` for values that make no search."""
-        if not self.ranges:
-            raise UserError("name what may change: `params` NAME=LOW..HIGH")
-        least = 1 + 2 * len(self.ranges)
-        for option, number, lowest in (
-            ("trials", self.trials, least),
-            ("rounds", self.rounds, 1),
-            ("cases", self.cases or 1, 1),
-            ("seed", self.seed, 0),
-        ):
-            if number < lowest:
-                why = " for today's values and both ends of each range" * (option == "trials")
-                raise UserError(f"--{option} is {number}: it must be {lowest} or more{why}")
-
-
-@dataclass(frozen=True, slots=True)
 class Round:
-    """A round: what was chosen, and what a fresh campaign says of it.
+    """A round with values that help.
 
     Attributes:
-        chosen: the trial, with all cases; None where no trial is better than today's values.
+        chosen: the trial with these values, of all cases.
         campaign: the fresh campaign.
         compared: what its cases are with today's values, and with the chosen ones.
-        fmc: FMC of the failures of the fresh campaign, summed over the levels.
     """
 
-    chosen: Trial | None
-    campaign: Run | None = None
-    compared: Comparison | None = None
-    fmc: float = 0.0
+    chosen: Trial
+    campaign: Run
+    compared: Comparison
 
     @property
-    def broke(self) -> int:
-        """Number of cases of the fresh campaign that pass with today's values alone."""
-        return 0 if self.compared is None else self.compared.broke
+    def fmc(self) -> float:
+        """FMC of the failures of the fresh campaign, summed over the levels."""
+        levels = summarise(self.campaign.cases, self.campaign.levels).levels
+        return sum(one.fmc for one in levels.values())
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
-        if self.chosen is None or self.campaign is None or self.compared is None:
-            return {"values": None}
         return {
             "values": self.chosen.values,
+            "extra": self.chosen.extra,
             "campaign": str(self.campaign.folder),
             "cases": len(self.campaign.outcomes),
             "failures": sum(not passes(outcome) for outcome in self.campaign.outcomes),
-            "fmc": {level_name(level): row for level, row in self.compared.fmc().items()},
-            "broke": self.broke,
+            "fmc": self.fmc,
+            "broke": self.compared.broke,
         }
 
 
 @dataclass(frozen=True, slots=True, repr=False)
-class Repair(Result):
+class RepairResult(Result):
     """Values of a controller's parameters that repair it, or that there are none.
 
     Attributes:
         folder: folder of the repair.
-        vut: the controller as it is.
-        settings: what was asked.
-        today: today's values.
-        failing: indices of the cases of the campaign that do not pass with today's values.
+        vut: the controller as it is, a spec.
+        ranges: the parameters that may change.
+        today: their values today.
+        cost: what was kept low.
+        seed: of the search.
         cases: number of cases of the campaign.
-        rounds: the rounds.
+        failing: indices of its cases that do not pass with today's values.
+        rounds: the rounds with values that help.
         trials: all trials, in their order.
     """
 
+    computed = ("repaired", "verified", "stays")
+
     folder: Path
     vut: str
-    settings: RepairSettings
+    ranges: tuple[Range, ...]
     today: Mapping[str, float]
-    failing: tuple[int, ...]
+    cost: str
+    seed: int
     cases: int
+    failing: tuple[int, ...]
     rounds: tuple[Round, ...]
     trials: tuple[Trial, ...]
 
     @property
-    def best(self) -> Round:
-        """The round that counts: that whose fresh campaign has the least FMC, over all levels."""
-        tested = [one for one in self.rounds if one.chosen is not None]
-        return min(reversed(tested), key=attrgetter("fmc"), default=Round(None))
+    def best(self) -> Round | None:
+        """The round that counts: its fresh campaign has the least FMC; None where no values help.
+
+        Of equal ones it is the later, which more cases have tried.
+        """
+        return min(reversed(self.rounds), key=attrgetter("fmc"), default=None)
 
     @property
     def chosen(self) -> Trial | None:
-        """The chosen values; None where no values help."""
-        return self.best.chosen
+        """The trial with the chosen values; None where no values help."""
+        return None if self.best is None else self.best.chosen
 
     @property
-    def spec(self) -> str | None:
+    def repaired(self) -> str | None:
         """The repaired controller as a spec."""
         if self.chosen is None:
             return None
@@ -265,88 +226,76 @@ class Repair(Result):
     @property
     def verified(self) -> bool:
         """Whether values were found, and no case of the fresh campaign broke by them."""
-        return self.best.compared is not None and not self.best.compared.worse
-
-    def change(self, trial: Trial) -> float:
-        """Return by how much a trial changes today's values."""
-        return change_of(trial.values, self.today, self.settings.ranges)
+        return self.best is not None and not self.best.compared.worse
 
     def to_record(self) -> dict[str, Any]:
         """Return what `repair.json` holds, and `--json` prints."""
-        chosen, ranges = self.chosen, self.settings.ranges
-        values = {} if chosen is None else chosen.values
-        return {
-            "folder": str(self.folder),
-            "vut": self.vut,
-            "repaired": self.spec,
-            "verified": self.verified,
-            "parameters": [
-                {**to_plain(one), "today": self.today[one.name], "repaired": values.get(one.name)}
-                for one in ranges
-            ],
-            "cost": self.settings.cost.value,
-            "cases": self.cases,
-            "failing": list(self.failing),
-            "stays": list(self.stays),
-            "extra": {} if chosen is None else chosen.extra,
-            "change": None if chosen is None else self.change(chosen),
-            "broke": self.best.broke,
-            "rounds": [one.to_record() for one in self.rounds],
-            "trials": len(self.trials),
-            "seed": self.settings.seed,
-        }
+        rounds = [one.to_record() for one in self.rounds]
+        names = ("vut", "ranges", "today", "cost", "seed", "cases", "failing", *self.computed)
+        found = {name: to_plain(getattr(self, name)) for name in names}
+        return {"folder": str(self.folder), **found, "rounds": rounds}
 
     def lines(self) -> list[str]:
         """Return the values, what they cost, what a fresh campaign says, and the command."""
-        chosen, page = self.chosen, f"page: {self.folder / PAGE}"
         failing = f"{counted(len(self.failing), 'case')} of {self.cases}"
-        if chosen is None:
+        staying = ", ".join(map(str, self.stays[:MOST_INDICES]))
+        staying += f", the first {MOST_INDICES}" if len(self.stays) > MOST_INDICES else ""
+        if self.chosen is None:
             return [
                 f"{self.vut}: no values in these ranges let any of the {failing} pass that do not "
                 "today, unless others fail that pass",
-                f"  these stay: {_indices(self.stays)}",
-                page,
+                f"  these stay: {staying}",
             ]
-        stays = f", {len(self.stays)} still do not: {_indices(self.stays)}" if self.stays else ""
+        stays = f", {len(self.stays)} still do not: {staying}" if self.stays else ""
         lines = [
             f"{self.vut}: {failing} did not pass; with other values "
             f"{len(self.failing) - len(self.stays)} of them pass{stays}; none that passed fails"
         ]
-        for one in self.settings.ranges:
-            today, value = self.today[one.name], chosen.values[one.name]
-            lines.append(f"  {one.name}: {today:g}" + (f" -> {value:g}" if value != today else ""))
+        for name, value in self.chosen.values.items():
+            changed = "" if value == self.today[name] else f" -> {value:g}"
+            lines.append(f"  {name}: {self.today[name]:g}{changed}")
         extra = (
-            f"{chosen.extra[cost]:+.2f} {unit} of {cost}" for cost, (_, unit) in MEASURED_BY.items()
+            f"{self.chosen.extra[cost]:+.2f} {unit} of {cost}"
+            for cost, (_, unit) in MEASURED_BY.items()
         )
         lines.append(f"  cost, mean of a case: {', '.join(extra)}")
-        for number, tested in enumerate(self.rounds, start=1):
-            if tested.campaign is not None and tested.compared is not None:
-                cases = counted(len(tested.campaign.outcomes), "case")
-                lines.append(
-                    f"fresh campaign {number}, {cases}: with today's values and the new ones "
-                    f"{tested.compared.headline}"
-                )
-        if not self.verified:
-            lines.append(f"not verified: {counted(self.best.broke, 'case')} broke")
-        spec = quoted(self.spec or "")
-        return [*lines, f"the repaired controller: merge-sumo campaign --vut {spec}", page]
+        lines += [
+            f"fresh campaign {number}, {counted(len(one.campaign.outcomes), 'case')}: with today's "
+            f"values and the new ones {one.compared.headline}"
+            for number, one in enumerate(self.rounds, start=1)
+        ]
+        lines += [] if self.verified else ["not verified: cases broke"]
+        command = f"merge-sumo campaign --vut {quoted(self.repaired or '')}"
+        return [*lines, f"the repaired controller: {command}"]
 
 
-def _indices(indices: Sequence[int]) -> str:
-    """Return indices of cases in words."""
-    shown = ", ".join(map(str, indices[:MOST_INDICES]))
-    return f"{shown}, the first {MOST_INDICES}" if len(indices) > MOST_INDICES else shown
+def ranges_of(asked: options.Repair) -> tuple[Range, ...]:
+    """Return the parameters that may change, with their ranges.
 
-
-def change_of(
-    values: Mapping[str, float], today: Mapping[str, float], ranges: Sequence[Range]
-) -> float:
-    """Return the sum over the parameters of the change as a share of the range."""
-    return sum(abs(values[r.name] - today[r.name]) / (r.high - r.low) for r in ranges)
+    Raises `UserError` for values that make no search, and where optuna is not installed.
+    """
+    if find_spec("optuna") is None:
+        raise UserError("repair needs optuna: run `pip install 'merge-sumo[repair]'`")
+    if asked.cost not in list(Cost):
+        raise UserError(f"`cost` is {asked.cost!r}: choose {' or '.join(Cost)}")
+    ranges = tuple(map(Range.parsed, asked.params))
+    if not ranges:
+        raise UserError("name what may change: `params` NAME=LOW..HIGH")
+    cases = 1 if asked.cases is None else asked.cases
+    for name, number, least, why in (
+        *(("rounds", asked.rounds, 1, ""), ("cases", cases, 1, ""), ("seed", asked.seed, 0, "")),
+        (
+            *("trials", asked.trials, 1 + 2 * len(ranges)),
+            " for today's values and both ends of each range",
+        ),
+    ):
+        if number < least:
+            raise UserError(f"`{name}` is {number}: it must be {least} or more{why}")
+    return ranges
 
 
 def fresh_settings(
-    today: CampaignSettings, asked: RepairSettings, spec: str, number: int
+    today: CampaignSettings, asked: options.Repair, spec: str, number: int
 ) -> CampaignSettings:
     """Return the settings of the fresh campaign of a round: another seed, and no earlier lesson.
 
@@ -358,197 +307,121 @@ def fresh_settings(
         for name in ("batch", "in_flight")
     }
     repeat = today.repeat if isinstance(today.repeat, str) else min(today.repeat, cases)
-    return replace(
-        today,
-        repeat=repeat,
-        vut=spec,
-        seed=today.seed + asked.seed + number,
-        cases=cases,
-        stop_when_converged=False,
-        **few,
+    seed = today.seed + asked.seed + number
+    changes = {"vut": spec, "seed": seed, "cases": cases, "repeat": repeat, **few}
+    return replace(today, stop_when_converged=False, **changes)
+
+
+def repair(
+    study: RunStudy,
+    asked: options.Repair,
+    folder: Path,
+    fresh: Callable[[str, int], Run],
+    on_part: OnPart = lambda *_: None,
+) -> RepairResult:
+    """Search for values that repair the controller of a campaign, round by round.
+
+    Args:
+        study: the campaign, and how its cases run.
+        asked: what is searched for.
+        folder: new folder for what is found.
+        fresh: runs the fresh campaign of a spec in a round.
+        on_part: told how far the trials of a round are.
+
+    Raises:
+        UserError: for values that make no search, where no case fails, and for a parameter without
+            an effect.
+    """
+    search = _Repair(study, asked, ranges_of(asked), folder, on_part)
+    rounds: list[Round] = []
+    for number in range(1, asked.rounds + 1):
+        chosen = search.round(number, rounds[-1].chosen if rounds else None)
+        if chosen is None:
+            break
+        campaign = fresh(search.spec_with(chosen.values), number)
+        rounds.append(Round(chosen, campaign, search.compared(campaign)))
+        untested = [outcome for outcome in campaign.outcomes if not outcome.is_tested]
+        against = [*spread_failures(campaign.outcomes), *untested][:MOST_AGAINST]
+        if not against:
+            break
+        rng = np.random.default_rng([asked.seed, number, 1])
+        search.cases += with_neighbours([outcome.case for outcome in against], rng)
+    return RepairResult(
+        folder=folder,
+        vut=str(study.plan.vut.spec),
+        ranges=search.ranges,
+        today=search.today,
+        cost=asked.cost,
+        seed=asked.seed,
+        cases=len(study.run.outcomes),
+        failing=search.failing,
+        rounds=tuple(rounds),
+        trials=tuple(search.trials),
     )
 
 
-def require_optuna() -> None:
-    """Raise `UserError` where optuna is not installed."""
-    if find_spec("optuna") is None:
-        raise UserError("repair needs optuna: run `pip install 'merge-sumo[repair]'`")
-
-
-ASKED: Final = {
-    "cases_sha256": "the record of the campaign",
-    "vut_files": "a file of the controller",
-    "parameters": "`params`",
-    "versions": "the version of a package",
-}
-"""What a setting of a repair is called where it differs; others are options of that name."""
-
-
-class RepairJournal:
-    """The folder of a repair: what was asked, and its trials in their order.
-
-    A resumed repair asks for the same trials again and takes those that are recorded.
-    """
-
-    def __init__(self, folder: Path, settings: Mapping[str, Any], *, resume: bool) -> None:
-        """Begin a new folder, or go on in one; `UserError` where it is of another repair."""
-        self.folder, self._recorded = folder, list[Trial]()
-        if not resume:
-            make_folder(folder)
-            replace_own(folder / SETTINGS, to_json(settings, indent=1))
-            return
-        before = _read(folder / SETTINGS)
-        known = decode(before, dict[str, Any])
-        asked = decode(to_json(settings))
-        for name in asked:
-            if known.get(name) != asked[name]:
-                what = ASKED.get(name, f"--{name}")
-                raise UserError(
-                    f"{what} is not what {folder} was begun with: go on with the same command, or "
-                    "begin a new folder"
-                )
-        if (folder / TRIALS).exists():
-            lines = _read(folder / TRIALS).splitlines(keepends=True)
-            whole = [line for line in lines if line.endswith(b"\n")]
-            self._recorded = [decode(line, Trial) for line in whole]
-            if len(whole) < len(lines):
-                os.truncate(folder / TRIALS, sum(map(len, whole)))
-        self._written = bool(self._recorded)
-
-    _written = False
-
-    def recorded(self, trial: Trial) -> Trial | None:
-        """Return the next recorded trial, which is one of these values; None after the last."""
-        if not self._recorded:
-            return None
-        known = self._recorded.pop(0)
-        same = (known.round, known.values, known.all_cases)
-        if same != (trial.round, trial.values, trial.all_cases):
-            raise UserError(
-                f"{self.folder / TRIALS} has other trials than this search: begin a new folder"
-            )
-        return known
-
-    def add(self, trial: Trial) -> None:
-        """Record a trial."""
-        add_to(self.folder / TRIALS, to_json(trial), new=not self._written)
-        self._written = True
-
-
-def _read(path: Path) -> bytes:
-    try:
-        return regular(path).read_bytes()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from error
-
-
-Fresh = Callable[[str, int], Run]
-"""Runs the fresh campaign of a spec in a round."""
-
-
-class Search:
-    """The search for values, round by round."""
+class _Repair:
+    """The search for values, with its cases and its trials."""
 
     def __init__(
         self,
-        run: Run,
-        plan: SimulationPlan,
-        settings: RepairSettings,
-        begin: Callable[[Mapping[str, Any]], RepairJournal],
-        *,
-        open_workers: Callable[[], AbstractContextManager[Workers]],
-        check: Callable[[], None] = lambda: None,
-        on_trial: Callable[[Trial], None] = lambda _: None,
+        study: RunStudy,
+        asked: options.Repair,
+        ranges: tuple[Range, ...],
+        folder: Path,
+        on_part: OnPart,
     ) -> None:
-        """Take a campaign and the plan of its cases.
-
-        `begin` gives the journal once there is something to repair. `check` is called after every
-        trial and may raise to stop there; `on_trial` is told of it.
-        """
-        self._plan, self._settings, self._begin = plan, settings, begin
-        self._record = {
-            "cases_sha256": hashlib.sha256(_read(run.folder / OUTCOMES)).hexdigest(),
-            "vut": str(plan.vut.spec),
-            "vut_files": plan.vut.files,
-            "parameters": to_plain(settings.ranges),
-            **{name: getattr(settings, name) for name in ("cost", "trials", "rounds", "cases")},
-            "seed": settings.seed,
-            "versions": {**plan.versions, "optuna": version("optuna")},
-        }
-        self._open, self._check, self._on_trial = open_workers, check, on_trial
-        self._workers: Workers | None = None
-        self._ranges = {one.name: one for one in settings.ranges}
-        self.today = plan.vut.values_of(settings.ranges)
-        self.cases: list[Case] = [outcome.case for outcome in run.outcomes]
-        self._own = len(self.cases)
-        self._before: list[Outcome] = []
-        """What becomes of the cases with today's values."""
+        self._plan, self._workers, self._folder = study.plan, study.workers, folder
+        self._asked, self._cost, self._on_part = asked, Cost(asked.cost), on_part
+        self.ranges = ranges
+        self.today = study.plan.vut.values_of(ranges)
+        self.cases = [outcome.case for outcome in study.run.outcomes]
+        self.failing: tuple[int, ...] = ()
         self.trials: list[Trial] = []
+        self._before: list[Outcome] = []
+        """Outcomes of the cases with today's values."""
         self._round = 1
-        self._journal: RepairJournal | None = None
 
-    def repaired(self, fresh: Fresh, folder: Path) -> Repair:
-        """Search, test and search again; return what was found, which is in a folder.
+    def spec_with(self, values: Mapping[str, float]) -> str:
+        """Return the controller with other values, as a spec."""
+        return str(self._plan.vut.spec.with_values(values, self.today))
 
-        Raises `UserError` where no case fails, and for a parameter without an effect.
-        """
-        rounds = list[Round]()
-        failing: tuple[int, ...] = ()
-        for number in range(1, self._settings.rounds + 1):
-            self._round = number
-            with self._opened():
-                self._before += self._run(self._plan, self.cases[len(self._before) :])
-                failing = failing or tuple(
-                    i for i in range(self._own) if not passes(self._before[i])
-                )
-                if not failing:
-                    raise UserError(
-                        f"every case passes with {self._plan.vut.spec}: nothing is to be repaired"
-                    )
-                self._journal = self._journal or self._begin(self._record)
-                chosen = self._search(rounds[-1].chosen if rounds else None)
-            if chosen is None:
-                rounds.append(Round(None))
-                break
-            spec = self._plan.vut.spec.with_values(chosen.values, self.today)
-            campaign = fresh(str(spec), number)
-            with self._opened():
-                compared = self._compared(campaign)
-            found = summarise(campaign.cases, campaign.levels).levels.values()
-            rounds.append(Round(chosen, campaign, compared, sum(one.fmc for one in found)))
-            untested = [o for o in campaign.outcomes if not o.is_tested]
-            against = [o.case for o in (*spread_failures(campaign.outcomes), *untested)][
-                :MOST_AGAINST
-            ]
-            if not against:
-                break
-            rng = np.random.default_rng([self._settings.seed, number, 1])
-            self.cases += with_neighbours(against, rng)
-        return Repair(
-            folder=folder,
-            vut=str(self._plan.vut.spec),
-            settings=self._settings,
-            today=self.today,
-            failing=failing,
-            cases=self._own,
-            rounds=tuple(rounds),
-            trials=tuple(self.trials),
-        )
+    def change(self, values: Mapping[str, float]) -> float:
+        """Return the sum over the parameters of the change as a share of the range."""
+        return sum(abs(values[r.name] - self.today[r.name]) / (r.high - r.low) for r in self.ranges)
 
-    @contextmanager
-    def _opened(self) -> Iterator[None]:
-        with self._open() as self._workers:
-            yield
-        self._workers = None
-
-    def _compared(self, campaign: Run) -> Comparison:
+    def compared(self, campaign: Run) -> Comparison:
         """Compare a fresh campaign with today's values in the same cases."""
-        cases = [outcome.case for outcome in campaign.outcomes]
-        today = [
-            replace(before, index=after.index)
-            for before, after in zip(self._run(self._plan, cases), campaign.outcomes, strict=True)
-        ]
-        return compare_outcomes(today, campaign, str(self._plan.vut.spec))
+        today = self._run(self._plan, [outcome.case for outcome in campaign.outcomes])
+        pairs = zip(today, campaign.outcomes, strict=True)
+        before = [replace(old, index=new.index) for old, new in pairs]
+        return compare_outcomes(before, campaign, str(self._plan.vut.spec))
+
+    def round(self, number: int, earlier: Trial | None) -> Trial | None:
+        """Search in a round; return the best trial, with all cases, or None where none helps."""
+        self._round = number
+        self._before += self._run(self._plan, self.cases[len(self._before) :])
+        if number == 1:
+            self.failing = tuple(i for i, old in enumerate(self._before) if not passes(old))
+            if not self.failing:
+                raise UserError(
+                    f"every case passes with {self._plan.vut.spec}: nothing is to be repaired"
+                )
+            make_folder(self._folder)
+        selected = self._selected()
+        present, *others = self._proposed(selected, earlier)
+        if earlier is None:
+            self._check_effect(others)
+        trials = (trial for trial in (present, *others) if trial.holds)
+        better = sorted(trials, key=lambda t: (*t.aims(self._cost), self.change(t.values)))
+        for trial in better[:CONFIRMED]:
+            if len(trial.fails) >= len(present.fails):
+                return None
+            trimmed = self._trimmed(trial, selected)
+            everywhere = self._trial(trimmed.values, range(len(self.cases)), all_cases=True)
+            if everywhere.holds:
+                return everywhere
+        return None
 
     def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
         ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
@@ -560,62 +433,40 @@ class Search:
         passing = [i for i, before in enumerate(self._before) if passes(before)]
         passing.sort(key=lambda i: (self._before[i].margin or 0.0, i))
         near, rest = passing[: len(failing)], passing[len(failing) :]
-        rng = np.random.default_rng([self._settings.seed, self._round])
+        rng = np.random.default_rng([self._asked.seed, self._round])
         drawn = rng.choice(len(rest), math.ceil(SHARE * len(rest)), replace=False)
         return sorted({*failing, *near, *(rest[k] for k in drawn.tolist())})
 
-    def _search(self, earlier: Trial | None) -> Trial | None:
-        """Return the best trial of a round, with all cases; None where none helps."""
-        selected = self._selected()
-        first = [self.today, *([] if earlier is None else [earlier.values])]
-        if earlier is None:
-            first += [
-                {**self.today, one.name: end}
-                for one in self._settings.ranges
-                for end in (one.low, one.high)
-            ]
-        found = [self._proposed(study, selected) for study in self._studies(first)]
-        if earlier is None:
-            self._check_effect(found)
-        present = found[0]
-        better = sorted(
-            (t for t in found if t.holds), key=lambda t: (*self._aims(t), self._size(t))
-        )
-        for trial in better[:CONFIRMED]:
-            if len(trial.fails) >= len(present.fails):
-                return None
-            trimmed = self._trimmed(trial, selected)
-            everywhere = self._trial(trimmed.values, range(len(self.cases)), all_cases=True)
-            if everywhere.holds:
-                return everywhere
-        return None
+    def _proposed(self, selected: Sequence[int], earlier: Trial | None) -> list[Trial]:
+        """Run the trials that optuna proposes: first today's values, and both ends of each range.
 
-    def _studies(self, first: Sequence[Mapping[str, float]]) -> Iterator[optuna.Study]:
-        """Give the study of optuna once for each of its trials."""
+        A later round begins with today's values, and with those that the earlier one has chosen.
+        """
         import optuna
 
+        first = [self.today]
+        if earlier is None:
+            ends = [(one.name, end) for one in self.ranges for end in (one.low, one.high)]
+            first += [{**self.today, name: end} for name, end in ends]
+        else:
+            first.append(earlier.values)
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         # Startup trials are drawn at random: a few for each parameter.
-        startup = max(10, len(first) + 4 * len(self._ranges))
-        seed = self._settings.seed * 1000 + self._round
+        startup = max(10, len(first) + 4 * len(self.ranges))
+        seed = self._asked.seed * 1000 + self._round
         sampler = optuna.samplers.TPESampler(seed=seed, n_startup_trials=startup, multivariate=True)
         study = optuna.create_study(directions=["minimize"] * 3, sampler=sampler)
         for values in first:
             study.enqueue_trial(dict(values))
-        for _ in range(self._settings.trials):
-            yield study
+        return [self._next(study, selected) for _ in range(self._asked.trials)]
 
-    def _proposed(self, study: optuna.Study, selected: Sequence[int]) -> Trial:
+    def _next(self, study: optuna.Study, selected: Sequence[int]) -> Trial:
         """Ask for a trial, run it and tell what became of it."""
         import optuna
 
-        asked = study.ask(
-            {
-                name: optuna.distributions.FloatDistribution(one.low, one.high)
-                for name, one in self._ranges.items()
-            }
-        )
-        values = {name: self._ranges[name].rounded(asked.params[name]) for name in self._ranges}
+        floats = optuna.distributions.FloatDistribution
+        asked = study.ask({one.name: floats(one.low, one.high) for one in self.ranges})
+        values = {one.name: one.rounded(asked.params[one.name]) for one in self.ranges}
         # Today's values have all their digits.
         is_todays = all(asked.params[name] == value for name, value in self.today.items())
         trial = self._trial(self.today if is_todays else values, selected)
@@ -623,98 +474,83 @@ class Search:
             study.tell(asked, state=optuna.trial.TrialState.FAIL)
             return trial
         asked.set_constraint("broke", float(len(trial.broke)))
-        study.tell(
-            asked, [len(trial.fails), trial.costs_more(self._settings.cost), self._size(trial)]
-        )
+        more = trial.costs_more(self._cost)
+        study.tell(asked, [len(trial.fails), more, self.change(trial.values)])
         return trial
 
     def _trial(
         self, values: Mapping[str, float], indices: Sequence[int], *, all_cases: bool = False
     ) -> Trial:
-        """Return a trial that is recorded, or run it on cases and record it."""
-        assert self._journal is not None, "begun before"  # noqa: S101
-        wanted = Trial(self._round, dict(values), all_cases=all_cases)
-        trial = self._journal.recorded(wanted)
-        if trial is None:
-            trial = self._ran(wanted, indices)
-            self._journal.add(trial)
-            self._check()
+        """Run a trial on cases and record it."""
+        trial = replaced(self._ran(dict(values), indices), all_cases=all_cases)
+        add_to(self._folder / TRIALS, to_json(trial), new=not self.trials)
         self.trials.append(trial)
-        self._on_trial(trial)
+        done, total = sum(one.round == self._round for one in self.trials), self._asked.trials
+        title = f"round {self._round}"
+        if done > total:  # how many the search for the smallest change takes is not known before
+            title, done = f"{title}, smallest change", done - total
+            total = done
+        self._on_part(title, done, total, "trials", "")
         return trial
 
-    def _ran(self, wanted: Trial, indices: Sequence[int]) -> Trial:
-        spec = self._plan.vut.spec.with_values(wanted.values, self.today)
-        is_todays = wanted.values == self.today
+    def _ran(self, values: dict[str, float], indices: Sequence[int]) -> Trial:
+        spec = self._plan.vut.spec.with_values(values, self.today)
         try:
-            if is_todays:
+            if values == self.today:
                 after = [self._before[index] for index in indices]
             else:
                 vut = VutFactory(spec, self._plan.vut.options)
                 cases = [self.cases[index] for index in indices]
                 after = self._run(replace(self._plan, vut=vut), cases)
         except UserError as error:
-            return Trial(wanted.round, wanted.values, refused=str(error))
+            return Trial(self._round, values, refused=str(error))
         pairs = [(i, self._before[i], now) for i, now in zip(indices, after, strict=True)]
         both = [(old, now) for _, old, now in pairs if old.is_tested and now.is_tested]
+        extra = {
+            cost: [
+                float(now.measures.value(name) or 0.0) - float(old.measures.value(name) or 0.0)
+                for old, now in both
+            ]
+            for cost, (name, _) in MEASURED_BY.items()
+        }
         return Trial(
-            wanted.round,
-            wanted.values,
+            self._round,
+            values,
             fails=tuple(i for i, old, now in pairs if not passes(old) and not passes(now)),
             broke=tuple(i for i, old, now in pairs if passes(old) and not passes(now)),
-            extra={
-                cost: fmean(
-                    float(now.measures.value(name) or 0.0) - float(old.measures.value(name) or 0.0)
-                    for old, now in both
-                )
-                if both
-                else 0.0
-                for cost, (name, _) in MEASURED_BY.items()
-            },
+            extra={cost: fmean(more) if more else 0.0 for cost, more in extra.items()},
             differs=any(old.measures != now.measures for _, old, now in pairs),
-            all_cases=wanted.all_cases,
         )
 
     def _check_effect(self, found: Sequence[Trial]) -> None:
         """Raise `UserError` for a parameter of which both ends change nothing."""
-        for place, one in enumerate(self._settings.ranges):
-            ends = found[1 + 2 * place : 3 + 2 * place]
+        for place, one in enumerate(self.ranges):
+            ends = found[2 * place : 2 * place + 2]
             if not any(trial.differs or trial.refused for trial in ends):
                 raise UserError(
                     f"`params` {one.name} has no effect on any case, be it {one.low:g} or "
                     f"{one.high:g}: leave it out, or name what the controller reads"
                 )
 
-    def _size(self, trial: Trial) -> float:
-        return change_of(trial.values, self.today, self._settings.ranges)
-
-    def _aims(self, trial: Trial) -> tuple[int, int]:
-        """Return what is compared before the change: failures, and steps of extra cost."""
-        extra = trial.costs_more(self._settings.cost)
-        return len(trial.fails), math.ceil(round(extra / COST_STEP, 9))
-
     def _trimmed(self, best: Trial, selected: Sequence[int]) -> Trial:
         """Return a trial with values as near to today's as the choice allows, with a reserve."""
-        aims, kept = self._aims(best), best
+        aims, kept = best.aims(self._cost), best
 
         def as_good(name: str, value: float) -> bool:
             nonlocal kept
             trial = self._trial({**kept.values, name: value}, selected)
-            good = trial.holds and self._aims(trial) <= aims
+            good = trial.holds and trial.aims(self._cost) <= aims
             kept = trial if good else kept
             return good
 
-        by_change = sorted(
-            self._settings.ranges,
-            key=lambda one: -change_of(kept.values, self.today, [one]),
-        )
-        for one in by_change:
-            today, good = self.today[one.name], kept.values[one.name]
-            if good == today:
+        for one in sorted(
+            self.ranges,
+            key=lambda r: -abs(best.values[r.name] - self.today[r.name]) / (r.high - r.low),
+        ):
+            bad, good = self.today[one.name], kept.values[one.name]
+            if good == bad or as_good(one.name, bad):
                 continue
-            if as_good(one.name, today):
-                continue
-            bad = today
+            today = bad
             for _ in range(BISECTIONS):
                 middle = (bad + good) / 2.0
                 if as_good(one.name, one.rounded(middle)):
@@ -740,5 +576,4 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
 
 
 def _outcomes_of(results: Episodes) -> list[Outcome]:
-    """Return the outcomes of a chunk, without motions."""
     return [episode.outcome for episode in results]

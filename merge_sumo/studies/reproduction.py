@@ -6,7 +6,7 @@ the median. Same seeds and same versions give the same files.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo import options
 from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -24,7 +25,8 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_margin
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.studies.sampler_study import OnPart, SamplerStudy, Search, Study
+from merge_sumo.studies.run_study import OnPart
+from merge_sumo.studies.sampler_study import SamplerRun, SamplerStudy, Study
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import Workers
@@ -105,6 +107,13 @@ def quick(seeds: int) -> Scale:
     return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
 
 
+def scale_of(asked: options.Reproduce) -> Scale:
+    """Return the scale that a person asks for."""
+    if asked.quick:
+        return quick(2 if asked.seeds is None else asked.seeds)
+    return Scale() if asked.seeds is None else Scale(seeds=asked.seeds)
+
+
 @dataclass(frozen=True, slots=True)
 class Panel:
     """Cases at one level in the unit cube, (n, d), which of them failed, (n,), and their FMC."""
@@ -146,11 +155,6 @@ class ColumnResult:
 
     column: Column
     study: SamplerStudy
-
-    @property
-    def truth(self) -> float | None:
-        """FMC of the truth, by which shares are divided; None where it is too small."""
-        return None if self.study.is_small else self.study.truth_fmc
 
     @cached_property
     def panels(self) -> dict[str, Panel]:
@@ -230,49 +234,44 @@ class Reproduction(Result):
         """Yield the rows of the table: a name, and a cell for each column."""
         results = list(self.columns.values())
         studies = [one.study for one in results]
+
+        def row(name: str, values: Iterable[float | None], form: str) -> tuple[str, list[str]]:
+            return name, ["-" if value is None else f"{value:{form}}" for value in values]
+
+        def beside(
+            name: str, ours: Iterable[float | None], papers: Iterable[float | None], form: str
+        ) -> tuple[str, list[str]]:
+            pairs = zip(row(name, ours, form)[1], row(name, papers, form)[1], strict=True)
+            return name, [f"{one} ({paper})" for one, paper in pairs]
+
+        papers = [one.column.paper for one in results]
         for name in ("truth", *SAMPLERS):
             ours = [
                 one.truth_fmc if name == "truth" else one.samplers[name].fmc.median
                 for one in studies
             ]
-            papers = [one.column.paper.get(name) for one in results]
-            yield (
-                name,
-                [
-                    f"{_or_dash(value, '.4f')} ({_or_dash(paper, '.4f')})"
-                    for value, paper in zip(ours, papers, strict=True)
-                ],
-            )
+            yield beside(name, ours, [paper.get(name) for paper in papers], ".4f")
         dense = [sum(fmc(truth.failures) for truth in one.dense.values()) for one in studies]
         if any(dense):
-            yield "dense truth", [_or_dash(value or None, ".4f") for value in dense]
-        yield "limit", [f"{one.limit_fmc:.4f}" for one in studies]
+            yield row("dense truth", [value or None for value in dense], ".4f")
+        yield row("limit", [one.limit_fmc for one in studies], ".4f")
         for name in ADAPTIVE:
-            cells = []
-            for one in results:
-                paper = one.column.paper
-                share = paper[name] / paper["truth"] if name in paper else None
-                ours_over = one.study.samplers[name].fmc_over_truth.median
-                cells.append(f"{_or_dash(ours_over, '.2f')} ({_or_dash(share, '.2f')})")
-            yield f"{name} / truth", cells
+            over = [one.samplers[name].fmc_over_truth.median for one in studies]
+            shares = [p[name] / p["truth"] if name in p else None for p in papers]
+            yield beside(f"{name} / truth", over, shares, ".2f")
         for name in ADAPTIVE:
             over = [one.samplers[name].fmc_over_limit.median for one in studies]
-            yield f"{name} / limit", [_or_dash(share, ".2f") for share in over]
+            yield row(f"{name} / limit", over, ".2f")
         for name in ADAPTIVE:
             after = studies[0].samplers[name].cases_by_batch
             # A quarter of all cases, or where a batch ended next.
             place = next(k for k, number in enumerate(after) if number >= after[-1] / 4)
-            early = [one.study.samplers[name].fmc_by_batch[1][place] for one in results]
+            early = [one.samplers[name].fmc_by_batch[1][place] for one in studies]
             shares = [
-                median / one.truth if one.truth else None
-                for one, median in zip(results, early, strict=True)
+                e / s.truth_fmc if s.truth_fmc and not s.is_small else None
+                for s, e in zip(studies, early, strict=True)
             ]
-            title = f"{name} / truth after {after[place]} cases"
-            yield title, [_or_dash(share, ".2f") for share in shares]
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else f"{value:{form}}"
+            yield row(f"{name} / truth after {after[place]} cases", shares, ".2f")
 
 
 def reproduce(
@@ -299,13 +298,13 @@ def reproduce(
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.
-        found = study(column.vut).compare(
-            (column.level,),
-            SAMPLERS,
+        asked = options.Benchmark(
+            column.vut,
             seeds=scale.seeds,
             cases=scale.batches * scale.batch,
             truth_cases=scale.truth_cases[column.level],
         )
+        found = study(column.vut).compare((column.level,), SAMPLERS, asked)
         columns[column.title] = ColumnResult(column, found)
     batch = 2 * scale.batch
     together = study("design2").searches(
@@ -315,7 +314,7 @@ def reproduce(
     return Reproduction(scale, columns, levels, povs.sha256())
 
 
-def _median_seed(searches: Sequence[Search]) -> int:
+def _median_seed(searches: Sequence[SamplerRun]) -> int:
     """Return the seed whose coverage is the median, the lower one of two."""
     order = sorted(range(len(searches)), key=lambda seed: (searches[seed].fmc[-1], seed))
     return order[(len(order) - 1) // 2]
@@ -327,7 +326,7 @@ def _panel(outcomes: Sequence[Outcome], level: int) -> Panel:
     return Panel(points, failed, fmc(points[failed]))
 
 
-def _level_batches(searches: Sequence[Search]) -> LevelBatches:
+def _level_batches(searches: Sequence[SamplerRun]) -> LevelBatches:
     shape = len(LEVELS), len(searches), len(searches[0].fmc)
     cases, judged, total = np.zeros((3, *shape))
     for seed, one in enumerate(searches):

@@ -15,6 +15,9 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.scenario import level_name
 
+OnPart = Callable[[str, int, int, str, str], None]
+"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
+
 
 @dataclass(frozen=True, slots=True)
 class RunStudy:
@@ -39,31 +42,23 @@ class RunStudy:
         """Return what a study keeps of the system that it tested, as `campaign.json` does."""
         return record_of(self.settings, self.plan)
 
-    def check_same_system(self) -> None:
-        """Raise `UserError` where the campaign had another net or other policies than this plan."""
-        today, run = self.record(), self.run
-        for name, difference in (
-            ("net_sha256", f"another net than {self.plan.road.path} is now: put that back"),
-            ("policies_sha256", "other policies: name what it was run with, `policies`"),
-        ):
-            if run.settings.get(name) != today[name]:
-                raise UserError(f"{run.folder} was run with {difference}")
-        notice_changes(run, self.plan)
+    def check_same_system(self, levels: Iterable[int] | None = None) -> None:
+        """Raise `UserError` where the campaign had another net, or other POVs at some levels.
 
-    def check_same_road(self, levels: Iterable[int]) -> None:
-        """Raise `UserError` where the campaign had another net, or other POVs at these levels."""
-        run, road = self.run, self.plan.road
+        By default they are all levels. A controller that has changed is a `Notice`.
+        """
+        run, road, today = self.run, self.plan.road, self.record()
         if run.settings.get("net_sha256", road.sha256) != road.sha256:
             raise UserError(
                 f"{run.folder} was run on another net than {road.path} is now: put that back"
             )
-        today = self.record()
-        for level in levels:
+        for level in self.settings.levels if levels is None else levels:
             if not same_pov(run.settings, today, level):
                 raise UserError(
                     f"{run.folder} was run against another POV of level {level_name(level)} than "
-                    "today's: give its policies"
+                    "today's: give its `policies`"
                 )
+        notice_changes(run, self.plan)
 
 
 def notice_changes(run: Run, plan: SimulationPlan) -> None:

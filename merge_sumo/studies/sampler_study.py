@@ -5,31 +5,32 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
-from heapq import heappop, heapreplace
-from io import StringIO
-from itertools import accumulate, chain, count
+from itertools import accumulate, chain, islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from merge_sumo import options
 from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.scheduler import groups_here
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, notice
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.studies.run_study import OnPart
 from merge_sumo.studies.truth import (
     DENSE_CASES,
     TRUTH_CASES,
     Repeats,
     Truth,
+    TruthResult,
     ground_truth,
     known_truth,
 )
@@ -41,9 +42,8 @@ from merge_sumo.values.case import FloatArray, Pool, to_unit
 from merge_sumo.values.fmc import covered, fmc
 from merge_sumo.values.scenario import level_name
 from merge_sumo.values.score import Outcome
+from merge_sumo.vuts.in_memory import is_here
 
-ORACLE_STEP: Final = 5
-"""Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""
 MOST_PROBES: Final = 10_000
 """Failures of a truth of which a covered share is one, at most: its error is then below .01."""
 COMPARED_BATCH: Final = 20
@@ -51,7 +51,7 @@ COMPARED_BATCH: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Search:
+class SamplerRun:
     """What one sampler did with one seed.
 
     Attributes:
@@ -83,7 +83,7 @@ Task = tuple[str, tuple[int, ...], int, int | None, int]
 """A search: sampler, levels, cases, batch, seed."""
 
 
-def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[Search]:
+def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
     """Run searches of the pool of a plan's scenario in this process."""
     return [_search(plan, *task) for task in tasks]
 
@@ -95,9 +95,8 @@ def _search(
     cases: int,
     batch: int | None,
     seed: int,
-) -> Search:
-    pool = Pool(levels=levels, scenario=plan.scenario)
-    lines = centre_lines(plan.road)
+) -> SamplerRun:
+    pool, lines = Pool(levels=levels, scenario=plan.scenario), centre_lines(plan.road)
     twin = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
     sampler = make_sampler(name, pool, seed, twin)
     spent_s = [0.0]
@@ -114,21 +113,33 @@ def _search(
 
     sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
     sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
-    found = Search([], [], 0.0)
+    found = SamplerRun([], [], 0.0)
     batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
     for group in groups_here(plan, sampler, cases, batch):
         found.outcomes.extend(episode.outcome for episode in group)
         found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
-    return Search(found.outcomes, found.fmc, spent_s[0])
+    return replace(found, sampler_s=spent_s[0])
 
 
-def _lost_search(task: Task) -> Search:
+def _lost_search(task: Task) -> SamplerRun:
     name, *_, seed = task
     raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
 
 
-OnPart = Callable[[str, int, int, str, str], None]
-"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
+def names_of(asked: options.Benchmark) -> list[str]:
+    """Return the names of the samplers that are compared; `UserError` for none, or no seeds."""
+    known = SAMPLERS if asked.samplers is None else asked.samplers
+    names = list(dict.fromkeys(map(str.strip, known)))
+    if not names:
+        raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
+    if asked.seeds < 1:
+        raise UserError(f"`seeds` is {asked.seeds}: it must be 1 or more")
+    return names
+
+
+def title(vut: str, levels: Sequence[int]) -> str:
+    """Return what searches are called."""
+    return f"{vut} v level {'/'.join(map(level_name, levels))}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,26 +176,31 @@ class Study:
         where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
         return ground_truth(plan, level, total, seed, repeats=repeats, **where)
 
-    def compare(
-        self,
-        levels: tuple[int, ...],
-        samplers: Sequence[str],
-        *,
-        seeds: int = 10,
-        cases: int = 400,
-        batch: int | None = None,
-        truth_cases: int | None = None,
-    ) -> SamplerStudy:
-        """Let each sampler search with the seeds 0 to `seeds` - 1, beside the truth of each level.
+    def truths(self, settings: CampaignSettings, asked: options.Truth) -> TruthResult:
+        """Return the truth of settings at each of their levels."""
+        repeats = Repeats.of(settings, asked.repeat, asked.tolerated)
+        by_level = {
+            level: self.truth(level, asked.cases, asked.seed, repeats) for level in settings.levels
+        }
+        if not self.plan.vut.kind.files_are_known and not is_here(settings.vut):
+            notice(
+                "note: nobody can tell what the program behind this VUT loads; this truth is kept "
+                "for its command and the files that are named there"
+            )
+        return TruthResult(settings.vut, by_level, settings.criterion, asked.tolerated)
 
-        A batch has by default as many cases as a sampler wants, or `COMPARED_BATCH`. A dense truth
-        is used where the cache has one.
+    def compare(
+        self, levels: tuple[int, ...], samplers: Sequence[str], asked: options.Benchmark
+    ) -> SamplerStudy:
+        """Let each sampler search with the seeds 0, 1, ... beside the truth of each level.
+
+        A dense truth is used where the cache has one.
         """
-        truths = {level: self.truth(level, truth_cases) for level in levels}
+        truths = {level: self.truth(level, asked.truth_cases) for level in levels}
         kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
         dense = {level: truth for level, truth in kept.items() if truth is not None}
-        searches = self.searches(levels, samplers, seeds, cases, batch)
-        return SamplerStudy(searches, truths, dense, cases, batch)
+        searches = self.searches(levels, samplers, asked.seeds, asked.cases, asked.batch)
+        return SamplerStudy(searches, truths, dense)
 
     def searches(
         self,
@@ -193,22 +209,20 @@ class Study:
         seeds: int,
         cases: int,
         batch: int | None,
-    ) -> dict[str, list[Search]]:
+    ) -> dict[str, list[SamplerRun]]:
         """Let each sampler search with each seed; return the searches by sampler."""
         tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
         for level in levels:
             self.plan.povs.check_level(level)
         plan = self.plan.for_cases(batch or COMPARED_BATCH)
-        title = f"{plan.vut.spec} v level {'/'.join(map(level_name, levels))}"
-        by_place, number = dict[int, Search](), count(1)
+        shown = title(str(plan.vut.spec), levels)
+        by_place: dict[int, SamplerRun] = {}
         with workers_or_here(self.workers) as processes:
             for place, one in processes.run(partial(search, plan), tasks, _lost_search, chunk=1):
                 by_place[place] = one
-                self.on_part(title, next(number), len(tasks), "runs", tasks[place][0])
-        searches: dict[str, list[Search]] = {name: [] for name in samplers}
-        for place, (name, *_) in enumerate(tasks):
-            searches[name].append(by_place[place])
-        return searches
+                self.on_part(shown, len(by_place), len(tasks), "runs", tasks[place][0])
+        found = iter(by_place[place] for place in range(len(tasks)))
+        return {name: list(islice(found, seeds)) for name in samplers}
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,14 +236,12 @@ class Spread:
     @classmethod
     def of(cls, values: ArrayLike) -> Spread:
         """Return the spread of a number for each seed; NaN and infinite ones are none."""
-        ordered = np.sort(np.asarray(values, dtype=np.float64))
+        ordered = np.sort(np.asarray(values, dtype=np.float64))  # NaN comes last
 
         def quantile(part: float) -> float | None:
             place = part * (len(ordered) - 1)
             low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
-            if not np.isfinite(high):
-                return None
-            return float(low + (place - math.floor(place)) * (high - low))
+            return float(low + place % 1.0 * (high - low)) if np.isfinite(high) else None
 
         return cls(quantile(0.5), quantile(0.25), quantile(0.75))
 
@@ -299,16 +311,12 @@ class SamplerStudy(Result):
         searches: the searches of each sampler, one a seed.
         truths: the truth by level.
         dense: the dense truth of the levels that have one.
-        cases: cases of each search.
-        batch: cases of a batch; None where samplers chose.
         figure: file that was drawn, if any.
     """
 
-    searches: dict[str, list[Search]]
+    searches: dict[str, list[SamplerRun]]
     truths: dict[int, Truth]
     dense: dict[int, Truth] = field(default_factory=dict)
-    cases: int = 400
-    batch: int | None = None
     figure: Path | None = None
 
     @cached_property
@@ -344,11 +352,6 @@ class SamplerStudy(Result):
         return total
 
     @cached_property
-    def oracle_fmc(self) -> dict[int, float]:
-        """Coverage of an oracle by number of cases."""
-        return oracle(self.truths, self.cases, self.batch)
-
-    @cached_property
     def probes(self) -> dict[int, FloatArray]:
         """The failing uniform cases of which the covered share is one, by level.
 
@@ -362,7 +365,7 @@ class SamplerStudy(Result):
         """What each sampler found."""
         return {name: self._summary(searches) for name, searches in self.searches.items()}
 
-    def _summary(self, searches: Sequence[Search]) -> SamplerSummary:
+    def _summary(self, searches: Sequence[SamplerRun]) -> SamplerSummary:
         """Return what one sampler found, one search a seed."""
         curves = np.array([search.fmc for search in searches])
         divisor = math.nan if self.is_small else self.truth_fmc or math.nan
@@ -397,7 +400,6 @@ class SamplerStudy(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
-        first = next(iter(self.samplers.values()))
         return {
             "truth_fmc": self.truth_fmc,
             "truth_failures": sum(len(truth.failures) for truth in self.truths.values()),
@@ -406,12 +408,11 @@ class SamplerStudy(Result):
             "covered_of": sum(map(len, self.probes.values())),
             "limit_fmc": self.limit_fmc,
             "dense_fmc": {level: fmc(truth.failures) for level, truth in self.dense.items()},
-            "oracle_fmc_by_batch": [self.oracle_fmc[n] for n in first.cases_by_batch],
             "samplers": to_plain(self.samplers),
         }
 
     def lines(self) -> list[str]:
-        """Return truth, limit and oracle, and a table of the samplers."""
+        """Return truth and limit, and a table of the samplers."""
         figure = [] if self.figure is None else [f"figure: {self.figure}"]
         return [*self.found(timed=True), *figure]
 
@@ -428,94 +429,21 @@ class SamplerStudy(Result):
             ),
             f"limit: FMC {self.limit_fmc:.4f}, of all that truth and searches found"
             + (f", or of {DENSE_CASES:,} uniform cases, where that is more" if self.dense else ""),
-            f"oracle: FMC {self.oracle_fmc[self.cases]:.4f} with {self.cases} cases",
             *self._table(timed=timed),
-            *self._error_of_shares(),
         ]
 
     def _table(self, *, timed: bool) -> list[str]:
         """Return a line per sampler: medians, with the quartiles in brackets."""
-        from rich.console import Console
-        from rich.table import Table
-
-        table = Table(
-            box=None, pad_edge=False, caption=r"medians \[quartiles]", caption_justify="left"
-        )
-        table.add_column("sampler")
-        rows = {
-            name: one.columns(small=self.is_small, timed=timed)
-            for name, one in self.samplers.items()
-        }
-        for heading in next(iter(rows.values()), {}):
-            table.add_column(heading, justify="right", no_wrap=True)
-        for name, cells in rows.items():
-            table.add_row(name, *cells.values())
-        text = StringIO()
-        # As wide as it is: a line of a table that is read by a program must not be broken.
-        Console(width=220, highlight=False, soft_wrap=True, file=text).print(table)
-        return [line.rstrip() for line in text.getvalue().splitlines()]
-
-    def _error_of_shares(self) -> list[str]:
-        """Return of what the covered share is one, and its largest error (Wilson, 1927)."""
-        if not self.probes:
-            return []
-        counts, z, errors = [len(points) for points in self.probes.values()], 1.96, []
-        for one in self.samplers.values():
-            p = one.covered_share.median or 0.0
-            halves = [
-                z / (1.0 + z**2 / n) * math.sqrt(p * (1.0 - p) / n + (z / (2.0 * n)) ** 2)
-                for n in counts
-            ]
-            errors.append(math.hypot(*halves) / len(counts))
-        return [
-            f"covered share: of {counted(sum(counts), 'failing uniform case')}, those within a "
-            f"radius of a failure found; to within {max(errors):.2f} (95 %)"
+        named = self.samplers.items()
+        rows = [
+            {"sampler": name, **one.columns(small=self.is_small, timed=timed)}
+            for name, one in named
         ]
-
-
-def oracle(truths: Mapping[int, Truth], cases: int, batch: int | None) -> dict[int, float]:
-    """Return the coverage of an oracle by number of cases, summed over the levels.
-
-    It knows the failures of the truth and takes, one after the other, the one whose ball adds the
-    most volume: greedy maximum coverage, which no order beats by more than a factor of e / (e - 1)
-    (Nemhauser, Wolsey and Fisher, 1978). A sampler may still pass its end, the truth's FMC: it may
-    fail in places that the truth's cases have missed.
-
-    Returns:
-        FMC after every case of the first batch, and then after every batch, up to `cases`.
-        Without a `batch`, samplers choose, and every ORACLE_STEP cases are shown.
-    """
-    batch = batch or ORACLE_STEP
-    greedy = {level: greedy_cover(truth.failures, cases) for level, truth in truths.items()}
-    ball = {level: fmc(np.zeros((1, truth.points.shape[1]))) for level, truth in truths.items()}
-    gains = [(-g * ball[level], level) for level, (_, gain) in greedy.items() for g in gain]
-    order = [level for _, level in sorted(gains)]
-    shown = sorted({*range(min(batch, cases) + 1), *range(0, cases, batch), cases})
-    return {
-        n: sum(fmc(points[: order[:n].count(level)]) for level, (points, _) in greedy.items())
-        for n in shown
-    }
-
-
-def greedy_cover(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """Return at most so many points, (m, d), in greedy order and what each adds, in balls.
-
-    What a point adds never grows. So the best is one that still adds as much as it once did, if no
-    other one ever did more (Minoux, 1978); of points that add the same it is the first.
-    """
-    grid = CoverageGrid(points.shape[1])
-    queue = [(-1.0, place) for place in range(len(points))]
-    order: list[int] = []
-    gains: list[float] = []
-    while queue and len(order) < most:
-        once, place = queue[0]
-        ball = grid.balls(points[[place]])
-        new = float(grid.new(ball)[0])
-        if new < -once:
-            heapreplace(queue, (-new, place))
-            continue
-        heappop(queue)
-        grid.cover(ball[0], 1.0)
-        order.append(place)
-        gains.append(new)
-    return points[order], np.array(gains)
+        widths = {name: max(map(len, (name, *(row[name] for row in rows)))) for name in rows[0]}
+        table = [{name: name for name in widths}, *rows]
+        shares = sum(map(len, self.probes.values()))
+        return [
+            *("  ".join(row[n].rjust(width) for n, width in widths.items()) for row in table),
+            "medians [quartiles]",
+            *([f"covered share: of {counted(shares, 'failing uniform case')}"] if shares else []),
+        ]

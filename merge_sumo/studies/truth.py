@@ -14,20 +14,24 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.analysis.result import Result
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.hashing import Files, changed
+from merge_sumo.system.printable import counted
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
 from merge_sumo.values.case import FloatArray, Pool
 from merge_sumo.values.chance import MOST_RUNS, check_tolerated, is_decided
+from merge_sumo.values.criterion import Criterion
 from merge_sumo.values.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
-from merge_sumo.values.scenario import OWN, Scenario
+from merge_sumo.values.scenario import OWN, Scenario, level_name
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
@@ -39,8 +43,6 @@ COUNTS: Final = ("runs", "failed_runs")
 """and those of one whose cases ran several times."""
 MOST_FILES_BYTES: Final = 1 << 26
 """Of a truth, besides its numbers: names and hashes of files."""
-PROGRESS_CASES: Final = 100
-"""Cases after which a person is told."""
 REAL_REGION: Final = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH: Final = 0.2
@@ -111,21 +113,36 @@ class Truth:
         return not len(linked) or float(linked.mean()) >= 1.0 - MOST_ALONE
 
     def remarks(self) -> list[str]:
-        """Return for what it is too small, in clauses."""
-        growth, failures = self.growth, self.failures
+        """Return what it is too small for, in clauses."""
         remarks = []
-        if growth > MOST_GROWTH:
+        if self.is_small:
             remarks.append(
                 "too small to be divided by: "
-                f"as many cases again could add up to {growth:.0%} to its FMC"
+                f"as many cases again could add up to {self.growth:.0%} to its FMC"
             )
         if not self.tells_regions:
-            alone = 1.0 - float(has_neighbour(failures).mean())
+            alone = 1.0 - float(has_neighbour(self.failures).mean())
+            radius = radius_for(self.points.shape[1])
             remarks.append(
                 f"too small for regions: {alone:.0%} of the failures have no other one within "
-                f"{radius_for(failures.shape[1]):.2f}"
+                f"{radius:.2f}"
             )
         return remarks
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what JSON says of it."""
+        failures = self.failures
+        return {
+            "cases": len(self.margin),
+            "failures": len(failures),
+            "fmc": fmc(failures),
+            "region_sizes": np.bincount(regions(failures)).tolist(),
+            "real_regions": len(self.real_regions()) if self.tells_regions else None,
+            "fmc_growth": self.growth,
+            "too_small": self.is_small,
+            "in_sumo": self.in_sumo,
+            **({} if self.runs is None else {"runs": self.all_runs}),
+        }
 
     def real_regions(self) -> list[FloatArray]:
         """Return the points of each disjoint region with a real share of the failures."""
@@ -153,6 +170,16 @@ class Repeats:
         if self.most < 1:
             raise UserError(f"`repeat` is {self.most}: it must be 1 or more")
 
+    @classmethod
+    def of(cls, settings: CampaignSettings, most: int | None, tolerated: float) -> Repeats | None:
+        """Return how often a person wants a case to run; None for once.
+
+        Where nothing is random a case runs once.
+        """
+        default = MOST_RUNS if tolerated else 1
+        repeats = cls(default if most is None else most, tolerated)
+        return repeats if repeats.most > 1 and settings.may_vary else None
+
 
 OnCases = Callable[[int], None]
 """Told how many cases have just ended."""
@@ -167,7 +194,7 @@ def ground_truth(
     repeats: Repeats | None = None,
     workers: Workers | None = None,
     cache: Path | None = None,
-    on_cases: OnCases | None = None,
+    on_cases: OnCases = lambda _: None,
 ) -> Truth:
     """Return the ground truth of a plan at a level, from the cache where it is there.
 
@@ -195,7 +222,7 @@ def ground_truth(
     count = TRUTH_CASES[level] if cases is None else cases
     for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
         if not isinstance(number, Integral) or number < least:
-            raise UserError(f"--{name} is {number!r}: it must be a whole number, {least} or more")
+            raise UserError(f"`{name}` is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
     of_runs = {} if repeats is None else asdict(repeats)
     kept = TruthKey({**plan.key(level), **of_runs}, level, count, seed, plan.engine)
@@ -208,12 +235,10 @@ def ground_truth(
     check_private(path.parent)
     dims = len(plan.scenario.dimensions(level))
     points = np.random.default_rng([seed, level]).random((count, dims))
-    told = _Told(count, on_cases)
     if repeats is None:
-        truth, files = _run(plan, level, points, workers, told)
+        truth, files = _run(plan, level, points, workers, on_cases)
     else:
-        truth, files = _run_repeatedly(plan, level, points, repeats, workers, told)
-    told.end()
+        truth, files = _run_repeatedly(plan, level, points, repeats, workers, on_cases)
     names = COLUMNS if truth.runs is None else (*COLUMNS, *COUNTS)
     arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in names}
     np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
@@ -224,51 +249,25 @@ def ground_truth(
     return truth
 
 
-class _Told:
-    """Tells a person how many cases have ended: some at a time, and the rest in the end."""
-
-    def __init__(self, cases: int, on_cases: OnCases | None) -> None:
-        self._cases, self._on_cases, self._ended, self._said = cases, on_cases, 0, 0
-
-    def ended(self, cases: int = 1) -> None:
-        """Count cases that have ended."""
-        self._ended += cases
-        if self._ended - self._said >= PROGRESS_CASES:
-            self._say(self._ended)
-
-    def end(self) -> None:
-        """Say what is left."""
-        if self._said < self._cases:
-            self._say(self._cases)
-
-    def _say(self, ended: int) -> None:
-        if self._on_cases is not None:
-            self._on_cases(ended - self._said)
-        self._said = ended
-
-
 def _run(
     plan: SimulationPlan,
     level: int,
     points: FloatArray,
     workers: Workers | None,
-    told: _Told | None,
+    on_cases: OnCases,
     draw: int = 0,
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
-    pool, count = Pool(levels=(level,), scenario=plan.scenario), len(points)
-    margins = np.full(count, np.nan)
+    margins = np.full(len(points), np.nan)
     plan = plan.at_level(level)
     files = (plan.vut.files or {}) | plan.povs.files
-    scored = evaluate(plan, CasesAt(pool, level, points, draw), workers, _margins)
+    cases = CasesAt(Pool(levels=(level,), scenario=plan.scenario), level, points, draw)
     in_sumo = 0
-    for place, (margin, by_sumo, loaded) in scored:
+    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margins):
         margins[place] = margin
         in_sumo += by_sumo
-        for name, sha256 in loaded.items():
-            files.setdefault(name, sha256)
-        if told is not None:
-            told.ended()
+        files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}
+        on_cases(1)
     return Truth(points, margins, in_sumo), files
 
 
@@ -278,35 +277,30 @@ def _run_repeatedly(
     points: FloatArray,
     repeats: Repeats,
     workers: Workers | None,
-    told: _Told,
+    on_cases: OnCases,
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), draw by draw, each until it is decided whether it fails."""
     margins = np.full((repeats.most, len(points)), np.nan)
     runs, failed = np.zeros((2, len(points)), dtype=np.int64)
     open_, in_sumo, files = np.arange(len(points)), 0, Files()
     for draw in range(repeats.most):
-        ran, loaded = _run(plan, level, points[open_], workers, None, draw)
+        ran, loaded = _run(plan, level, points[open_], workers, lambda _: None, draw)
         files, in_sumo = {**loaded, **files}, in_sumo + ran.in_sumo
         margins[draw, open_] = ran.margin
         runs[open_] += ~np.isnan(ran.margin)
         failed[open_] += ran.margin < 0.0
         pairs = zip(failed[open_].tolist(), runs[open_].tolist(), strict=True)
         decided = [n > 0 and is_decided(k, n, repeats.tolerated) for k, n in pairs]
-        told.ended(sum(decided))
+        on_cases(sum(decided))
         open_ = open_[~np.array(decided)]
         if not len(open_):
             break
+    on_cases(len(open_))
     # NaN, of what did not run or has no verdict, comes last.
-    spared = _spared(runs, repeats.tolerated)
+    numbers = np.arange(1, runs.max(initial=1) + 1)
+    spared = (numbers[:, None] / np.maximum(runs, 1) <= repeats.tolerated).sum(axis=0)
     margin = np.sort(margins, axis=0)[spared, np.arange(len(points))]
     return Truth(points, margin, in_sumo, runs, failed), files
-
-
-def _spared(runs: IntArray, tolerated: float) -> IntArray:
-    """Return how many failing runs of each case are tolerated, (n,)."""
-    numbers = np.arange(1, runs.max(initial=1) + 1)
-    tolerable = numbers[:, None] / np.maximum(runs, 1) <= tolerated
-    return np.asarray(tolerable.sum(axis=0), dtype=np.int64)
 
 
 def known_truth(
@@ -387,3 +381,58 @@ def _margins(results: Episodes) -> list[tuple[float, bool, Files]]:
         (np.nan if verdict.margin is None else verdict.margin, place in results.in_sumo, files)
         for place, verdict in enumerate(results.verdicts())
     ]
+
+
+@dataclass(frozen=True, repr=False)
+class TruthResult(Result):
+    """The ground truth of a VUT at one or more POV levels.
+
+    Attributes:
+        vut: the VUT.
+        truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
+            points of the `failures`, (m, d).
+        criterion: what counts as a failure.
+        tolerated: share of its runs in which a case may fail.
+    """
+
+    vut: str
+    truths: dict[int, Truth]
+    criterion: Criterion
+    tolerated: float = 0.0
+
+    def to_record(self) -> dict[str, Any]:
+        """Return what `--json` prints: that of the level, or sums with a list of the levels."""
+        levels = [
+            {"vut": self.vut, "level": level, **truth.to_record(), "fail_when": self.criterion.text}
+            | ({} if truth.runs is None else {"tolerated": self.tolerated})
+            for level, truth in self.truths.items()
+        ]
+        if len(levels) == 1:
+            return levels[0]
+        sums: dict[str, Any] = {}
+        for name in ("cases", "failures", "fmc", "real_regions"):
+            of_levels = [one[name] for one in levels]
+            sums[name] = None if None in of_levels else sum(of_levels)
+        text = self.criterion.text
+        return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": levels}
+
+    def lines(self) -> list[str]:
+        """Return a line for each level, and any criterion but the default one in words."""
+        lines = []
+        for level, truth in self.truths.items():
+            line = f"{self.vut} at level {level_name(level)}: "
+            line += f"{counted(len(truth.failures), 'failure')} in "
+            line += f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
+            if truth.tells_regions:
+                regions = counted(len(truth.real_regions()), "region")
+                line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
+            if truth.in_sumo < truth.all_runs:
+                cases = counted(truth.in_sumo, "case")
+                line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
+            lines += [line, *(f"  {remark}" for remark in truth.remarks())]
+            if truth.runs is not None:
+                said = f"more than {self.tolerated:.0%} of its runs do" if self.tolerated else ""
+                lines.append(
+                    f"  {truth.all_runs} runs; a case fails where {said or 'any of its runs does'}"
+                )
+        return [*lines, f"  a case fails when {self.criterion.words}"]

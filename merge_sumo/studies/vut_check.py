@@ -6,19 +6,24 @@ import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from pathlib import Path
 from time import perf_counter
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.analysis.result import Result
+from merge_sumo.analysis.result import Result, Shown
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
+from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.values.case import Case, FloatArray, MergeCase, from_unit
-from merge_sumo.values.scenario import DT_S, Scenario, lane_of
+from merge_sumo.values.scenario import DT_S, US23, Scenario, lane_of
 from merge_sumo.values.trajectory import End, Trajectory
 from merge_sumo.vuts.base import HERE
+from merge_sumo.vuts.built_in import BUILT_IN_VUTS
+from merge_sumo.vuts.python import installed_vuts
+from merge_sumo.vuts.registry import KINDS
 
 CORRIDORS: Final = 4
 PLACES: Final = tuple(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
@@ -267,3 +272,16 @@ def _not_numbers(ground: Simulator, case: Case) -> list[str]:
     if np.isfinite(answer):
         return [f"To a state that is not a number it answers {answer:g} m/s2."]
     return []
+
+
+def known_vuts(policies: Path | str | None) -> Shown:
+    """Return the VUTs that can be tested, with the learned drivers of a folder or a library."""
+    trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
+    built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
+    kinds = [kind for kind in KINDS.values() if kind.form]
+    names = {"built in": built_in, "installed": list(installed_vuts())}
+    lines = [f"{title}: {', '.join(known)}" for title, known in names.items() if known]
+    for kind in kinds:
+        lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
+    listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
+    return Shown({**names, "kinds": listed}, lines)

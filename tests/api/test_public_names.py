@@ -66,8 +66,8 @@ print(ms.scenarios(), ms.new_scenario("a.toml", net="a.net.xml", mainline="a b",
 print(ms.check_scenario("us23"), ms.reproduce(quick=True))
 print(ms.explain(run, 3).found)
 print(ms.benchmark("fsm", 0, samplers=["uniform"], seeds=2).samplers["uniform"].fmc.median)
-print(ms.probability(run, cases=100).found.confidence)
-print(ms.repair(run, ["gain=0..1"], trials=9).spec)
+print(ms.probability(run, cases=100).confidence)
+print(ms.repair(run, ["gain=0..1"], trials=9).repaired)
 print(ms.check_vut(Mine).problems, ms.train(["pov1"], check=True)["pov1"].mean_regret)
 try:
     ms.open_run("nowhere")

@@ -25,7 +25,7 @@ from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, fail
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path
-from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
+from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.workers import Workers
@@ -248,7 +248,7 @@ class TestAFileOfOurs:
 
 
 def avoided(folder: Path) -> None:
-    write_avoidance(folder, [Avoidance(0, ("fsm",), None, True)])
+    AVOIDANCE.write_lines(folder, [Avoidance(0, ("fsm",), None, True)])
 
 
 OURS = {

@@ -61,11 +61,6 @@ VERBS = {
     "rerun": Verb("rerun run --json", how="SIGTERM"),
     "rerun --stress": Verb("rerun run --stress --json"),
     "explain": Verb("explain run --json"),
-    "repair": Verb(
-        "repair run --param gap_m=10..40 --trials 4 --rounds 1 --cases 20 --out new",
-        "repair run --param gap_m=10..40 --trials 4 --rounds 1 --cases 20 --resume new",
-        how="Ctrl-C",
-    ),
     "truth": Verb("truth --vut design1 --level 0 --cases 1500 --json"),
     "benchmark": Verb(
         "benchmark --vut design1 --level 0 --samplers uniform,gpr --seeds 2 --cases 40 "

@@ -16,6 +16,7 @@ import pytest
 from ci_snippets import files
 from contest import BenchmarkSettings, Found, SamplerBenchmark, Task, cases_to, fmc_of
 from entrants import Entrant, sampler_class
+from oracle import oracle
 from problems import (
     MANIFEST,
     PROBLEMS,
@@ -29,6 +30,7 @@ from problems import (
 )
 
 from merge_sumo.errors import UserError
+from merge_sumo.studies.truth import Truth
 from merge_sumo.testing import SamplerContract
 from merge_sumo.values.fmc import RADIUS, fmc
 
@@ -233,3 +235,11 @@ class TestCmaMe(SamplerContract):
 @needs("botorch")
 class TestStraddle(SamplerContract):
     sampler = sampler_class(f"{GUESTS / 'straddle.py'}:StraddleSampler")
+
+
+def test_the_oracle_takes_the_most_useful_failure_first():
+    # Two that overlap and one apart: one of the two, the one apart, then the rest.
+    points = np.array([[0.2, 0.2], [0.22, 0.2], [0.8, 0.8]])
+    curve = oracle({0: Truth(points, np.full(3, -0.2))}, 10, 5)
+    assert [curve[n] for n in range(3)] == pytest.approx([0.0, DISC, 2.0 * DISC])
+    assert curve[3] == curve[10] == pytest.approx(fmc(points))

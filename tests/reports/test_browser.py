@@ -21,7 +21,7 @@ from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report, report_model
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
+from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
 
@@ -349,7 +349,7 @@ def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
     first, others = found[0].index, [o.index for o in found[1:]]
     lines = [Avoidance(first, ("careful", "rss"), 3.0, pov_careful=True)]
     lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
-    write_avoidance(run.folder, lines)
+    AVOIDANCE.write_lines(run.folder, lines)
     with shown(browser, report.write_report(run)) as page:
         assert "In the VUT's place careful, rss would have avoided it." in page.inner_text("#case")
         page.locator(".map input[type=checkbox]").first.check()
@@ -373,7 +373,7 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     gap = Axis("gap_m", 16.2, 8.1, 32.4, 0.6, 2, below=14.1)
     known = Explanation(first.index, start, {"0": True, "2": False}, (gap,))
     line = json.dumps(to_plain(known))
-    (run.folder / EXPLANATIONS).write_text(f"{line}\n", encoding="utf-8")
+    (run.folder / EXPLANATIONS.name).write_text(f"{line}\n", encoding="utf-8")
     words = list(in_words(known, first))
     moments = [
         t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None

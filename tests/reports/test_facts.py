@@ -18,7 +18,7 @@ from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports.facts import Fact
 from merge_sumo.reports.report import report_page
-from merge_sumo.studies.counterfactuals import Avoidance, write_avoidance
+from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def made(tmp_path_factory) -> Run:
     worst, *others = (o.index for o in failures(run.outcomes))
     lines = [Avoidance(worst, ("careful", "rss"), 3.0, pov_careful=True)]
     lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
-    write_avoidance(run.folder, lines)
+    AVOIDANCE.write_lines(run.folder, lines)
     return run
 
 

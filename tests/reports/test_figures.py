@@ -26,19 +26,16 @@ def curves():
         )
         for name, end in (("uniform", 0.01), ("gpr", 0.05))
     }
-    study: Any = SimpleNamespace(
-        samplers=samplers, truth_fmc=0.12, oracle_fmc={0: 0.0, 10: 0.1, 40: 0.12}, limit_fmc=0.15
-    )
+    study: Any = SimpleNamespace(samplers=samplers, truth_fmc=0.12, limit_fmc=0.15)
     return figures.coverage_curves("design1 v level 0", study)
 
 
-def test_curves_show_each_sampler_the_oracle_and_the_truth():
+def test_curves_show_each_sampler_and_the_truth():
     (axes,) = curves().axes
     lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}
     assert lines == {
         "uniform": [0.0, 0.005, 0.01],
         "gpr": [0.0, 0.025, 0.05],
-        "oracle": [0.0, 0.1, 0.12],
         "truth": [0.12, 0.12],
         "limit": [0.15, 0.15],
     }

@@ -29,7 +29,6 @@ from merge_sumo.studies.comparison import (
     ComparedCase,
     Region,
     compare,
-    compare_outcomes,
     rerun,
 )
 from merge_sumo.studies.run_study import RunStudy
@@ -67,9 +66,7 @@ def outcome(became: str, index: int = 0) -> Outcome:
     [
         ("contact", "safe", Change.FIXED, "contact -> safe"),
         ("safe", "contact", Change.BROKE, "safe -> contact"),
-        ("safe", "timeout", Change.BROKE, "safe -> timeout"),
         ("harsh", "vut error", Change.BROKE, "harsh -> vut error"),
-        ("vut error", "safe", Change.FIXED, "vut error -> safe"),
         ("contact", "timeout", Change.NEITHER, "contact -> timeout"),
         ("contact", "conflict", Change.NEITHER, "contact -> conflict"),
         ("safe", "harsh", Change.BOTH, "safe -> harsh"),
@@ -83,9 +80,6 @@ def outcome(became: str, index: int = 0) -> Outcome:
 def test_what_became_of_a_case(before, after, change, words):
     one = ComparedCase(outcome(before), outcome(after))
     assert (one.change, one.became) == (change, words)
-
-
-# Recorded campaigns.
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +145,6 @@ class TestARegion:
         assert (region.change, region.version) == (Change.EARLIER_ALONE, 1)
         assert (region.cases, region.failed) == (1, 0)
         assert region.fmc == pytest.approx(BALL, rel=1e-6)
-        assert 0.4 < region.looked_at < 0.6
         assert not compare([a, b]).worse
 
     def test_is_the_later_ones_the_other_way_round_and_breaks_nothing(self, tmp_path):
@@ -185,22 +178,14 @@ def test_three_versions_are_two_steps(tmp_path):
     assert [row[0] for row in found.fmc().values()] == ["0.0000"]
 
 
-def test_a_version_that_was_tested_in_no_case_is_worse(tmp_path):
-    a, b = write(tmp_path / "a", (0.5, 0.5, "fails")), write(tmp_path / "b", (0.1, 0.1, "errs"))
-    assert compare([a, b]).worse
-
-
 def test_what_does_not_compare_is_refused(tmp_path, run):
     with pytest.raises(UserError, match="needs two campaigns or more"):
         compare([run])
     with pytest.raises(UserError, match="no POV level in common"):
         compare([run, write(tmp_path / "1", (0.1, 0.1, "passes"), level=1)])
-    with pytest.raises(UserError, match="with the same share"):
+    with pytest.raises(UserError, match="differ in the share of its runs"):
         compare([run, changed(tmp_path / "tolerant", run, tolerated=0.2)])
     assert compare([run, changed(tmp_path / "net", run, net_sha256="0")]).notes
-
-
-# The command and its page.
 
 
 def test_a_list_that_is_cut_says_so_everywhere(call, tmp_path, monkeypatch):
@@ -219,17 +204,6 @@ def test_a_list_that_is_cut_says_so_everywhere(call, tmp_path, monkeypatch):
     assert titles.index("From 1 to 2") < titles.index("Broke: 25, the first 20 of 25")
     assert len(root.findall(".//details")) == 20
     assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "25"
-
-
-def test_json_has_the_transitions_and_every_case(call, run, fixed):
-    told = json.loads(call("compare", run.folder, run.folder, "--json").out)
-    (step,) = told["steps"]
-    assert told["worse"] is False
-    assert sum(row["cases"] for row in step["transitions"]) == 60
-    assert {case["change"] for case in step["cases"]} == {"pass with neither"}
-    assert len(step["cases"]) == len(failures(run.outcomes))
-    assert call("compare", fixed.folder, run.folder).code == 1
-    assert call("compare", run.folder, fixed.folder).code == 0
 
 
 def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run, tmp_path):
@@ -258,11 +232,10 @@ def test_the_page_is_written_nowhere_where_something_is(call, run, tmp_path):
     assert file.read_text() == "mine"
 
 
-# Recorded cases with a changed VUT.
-
-
 def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
-    found = rerun(RunStudy(run, today := settings_of(run.folder, run.settings), resolve(today)))
+    found = rerun(
+        RunStudy(run, today := settings_of(run.folder, run.settings), resolve(today)), run.outcomes
+    )
     assert [o.measures for o in found.versions[1].outcomes] == [o.measures for o in run.outcomes]
     assert found.steps[0].count(Change.BROKE) == found.steps[0].count(Change.FIXED) == 0
     assert not found.worse
@@ -294,40 +267,16 @@ def test_a_rerun_says_what_is_fixed_and_where_its_cases_come_from(command_line, 
     assert "`merge-sumo campaign --vut design2 --against design1` searches there" in out
 
 
-def test_a_rerun_of_a_changed_file_names_no_campaign_of_a_version_against_itself(
-    command_line, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    Path("my_vut.py").write_text("def f(seen):\n    return 1.0\n")
-    settings = campaign_settings(vut="my_vut.py:f", cases=4, batch=4)
-    run_campaign(settings, tmp_path / "run")
-    Path("my_vut.py").write_text("def f(seen):\n    return 0.0\n")
-    _, out, _ = command_line("rerun", "run", "--vut", "my_vut.py:f")
-    assert "`merge-sumo campaign --vut my_vut.py:f` searches there" in out
-
-
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
         (("60",), "has no case 60"),
-        (("--vut", "design9"), "design9"),
-        (("--tolerance", "1"), "the option --tolerance is gone"),
+        (("--level", "2"), "has no cases at level 2: it has 0, or all"),
         (("3", "--stress"), "--stress runs all cases"),
     ],
 )
 def test_bad_use_of_rerun_is_refused(command_line, run, arguments, part):
     assert_refused(command_line("rerun", run.folder, *arguments), part)
-
-
-def test_rerun_on_another_net_is_refused(command_line, run, tmp_path):
-    folder = shutil.copytree(run.folder, tmp_path / "campaign")
-    settings = json.loads((folder / "campaign.json").read_text())
-    settings.pop("sha256")
-    (folder / "campaign.json").write_text(json.dumps({**settings, "net_sha256": "0"}))
-    assert_refused(command_line("rerun", folder), "another net")
-
-
-# Chance.
 
 
 def runs(failing: int, count: int) -> RunsOfCase:
@@ -353,8 +302,7 @@ def compared(before: tuple[int, int], after: tuple[int, int], tolerated: float) 
 @pytest.mark.parametrize(
     ("before", "after", "tolerated", "change"),
     [
-        ((3, 10), (5, 10), 0.4, Change.WITHIN_CHANCE),
-        ((5, 10), (3, 10), 0.4, Change.WITHIN_CHANCE),
+        ((3, 10), (5, 10), 0.4, Change.WITHIN_CHANCE),  # p = 0.65
         ((3, 10), (5, 10), 0.0, Change.NEITHER),
         ((0, 10), (6, 10), 0.4, Change.BROKE),
         ((6, 10), (0, 10), 0.4, Change.FIXED),
@@ -362,14 +310,6 @@ def compared(before: tuple[int, int], after: tuple[int, int], tolerated: float) 
 )
 def test_shares_that_chance_may_give_are_no_change(before, after, tolerated, change):
     assert compared(before, after, tolerated).change is change
-
-
-def test_the_sentence_says_by_what():
-    # Fisher's exact test of 3 of 10 against 5 of 10.
-    one = compared((3, 10), (5, 10), 0.4)
-    assert one.became == ("3 of 10 runs fail -> 5 of 10 runs fail, by Fisher's exact test p = 0.65")
-    record = one.to_record()
-    assert (record["failed_runs_before"], record["runs_before"]) == (3, 10)
 
 
 COIN = """
@@ -403,11 +343,5 @@ def test_campaigns_with_repeats_are_compared_case_by_case(tmp_path):
         assert one.runs_a.failures <= one.runs_b.failures
     assert step.count(Change.BROKE) == 0, "no case is told apart by ten runs"
     today = settings_of(made[0].folder, made[0].settings, {"vut": made[0].vut})
-    again = rerun(RunStudy(made[0], today, resolve(today)))
+    again = rerun(RunStudy(made[0], today, resolve(today)), made[0].outcomes)
     assert {case.change for case in again.steps[0].cases} <= {Change.BOTH, Change.NEITHER}
-
-
-def test_cases_of_a_campaign_with_another_vut(run):
-    before = [replace(one, measures=outcome("safe").measures, margin=None) for one in run.outcomes]
-    found = compare_outcomes(before, run, "other")
-    assert found.broke == len(failures(run.outcomes))

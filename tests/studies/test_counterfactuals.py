@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
 
 import numpy as np
@@ -29,12 +28,8 @@ from merge_sumo.studies.counterfactuals import (
     Stage,
     avoidance,
     avoidances,
-    read_avoidance,
     run_counterfactuals,
-    write_avoidance,
 )
-from merge_sumo.system.workers import InProcess, Workers
-from merge_sumo.values.case import MergeCase
 from merge_sumo.values.merge import brake_after_mps2
 from merge_sumo.values.scenario import OWN, US23
 from merge_sumo.vuts.base import VutOptions
@@ -87,20 +82,6 @@ def last_of(failure):
     steps = range(len(failure.motion) - 1)
     passing = [step for step in steps if passes(failure, REFERENCES["fsm"](1), step)]
     return max(passing, default=None)
-
-
-class DiesAt(InProcess):
-    """A worker that is ended by one failure, each time."""
-
-    def __init__(self, index):
-        self.index = index
-
-    def submit(self, fn, /, *args, **kwargs):
-        if self.index not in [index for index, _ in args[0]]:
-            return super().submit(fn, *args, **kwargs)
-        future: Future = Future()
-        future.set_exception(BrokenExecutor())
-        return future
 
 
 class TestEveryFailure:
@@ -191,30 +172,12 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
     assert run_counterfactuals(plan_for("careful", povs=povs), failing) == found[:4]
 
 
-class TestWorkers:
-    @pytest.mark.slow
-    def test_that_die_at_a_failure_leave_out_that_one_and_no_other(self, run, found):
-        left_out = found[1].index
-        with Workers(lambda: DiesAt(left_out), 1) as workers:
-            assert avoidance_of(run, workers) == [one for one in found if one.index != left_out]
-
-    def test_are_asked_in_between_whether_to_stop(self, run, found):
-        class EnoughError(Exception):
-            pass
-
-        def stop():
-            raise EnoughError
-
-        with Workers(InProcess, 3) as workers, pytest.raises(EnoughError):
-            avoidance_of(run, workers, check=stop)
-
-
 class TestTheFile:
     def test_is_read_as_it_was_written_and_leaves_the_outcomes_alone(self, folder, found):
         before = (folder / "outcomes.jsonl").read_bytes()
-        assert read_avoidance(Run(folder)) == {}
-        write_avoidance(folder, found)
-        assert list(read_avoidance(Run(folder)).values()) == found
+        assert AVOIDANCE.read_lines(Run(folder)) == {}
+        AVOIDANCE.write_lines(folder, found)
+        assert list(AVOIDANCE.read_lines(Run(folder)).values()) == found
         assert (folder / "outcomes.jsonl").read_bytes() == before
 
     @pytest.mark.parametrize(
@@ -233,39 +196,10 @@ class TestTheFile:
     def test_of_somebody_else_is_refused_where_it_is_not_as_it_is_written(
         self, folder, found, change
     ):
-        write_avoidance(folder, found)
-        path = folder / AVOIDANCE
+        AVOIDANCE.write_lines(folder, found)
+        path = folder / AVOIDANCE.name
         lines = path.read_text().splitlines()
         lines[0] = json.dumps(json.loads(lines[0]) | change)
         path.write_text("\n".join(lines) + "\n")
         with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
-            read_avoidance(Run(folder))
-
-
-ESCAPES = """
-class Escapes:
-    def __init__(self, until_s, a_mps2):
-        self.until_s, self.a_mps2 = until_s, a_mps2
-
-    def act(self, seen):
-        level0 = min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
-        return level0 if seen.t_s < self.until_s - 0.05 else self.a_mps2
-"""
-
-
-@pytest.mark.parametrize("dx_m", [-5.0, 0.0, 5.0])
-def test_after_the_last_way_out_neither_braking_nor_acceleration_helps_in_sumo(tmp_path, dx_m):
-    """Eq. (4) moves a car by its speed before the step, so there is no way out a step later."""
-    (tmp_path / "vut.py").write_text(ESCAPES)
-    case = MergeCase(level=0, x_pov0_m=-240.0, v_pov0_mps=30.0, scenario=US23)
-    first = run_cases(plan_for("level0"), [case])[0]
-    case = replace(case, x_pov0_m=-240.0 - first.outcome.measures.dx_m + dx_m)
-    measures = run_cases(plan_for("level0"), [case])[0].outcome.measures
-    assert measures.dx_m == pytest.approx(dx_m)
-    for late_s, avoids in ((0.0, True), (0.1, False), (0.2, False), (0.5, False)):
-        until_s = measures.last_avoidable_s + late_s
-        ends = [
-            run_cases(plan_for(f"{tmp_path}/vut.py:Escapes?until_s={until_s}&a_mps2={a}"), [case])
-            for a in (2, -4)
-        ]
-        assert any(not results[0].outcome.measures.is_close for results in ends) == avoids
+            AVOIDANCE.read_lines(Run(folder))

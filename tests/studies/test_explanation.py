@@ -24,7 +24,6 @@ from merge_sumo.studies.explanation import (
     Axis,
     Explanation,
     in_words,
-    read_explanations,
 )
 from merge_sumo.values.criterion import Criterion
 
@@ -69,7 +68,7 @@ def check_axes(found: Explanation, case, plan):
 class TestACampaign:
     def test_explains_its_worst_failure_alone(self, made):
         worst = failures(made.cases)[0]
-        ((index, found),) = read_explanations(made).items()
+        ((index, found),) = EXPLANATIONS.read_lines(made).items()
         assert index == worst.index
         assert [axis.name for axis in found.start[:2]] == ["x_pov0_m", "v_pov0_mps"]
         assert found.parameters == ()
@@ -79,7 +78,7 @@ class TestACampaign:
         (tmp_path / "mine.py").write_text("def drive(seen):\n    return 1.0\n")
         own = uniform(f"{tmp_path / 'mine.py'}:drive", tmp_path / "run", 60, level=0)
         assert own.failures
-        assert not (own.folder / EXPLANATIONS).exists()
+        assert not (own.folder / EXPLANATIONS.name).exists()
 
     def test_is_not_explained_where_the_engines_differ(self, tmp_path, monkeypatch):
         monkeypatch.setattr(
@@ -87,7 +86,7 @@ class TestACampaign:
         )
         run = uniform("level0", tmp_path / "run", 60, level=0)
         assert run.failures
-        assert not (run.folder / EXPLANATIONS).exists()
+        assert not (run.folder / EXPLANATIONS.name).exists()
         with pytest.raises(UserError, match=r"case \d+ ends otherwise .* the VUT is another"):
             ms.explain(run)
 
@@ -167,7 +166,7 @@ class TestParameters:
             assert not passes(plan_for(f"design2?gap_m={nearer:.2f}"), worst.case)
         assert of_gap.passing
         assert (of_kp.value, of_kp.low, of_kp.high) == (1.4, 1.0, 1.41)
-        assert read_explanations(Run(folder))[worst.index] == result.found
+        assert EXPLANATIONS.read_lines(Run(folder))[worst.index] == result.found
         page = ms.open_run(folder).report().read_text("utf-8")
         assert "the VUT's gap_m is 16.20; passes at" in page
 
@@ -246,10 +245,10 @@ class TestTheFile:
         ],
     )
     def test_of_somebody_else_is_refused_in_a_sentence(self, folder, changes):
-        record = json.loads((folder / EXPLANATIONS).read_text())
-        (folder / EXPLANATIONS).write_text(json.dumps({**record, **changes}))
-        with pytest.raises(UserError, match=EXPLANATIONS):
-            read_explanations(Run(folder))
+        record = json.loads((folder / EXPLANATIONS.name).read_text())
+        (folder / EXPLANATIONS.name).write_text(json.dumps({**record, **changes}))
+        with pytest.raises(UserError, match=EXPLANATIONS.name):
+            EXPLANATIONS.read_lines(Run(folder))
 
 
 def test_words_by_hand(made):

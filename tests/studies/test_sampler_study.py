@@ -16,15 +16,15 @@ import pytest
 from plans import key_of, plan_for
 from vut_contract import factory
 
+from merge_sumo import options
 from merge_sumo.studies.sampler_study import (
+    SamplerRun,
     SamplerStudy,
     SamplerSummary,
-    Search,
     Spread,
     Study,
-    oracle,
 )
-from merge_sumo.studies.truth import Truth, ground_truth, known_truth
+from merge_sumo.studies.truth import Truth, ground_truth
 from merge_sumo.values.case import from_unit, to_unit
 from merge_sumo.values.fmc import fmc
 from merge_sumo.values.scenario import US23
@@ -132,7 +132,8 @@ def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_na
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):
     study = Study(plan_for("design1"), cache=cache)
-    result = study.compare((0,), ["uniform"], seeds=2, cases=50, batch=20, truth_cases=300)
+    asked = options.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
+    result = study.compare((0,), ["uniform"], asked)
     found = result.samplers["uniform"]
     assert found.cases_by_batch == [20, 40, 50]
     assert all(curve == sorted(curve) for curve in found.fmc_by_batch)
@@ -144,14 +145,9 @@ def test_a_study_says_what_samplers_found_of_the_truth(cache):
     assert result.dense == {}
 
 
-def test_a_search_of_all_levels_sums_their_coverage():
-    searches = Study(plan_for("design1")).searches((0, 1), ["uniform"], 1, 40, 40)
-    (found,) = searches["uniform"]
-    assert {outcome.case.level for outcome in found.outcomes} == {0, 1}
-    assert found.fmc[-1] == sum(fmc(found.failures(level)) for level in (0, 1))
-
-
-def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float = 0.0) -> Search:
+def searched(
+    points_by_batch: list[list[tuple[float, float]]], sampler_s: float = 0.0
+) -> SamplerRun:
     """Return a search at level 0 with failures at points, and one safe case in each batch."""
     outcomes: list[Outcome] = []
     curve = []
@@ -162,7 +158,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]], sampler_s: float 
             measures = Measures(end=end, score=score, t_end_s=8.3)
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
-    return Search(outcomes, curve, sampler_s)
+    return SamplerRun(outcomes, curve, sampler_s)
 
 
 def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
@@ -178,11 +174,11 @@ HALF = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
 MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
 
 
-def study_of(*searches: Search, truth: Truth = TWO, **more) -> SamplerStudy:
-    return SamplerStudy({"mine": list(searches)}, {0: truth}, cases=4, **more)
+def study_of(*searches: SamplerRun, truth: Truth = TWO, **more) -> SamplerStudy:
+    return SamplerStudy({"mine": list(searches)}, {0: truth}, **more)
 
 
-def summary(*searches: Search, **more) -> SamplerSummary:
+def summary(*searches: SamplerRun, **more) -> SamplerSummary:
     return study_of(*searches, **more).samplers["mine"]
 
 
@@ -215,40 +211,11 @@ class TestASamplerByHand:
 
     def test_covers_the_mean_share_over_the_levels_with_failures(self):
         for other, share in ((NONE, 0.5), (truth_with((0.2, 0.2)), 0.25)):
-            found = SamplerStudy({"mine": [HALF]}, {0: SMALL, 1: other}, cases=3)
+            found = SamplerStudy({"mine": [HALF]}, {0: SMALL, 1: other})
             assert found.samplers["mine"].covered_share.median == share
-
-
-def test_a_truth_is_known_when_it_was_made_and_not_before(truth, cache, tmp_path):
-    assert known_truth(plan_for("design1"), 0, 300, cache=tmp_path) is None
-    assert known_truth(plan_for("design1"), 0, 301, cache=cache) is None
-    known = known_truth(plan_for("design1"), 0, 300, cache=cache)
-    assert known is not None
-    assert np.array_equal(known.margin, truth.margin)
 
 
 def test_the_cases_of_a_truth_are_the_first_of_a_denser_one(truth, tmp_path):
     few = ground_truth(plan_for("design1"), 0, 40, cache=tmp_path)
     assert np.array_equal(few.points, truth.points[:40])
     assert np.array_equal(few.margin, truth.margin[:40])
-
-
-class TestTheOracle:
-    def test_takes_the_most_useful_failure_first(self):
-        # Two that overlap and one apart: one of the two, the one apart, then the rest.
-        points = np.array([[0.2, 0.2], [0.22, 0.2], [0.8, 0.8]])
-        truth = Truth(points, np.full(3, -0.2))
-        curve = oracle({0: truth}, 10, 5)
-        one = fmc(points[:1])
-        assert curve[0] == 0.0
-        assert curve[1] == pytest.approx(one)
-        assert curve[2] == pytest.approx(2.0 * one)
-        assert curve[3] == pytest.approx(fmc(points))
-        assert curve[10] == curve[3]
-
-    def test_of_two_levels_takes_volume_where_there_is_most(self):
-        flat = Truth(np.array([[0.5, 0.5]]), np.array([-0.2]))
-        solid = Truth(np.array([[0.5, 0.5, 0.5]]), np.array([-0.2]))
-        curve = oracle({2: solid, 1: flat}, 2, 2)
-        assert curve[1] == pytest.approx(fmc(flat.failures))
-        assert curve[2] == pytest.approx(fmc(flat.failures) + fmc(solid.failures))

@@ -60,7 +60,7 @@ def test_each_case_runs_until_it_is_decided_as_the_coin_says(tolerated, most):
 
 
 def test_runs_that_are_no_number_of_runs_are_refused():
-    for keywords, sentence in (({"repeat": 0}, "--repeat is 0"), ({"tolerated": 1.0}, "--toler")):
+    for keywords, sentence in (({"repeat": 0}, "`repeat` is 0"), ({"tolerated": 1.0}, "tolerated")):
         with pytest.raises(UserError, match=sentence):
             truth_of(**keywords)
 

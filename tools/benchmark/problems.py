@@ -19,6 +19,7 @@ from typing import Any, Final
 import frozen  # noqa: F401 (registers the VUTs)
 import numpy as np
 from numpy.typing import NDArray
+from oracle import oracle
 from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.plan import resolve
@@ -27,7 +28,6 @@ from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.sampler_study import oracle
 from merge_sumo.studies.truth import Truth, ground_truth
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.hashing import sha256_of

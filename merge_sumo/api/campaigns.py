@@ -1,0 +1,130 @@
+"""A campaign from its settings to its report: what `campaign`, `resume` and `repair` share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+from merge_sumo import options
+from merge_sumo.analysis.verdict import parse_gates
+from merge_sumo.api.asked import opened
+from merge_sumo.api.results import CampaignRun
+from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.scenario_suggestion import unseen
+from merge_sumo.campaigns.settings import CampaignSettings, controllers
+from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.errors import notice
+from merge_sumo.reports.junit import check_junit, write_junit
+from merge_sumo.reports.progress import CampaignBars
+from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.studies.counterfactuals import AVOIDANCE, avoidance
+from merge_sumo.studies.explanation import note_explanation
+from merge_sumo.system.folders import check_new, link_latest
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.printable import quoted
+from merge_sumo.system.workers import Workers
+from merge_sumo.values.scenario import LEVELS, MergeScenario, Scenario, level_name
+from merge_sumo.values.score import Outcome
+
+
+def concluded(
+    settings: CampaignSettings,
+    plan: SimulationPlan,
+    folder: Path,
+    where: options.Execution,
+    asked: options.SearchOfTest,
+    *,
+    goes_on: bool = False,
+    workers: Workers | None = None,
+) -> CampaignRun:
+    """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
+
+    It begins in a new folder, or goes on in one, with its own workers or those of a caller. An
+    interruption has a note on how to go on.
+    """
+    junit = None if asked.junit is None else Path(asked.junit)
+    parse_gates(asked.gates, against=settings.against is not None)
+    if junit is not None:
+        check_junit(junit, folder)
+    if goes_on:
+        check_report(folder)
+    else:
+        check_new(folder)
+    check = asked.check or (lambda: None)
+    bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
+    title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
+
+    def case_ended(outcome: Outcome) -> None:
+        bars.case_ended(outcome)
+        if asked.on_case is not None:
+            asked.on_case(outcome)
+
+    try:
+        with opened(where, plan) if workers is None else nullcontext(workers) as present, bars:
+            run = run_campaign
+            if goes_on:
+                run = partial(resume_campaign, on_before=bars.ran_before, warn=notice)
+            done = run(
+                *(settings, plan, folder, case_ended),
+                workers=present,
+                check=check,
+                begin=lambda: bars.begin(title),
+            )
+            result = CampaignRun(done, asked.gates)
+            _write_findings(result, plan, present, bars, check)
+    except (KeyboardInterrupt, Stopped) as stop:
+        if folder.exists():
+            link_latest(folder)
+            again = controllers(asdict(settings)).items()
+            named = "".join(f", {name}={spec!r}" for name, spec in again)
+            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r}{named})")
+        raise
+    if junit is not None:
+        write_junit(junit, done, result.facts, result.verdict, result.gates)
+    return result
+
+
+def _write_findings(
+    result: CampaignRun,
+    plan: SimulationPlan,
+    workers: Workers,
+    bars: CampaignBars,
+    check: Callable[[], None],
+) -> None:
+    """Write what follows the cases into the folder: counterfactuals and report."""
+
+    def counted(title: str, unit: str) -> Callable[[int, int], None]:
+        return lambda count, total: bars.counted(title, count, total, unit)
+
+    done, careful = result.run, counted("careful drivers", "failures")
+    # The careful drivers are models of merges.
+    if isinstance(plan.scenario, MergeScenario) and (
+        known := avoidance(done, plan, workers=workers, check=check, on_part=careful)
+    ):
+        AVOIDANCE.write_lines(done.folder, known)
+    note_explanation(done, plan, workers=workers, check=check)
+    link_latest(done.folder)
+    write_report(done, result.summary, counted("surrogates of the report", "levels"))
+
+
+def notice_untrained(
+    settings: CampaignSettings, plan: SimulationPlan, asked: options.Campaign
+) -> None:
+    """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
+    levels = set(LEVELS) & set(settings.scenario.levels)
+    if asked.level == "all" and not levels <= set(settings.levels):
+        present = ", ".join(map(level_name, settings.levels))
+        notice(
+            f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
+        )
+    if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
+        scenario = asked.scenario
+        name = scenario.name if isinstance(scenario, Scenario) else str(scenario)
+        option = "" if asked.policies is None else f" --policies {quoted(asked.policies)}"
+        notice(
+            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            f"`merge-sumo scenario check {quoted(name)}{option}` says in what it differs"
+        )
