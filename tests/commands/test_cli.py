@@ -233,10 +233,8 @@ class TestReport:
             before.pop(campaign / made, None)
         assert after == before
 
-    @pytest.mark.parametrize("kept", [0, 1])
-    def test_of_a_campaign_that_has_hardly_begun_is_written_too(self, call, campaign, kept):
-        lines = (campaign / "outcomes.jsonl").read_bytes().splitlines(keepends=True)
-        (campaign / "outcomes.jsonl").write_bytes(b"".join(lines[:kept]))
+    def test_of_a_campaign_that_has_hardly_begun_is_written_too(self, call, campaign):
+        (campaign / "outcomes.jsonl").write_bytes(b"")
         assert call("report", campaign).code == 0
 
 

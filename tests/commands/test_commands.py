@@ -19,8 +19,6 @@ from merge_sumo import cli
 from merge_sumo.commands.application import PANELS
 from merge_sumo.options import GROUPS
 
-ENDS = ".", ":", "!", "?"
-
 
 def commands() -> dict[str, Any]:
     """Return all commands by what a person types."""
@@ -66,19 +64,6 @@ class TestOptions:
         options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
         groups = [p.rich_help_panel for p in options if p.name != "help"]
         assert groups == sorted(groups, key=GROUPS.index)
-
-    def test_are_the_same_wherever_they_make_sense(self):
-        has = {
-            option: {name for name, c in COMMANDS.items() if option in {p.name for p in c.params}}
-            for option in ("as_json", "progress", "workers", "level")
-        }
-        assert set(COMMANDS) == has["as_json"]
-        again = {"explain", "repair"}
-        fresh = {*again, "probability"}
-        runs_cases = {"campaign", "benchmark", "rerun", "truth", *fresh}
-        assert has["workers"] == {*runs_cases, "reproduce"}
-        assert has["progress"] == {*runs_cases, "reproduce", "train"}
-        assert has["level"] == {*runs_cases, "run"} - fresh
 
 
 class TestHelp:
@@ -150,8 +135,3 @@ def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
             os.kill(process.pid, signal.SIGINT)
     os.close(ours)
     return shown.decode(errors="replace"), process.wait(timeout=600)
-
-
-def test_the_words_of_a_docstring_end_as_sentences():
-    for name, command in COMMANDS.items():
-        assert re.split(r"\n\n", command.help or "")[0].endswith(ENDS), name
