@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from inspect import Parameter
 from types import MemberDescriptorType
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import numpy as np
 
@@ -27,26 +27,17 @@ MOST_DIGITS: Final = 100
 BY_NAME: Final = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
 
-@dataclass(frozen=True, slots=True)
 class Parameters:
     """How the parameters of a spec reach the objects of a controller.
 
-    Attributes:
-        spec: the spec, for messages.
-        keywords: those that the constructor or the function is called with.
-        attributes: those that an object is given after it was made.
-        known: all keywords that could be given, with their present values; None for one that has
-            no number by default.
+    Those that the constructor or the function knows are its keywords; the others are attributes
+    that an object is given after it was made.
     """
 
-    spec: VutSpec
-    keywords: Mapping[str, float]
-    attributes: Mapping[str, float]
-    known: Mapping[str, float | None]
-
-    @classmethod
-    def of(cls, target: Any, spec: VutSpec, given: Mapping[str, float], in_order: int) -> Self:
-        """Return how `given` parameters reach a class, a function or an object.
+    def __init__(
+        self, target: Any, spec: VutSpec, given: Mapping[str, float], in_order: int
+    ) -> None:
+        """Sort `given` parameters of a class, a function or an object.
 
         `in_order` arguments are given by their place. Raises `UserError` for a parameter that a
         function does not have.
@@ -56,12 +47,13 @@ class Parameters:
             with suppress(TypeError, ValueError):  # Python does not know the signature
                 known = list(inspect.signature(target).parameters.values())[in_order:]
                 defaults = {p.name: p.default for p in known if p.kind in BY_NAME}
-        keywords = {name: value for name, value in given.items() if name in defaults}
-        attributes = {name: value for name, value in given.items() if name not in defaults}
-        if attributes and inspect.isroutine(target):
-            raise spec.has_no(next(iter(attributes)), defaults)
-        present = {name: _number(keywords.get(name, value)) for name, value in defaults.items()}
-        return cls(spec, keywords, attributes, present)
+        self.spec = spec
+        self.keywords = {name: value for name, value in given.items() if name in defaults}
+        self.attributes = {name: value for name, value in given.items() if name not in defaults}
+        if self.attributes and inspect.isroutine(target):
+            raise spec.has_no(next(iter(self.attributes)), defaults)
+        both = defaults | self.keywords
+        self._numbers = {n: v for n, value in both.items() if (v := _number(value)) is not None}
 
     def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function that has its keywords, and is called with what the VUT sees."""
@@ -88,8 +80,7 @@ class Parameters:
 
     def present(self, made: Any) -> dict[str, float]:
         """Return all parameters of an object, or of a function, that have a number."""
-        found = {} if inspect.isroutine(made) else _attributes(made)
-        return found | {name: value for name, value in self.known.items() if value is not None}
+        return ({} if inspect.isroutine(made) else _attributes(made)) | self._numbers
 
 
 def _attributes(made: Any) -> dict[str, float]:

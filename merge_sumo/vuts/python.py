@@ -106,7 +106,7 @@ def vut_of(
     batched, acts = (callable(getattr(target, method, None)) for method in ("act_batch", "act"))
     if not (batched or acts or (not is_class and callable(target) and fits(target, 1))):
         return None
-    parameters = Parameters.of(target, spec, given, in_order=int(not is_class or batched))
+    parameters = Parameters(target, spec, given, in_order=int(not is_class or batched))
 
     def make(corridors: int, _world: object) -> Driver:
         def new(*arguments: int) -> Any:
