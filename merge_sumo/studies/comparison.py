@@ -45,8 +45,6 @@ LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""
 SIGNIFICANT: Final = 0.05
 """Chance of the runs of a case in equal versions, up to which a change is none of chance."""
-ROUNDING: Final = 1e-9
-"""Share of the radius by which two points may be further apart and still count as near."""
 
 
 class Change(StrEnum):
@@ -436,13 +434,8 @@ def compare_against(run: Run) -> Comparison | None:
     earlier = run.earlier()
     if earlier is None:
         return None
-    before = Version(
-        earlier.vut,
-        str(earlier.folder),
-        earlier.outcomes[: len(run.outcomes)],
-        run.tolerated,
-        run.levels,
-    )
+    outcomes = earlier.outcomes[: len(run.outcomes)]
+    before = Version(earlier.vut, str(earlier.folder), outcomes, run.tolerated, run.levels)
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
     return _of_two(before, Version.of(run), source)
 
@@ -484,8 +477,6 @@ def _notes(runs: Sequence[Run]) -> list[str]:
             "The campaigns differ in sampler or number of cases: FMC, failures and regions are "
             "what each of them found, and a longer search finds more."
         )
-    if len({str(run.settings.get("net_sha256")) for run in runs}) > 1:
-        notes.append("The campaigns were not all run on the same net.")
     notes += [f"{run.folder}: {run.interruption}" for run in runs if run.interruption]
     return notes
 
@@ -524,7 +515,7 @@ def _regions_of(
         return []
     level = failing[0].case.level
     points, of_others = (to_unit((o.case for o in some), level) for some in (failing, tested))
-    labels, limit = regions(points), radius_for(points.shape[1]) * (1.0 + ROUNDING)
+    labels, limit = regions(points), radius_for(points.shape[1]) + 1e-9
     found = []
     for label in np.unique(labels):
         at = points[labels == label]

@@ -201,10 +201,8 @@ def ground_truth(
     Memory grows by 40 bytes a case and no more, whatever the number of cases.
 
     The cache's key is a hash of level, cases, seed, engine and of what decides outcomes by the
-    plan, with the versions of the software: after a change in the sources of this package that
-    gives it no other version, the cache is to be removed. What the VUT itself loaded while it drove
-    is kept with the truth, and a truth is only used while those files are the same. A plan for the
-    kinematic engine also takes the truth that SUMO gave.
+    plan, with the versions of the software. A truth is only used while the files are the same that
+    the VUT loaded. A plan for the kinematic engine also takes the truth that SUMO gave.
 
     Args:
         plan: how cases run.
