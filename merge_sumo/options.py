@@ -521,7 +521,7 @@ class Case(Test):
         "--debug",
     )
     gui: bool = option(
-        False, bool, "Play it in sumo-gui when it has run, in real time.", WHERE, "--gui"
+        False, bool, "Show it in sumo-gui while it runs, in real time.", WHERE, "--gui"
     )
     out: AnyPath | None = _out("New folder to keep it in, for `replay` and sumo-gui.")
     on_end: Callable[[Any], None] | None = keyword(

@@ -79,7 +79,6 @@ from merge_sumo.studies.stress import STRESS, StressResult
 from merge_sumo.studies.truth import TruthResult
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
-from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
@@ -90,9 +89,9 @@ from merge_sumo.system.folders import (
     make_folder,
     write_new,
 )
-from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
+from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import US23, Scenario
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
@@ -150,23 +149,19 @@ def run(asked: options.Case) -> CaseRun:
     settings, case = given_case(asked) if asked.recorded is None else recorded_case(asked)
     if asked.out is not None:
         check_new(Path(asked.out))
-    if asked.gui:
-        replayer.check_display()
     for sentence in outside_of_the_pool(case):
         notice(sentence)
     plan = resolve(settings, debug=asked.debug)
     if asked.recorded is not None:
         notice_changes(campaign_of(asked.recorded[0]).run, plan)
-    result = run_one(plan, case)
-    with stopping_in_order(), scratch_folder() as scratch:
-        folder = scratch / "case" if asked.out is None else Path(asked.out)
-        if asked.gui or asked.out is not None:
-            write_scenario(folder, plan.road, result.outcome, result.trajectory)
+
+    def ended(episode: Episode) -> None:
+        if asked.out is not None:
+            write_scenario(Path(asked.out), plan.road, episode.outcome, episode.trajectory)
         if asked.on_end is not None:
-            asked.on_end(CaseRun(result))
-        if asked.gui:
-            replayer.open_gui(folder)
-    return CaseRun(result)
+            asked.on_end(CaseRun(episode))
+
+    return CaseRun(run_one(plan, case, live=asked.gui, on_end=ended))
 
 
 @verb(options.Rerun)

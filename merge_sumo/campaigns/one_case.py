@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import Any, Final
 
 from merge_sumo.engine.plan import SimulationPlan
@@ -10,6 +11,8 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.options import COORDINATES
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.sumo.live import Window
+from merge_sumo.sumo.replay_folder import case_line, verdict_line
 from merge_sumo.values.case import Case
 from merge_sumo.values.episode import Episode
 from merge_sumo.values.scenario import Scenario, level_name
@@ -64,9 +67,30 @@ def _option(name: str) -> str:
     return f"`{name}`" if name in COORDINATES else f"{name}, which `at` gives,"
 
 
-def run_one(plan: SimulationPlan, case: Case) -> Episode:
-    """Run one case in SUMO; its outcome is that of the same case in a campaign."""
-    with Simulator(plan.for_cases(1)) as simulator:
-        _, trajectory = next(simulator.run([case]))
-    outcome = plan.criterion.outcome(0, 0, trajectory, centre_lines(plan.road))
-    return Episode(outcome, trajectory)
+def run_one(
+    plan: SimulationPlan,
+    case: Case,
+    *,
+    live: bool = False,
+    on_end: Callable[[Episode], None] = lambda _: None,
+) -> Episode:
+    """Run one case in SUMO; its outcome is that of the same case in a campaign.
+
+    With `live` sumo-gui shows it in real time until a person closes the window; `on_end` is told
+    before that. Raises `UserError` when the window is closed while the case runs.
+    """
+    with (
+        Window() if live else nullcontext() as window,
+        Simulator(plan.for_cases(1), window) as simulator,
+    ):
+        if window is not None:
+            window.write(case_line(case))
+        running = simulator.run([case])
+        _, trajectory = next(running)
+        outcome = plan.criterion.outcome(0, 0, trajectory, centre_lines(plan.road))
+        episode = Episode(outcome, trajectory)
+        on_end(episode)
+        if window is not None:
+            window.write(verdict_line(outcome))
+            window.wait()  # before the corridor is made ready for the next case
+    return episode

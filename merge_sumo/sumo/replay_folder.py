@@ -27,6 +27,7 @@ from merge_sumo.road.netfile import NetFile, Point
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
 from merge_sumo.system.records import to_json
+from merge_sumo.values.case import Case
 from merge_sumo.values.merge import merged_rows
 from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.values.score import Outcome
@@ -63,6 +64,10 @@ EXAGGERATED: Final = 1.0 / 175.0
 """Enlargement of the cars for a metre of the picture's width."""
 MOST_BESIDE: Final = 1.7
 """At most, with an acceleration lane: cars side by side do not look as if they touched."""
+MOVING_INK: Final = "0.85,0.30,0.05"
+"""Of labels at cars: it is read on a black road and beside it."""
+LETTERS: Final = "60"
+"""Size of the labels."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
@@ -259,27 +264,50 @@ def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
 
 
 def _view(picture: Picture) -> etree._Element:
+    viewport = picture.zoom, f"{picture.x_m:g}", f"{picture.y_m:g}"
+    return view_settings(picture.exaggeration, viewport, borders=picture.borders)
+
+
+def view_settings(
+    exaggeration: str,
+    viewport: tuple[str, str, str],
+    label: str | None = None,
+    *,
+    borders: bool = False,
+) -> etree._Element:
+    """Return the settings of a view with large cars, labelled by one of their parameters.
+
+    `viewport` is zoom, x and y. Without a `label` cars have none. `borders` draws lines between
+    lanes.
+    """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    if picture.borders:
+    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": exaggeration}
+    if label is not None:
+        vehicles |= {"vehicleTextParam": label, **_text("vehicleText", "70", MOVING_INK)}
+    if borders:
         etree.SubElement(scheme, "edges", laneShowBorders="1")
-    exaggeration = picture.exaggeration
-    etree.SubElement(scheme, "vehicles", vehicleQuality="3", vehicle_exaggeration=exaggeration)
+    etree.SubElement(scheme, "vehicles", vehicles)
     etree.SubElement(
         scheme,
         "pois",
-        poiTextParam=TEXT,
-        poiText_show="1",
-        poiText_size="60",
-        poiText_color=INK,
-        poiText_constantSize="1",
-        poiText_bgColor=PALE,
+        {"poiTextParam": TEXT, **_text("poiText", LETTERS, INK), "poiText_bgColor": PALE},
     )
     etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
-    x, y = f"{picture.x_m:g}", f"{picture.y_m:g}"
-    etree.SubElement(root, "viewport", zoom=picture.zoom, x=x, y=y)
+    zoom, x, y = viewport
+    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
+
+
+def _text(of: str, size: str, colour: str) -> dict[str, str]:
+    """Return how a text is shown; its size is that on the screen."""
+    return {
+        f"{of}_show": "1",
+        f"{of}_size": size,
+        f"{of}_color": colour,
+        f"{of}_constantSize": "1",
+    }
 
 
 def _picture(shown: Road, record: etree._Element) -> Picture:
@@ -336,29 +364,24 @@ def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Ele
     return root
 
 
+def beside(text: str, *, ahead: bool) -> str:
+    """Return the label of a car that moves, pushed ahead of it or behind it by spaces.
+
+    Labels stand over the middle of their cars, and at M these are in one place. A space is half as
+    wide as a letter.
+    """
+    room = " " * (round(2.6 * len(text)) + 8)
+    return room + text if ahead else text + room
+
+
 def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
     """Return the labels of an episode as an additional file."""
     root = etree.Element("additional")
-    case, found = outcome.case, outcome.measures
-    notation = case.scenario.notation.items()
-    values = ((getattr(case, field), written) for field, written in notation)
-    parts = [
-        f"{written.name} {value:.{written.digits}f} {written.unit}"
-        for value, written in values
-        if value is not None
-    ]
-    severity = "" if found.severity is None else f"{found.severity}, "
-    failed = "fails" if outcome.failed else "does not fail"
-    end = found.end.value.replace("_", " ").lower()
-    place = "" if found.lane_share is None else f", at {found.lane_share:.2f} of the lane"
-    lines = (
-        f"case {outcome.index}, POV level {level_name(case.level)}: {', '.join(parts)}",
-        f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}",
-    )
+    lines = (case_line(outcome.case, outcome.index), verdict_line(outcome))
     for number, (line, height) in enumerate(zip(lines, LINES, strict=True)):
         at = picture.x_m, picture.y_m + height * picture.height_m
         _label(root, f"line{number}", at, line)
-    cars = VEHICLES[: case.scenario.vehicles]
+    cars = VEHICLES[: outcome.case.scenario.vehicles]
     dot_m, apart_m = DOT * picture.width_m, APART * picture.width_m
     y = picture.y_m + LEGEND * picture.height_m
     for row, name in enumerate(cars):
@@ -367,6 +390,29 @@ def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
         middle = x + (DOT + 0.5 * LETTER * len(NAMES[name])) * picture.width_m
         _label(root, f"{name}-name", (middle, y - RAISED * picture.height_m), NAMES[name])
     return root
+
+
+def case_line(case: Case, index: int | None = None) -> str:
+    """Return which case it is, with its index where it has one."""
+    notation = case.scenario.notation.items()
+    values = ((getattr(case, field), written) for field, written in notation)
+    parts = [
+        f"{written.name} {value:.{written.digits}f} {written.unit}"
+        for value, written in values
+        if value is not None
+    ]
+    named = "" if index is None else f"case {index}, "
+    return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
+
+
+def verdict_line(outcome: Outcome) -> str:
+    """Return what became of it."""
+    found = outcome.measures
+    severity = "" if found.severity is None else f"{found.severity}, "
+    failed = "fails" if outcome.failed else "does not fail"
+    end = found.end.value.replace("_", " ").lower()
+    place = "" if found.lane_share is None else f", at {found.lane_share:.2f} of the lane"
+    return f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}"
 
 
 def _label(

@@ -1,4 +1,4 @@
-"""One case on its own: on the command line and from Python."""
+"""One case on its own: on the command line, from Python, and live in sumo-gui."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ import numpy as np
 import pytest
 from calling import assert_refused
 from plans import plan_for
+from processes import ports_of
 
 from merge_sumo.campaigns.one_case import case_of, run_one
+from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.sumo.live import Window
+from merge_sumo.values.case import MergeCase
+from merge_sumo.values.scenario import US23
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
+COLLIDES = MergeCase(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6, scenario=US23)
 SAFE = ("--level", "0", "--x", "-300", "--v", "34")
 
 
@@ -91,3 +97,48 @@ def test_in_traffic_the_table_has_all_cars():
     head = motion_lines(ended.trajectory)[0]
     assert all(name in head for name in ("x POV", "x VUT", "x AHEAD", "x BEHIND"))
     assert lines_of(ended.outcome, ended.trajectory)[0].endswith("headway behind 2.00 s")
+
+
+class TestInSumoGui:
+    @pytest.fixture
+    def window(self, display, monkeypatch):
+        """Let windows open on a display of the test, without waiting for anybody."""
+        monkeypatch.setenv("DISPLAY", display)
+        monkeypatch.setattr(Window, "wait", lambda _: None)
+        monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
+        monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
+        return monkeypatch
+
+    def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
+        slept: list[float] = []
+        window.setattr("merge_sumo.sumo.live.sleep", slept.append)
+        plan = plan_for("design2", corridors=1)
+        live = run_one(plan, COLLIDES, live=True)
+        without = run_one(plan, COLLIDES)
+        assert (live.trajectory.motion == without.trajectory.motion).all()
+        assert live.outcome == without.outcome
+        assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+
+    def test_opens_no_port(self, window):
+        ports: list[list[str]] = []
+
+        def look(this: Window) -> None:
+            ports.append(ports_of(this._child.process.pid))
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "step", look)
+        run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+        assert len(ports) > 20
+        assert not any(ports)
+
+    def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
+        def close_window(this: Window) -> None:
+            if this._shown == 20:
+                this._child.process.kill()
+            step(this)
+
+        step = Window.step
+        window.setattr(Window, "step", close_window)
+        with pytest.raises(UserError, match="the window was closed before the case had ended"):
+            run_one(plan_for("design2", corridors=1), COLLIDES, live=True)

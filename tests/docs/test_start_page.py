@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from merge_sumo.sumo.live import Window
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, flags=re.DOTALL | re.MULTILINE)
@@ -58,14 +60,14 @@ def test_the_steps_lead_to_a_failing_case(campaign, command_line, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_last_step_shows_it_in_sumo_gui(campaign, command_line, monkeypatch):
+def test_the_last_step_shows_it_live(campaign, command_line, display, monkeypatch):
     folder, worst = campaign
     monkeypatch.chdir(folder)
-    shown: list[Path] = []
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr("merge_sumo.sumo.replay.open_gui", shown.append)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.setattr(Window, "wait", lambda _: None)
+    monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
+    monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
     arguments = the_worst(LIVE, worst)
     assert arguments == [*the_worst(RUN, worst), "--gui"]
     code, _, err = command_line(*arguments)
     assert code == FAILS, err
-    assert len(shown) == 1

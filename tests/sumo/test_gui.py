@@ -114,18 +114,28 @@ def car(image: np.ndarray, who: str) -> np.ndarray:
     )
 
 
-def test_a_window_of_a_case_that_ran_ends_with_its_command(display, tmp_path):
+NEVER_CONNECTED = """
+import time
+from merge_sumo.cli import main
+from merge_sumo.sumo.child import Channel
+
+Channel.receive = lambda *_, **__: time.sleep(600)
+main()
+"""
+
+
+def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(display, tmp_path):
+    (tmp_path / "script.py").write_text(NEVER_CONNECTED)
     case = ("--vut", "level0", "--x", "-300", "--v", "30", "--gui")
     with none_left() as mark:
         command = subprocess.Popen(
-            [sys.executable, "-m", "merge_sumo.cli", "run", *case],
+            [sys.executable, tmp_path / "script.py", "run", *case],
             env={**os.environ, "DISPLAY": display, "TMPDIR": str(tmp_path)},
-            stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
         try:
-            while not any("sumo-gui" in program for program in marked(mark)):
+            while not any("merge_sumo.sumo.live" in program for program in marked(mark)):
                 assert command.poll() is None
                 time.sleep(0.05)
             command.terminate()
@@ -133,7 +143,7 @@ def test_a_window_of_a_case_that_ran_ends_with_its_command(display, tmp_path):
         finally:
             if command.poll() is None:
                 os.killpg(command.pid, signal.SIGKILL)
-    assert list(tmp_path.iterdir()) == []
+    assert [file.name for file in tmp_path.iterdir()] == ["script.py"]
 
 
 def test_the_cars_meet(pictures):
