@@ -33,4 +33,4 @@ def notice(sentence: str, category: type[Warning] = Notice) -> None:
     level = 2
     while frame is not None and frame.f_globals.get("__name__", "").startswith("merge_sumo."):
         frame, level = frame.f_back, level + 1
-    warnings.warn(sentence, category, stacklevel=level - 1)
+    warnings.warn(sentence, category, stacklevel=level)

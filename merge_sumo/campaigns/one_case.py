@@ -64,7 +64,7 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
 
 def _option(name: str) -> str:
     """Return how a person gives a coordinate."""
-    return f"`{name}`" if name in COORDINATES else f"{name}, which `at` gives,"
+    return f"`{name}`" if name in COORDINATES else f"`at` {name}=NUMBER"
 
 
 def run_one(

@@ -47,7 +47,7 @@ def _flags() -> dict[str, str]:
         if issubclass(record, options.Asked)
         for name, (one, _) in options.options_of(record).items()
     }
-    return {**known, "vut": "--vut", "recorded": "--case"}
+    return {**known, "vut": "--vut", "recorded": "--case", "at": "--at"}
 
 
 def _in_flags(sentence: str) -> str:

@@ -42,10 +42,13 @@ class RunStudy:
         """Return what a study keeps of the system that it tested, as `campaign.json` does."""
         return record_of(self.settings, self.plan)
 
-    def check_same_system(self, levels: Iterable[int] | None = None) -> None:
+    def check_same_system(
+        self, levels: Iterable[int] | None = None, *, may_change: bool = False
+    ) -> None:
         """Raise `UserError` where the campaign had another net, or other POVs at some levels.
 
-        By default they are all levels. A controller that has changed is a `Notice`.
+        By default they are all levels. A controller that has changed is a `Notice`, unless that is
+        what the study is of.
         """
         run, road, today = self.run, self.plan.road, self.record()
         if run.settings.get("net_sha256", road.sha256) != road.sha256:
@@ -58,7 +61,8 @@ class RunStudy:
                     f"{run.folder} was run against another POV of level {level_name(level)} than "
                     "today's: give its `policies`"
                 )
-        notice_changes(run, self.plan)
+        if not may_change:
+            notice_changes(run, self.plan)
 
 
 def notice_changes(run: Run, plan: SimulationPlan) -> None:

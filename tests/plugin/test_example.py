@@ -102,7 +102,7 @@ class TestCampaignOfBraking:
         keywords: dict[str, Any] = {"scenario": BrakingScenario(), "level": 0}
         near = ms.run(keep_distance, case={"gap0_m": 6.0, "a_pov_mps2": -1.0}, **keywords)
         assert near.outcome.case.gap0_m == 6.0
-        with pytest.raises(UserError, match="--at a_pov_mps2=NUMBER is missing"):
+        with pytest.raises(UserError, match="`at` a_pov_mps2=NUMBER is missing"):
             ms.run(keep_distance, case={"gap0_m": 6.0}, **keywords)
         with pytest.raises(UserError, match="a case has no gap: it has gap0_m"):
             ms.run(keep_distance, **(keywords | {"gap": 6.0}))
@@ -115,7 +115,7 @@ class TestCampaignOfBraking:
     def test_has_the_levels_of_its_kind(self):
         with pytest.raises(UserError, match="no POV level 1: choose 0"):
             ms.campaign(keep_distance, scenario=BrakingScenario(), level=1)
-        with pytest.raises(UserError, match="--fail-when paper is of merges"):
+        with pytest.raises(UserError, match="`fail_when` paper is of merges"):
             ms.campaign(keep_distance, scenario=BrakingScenario(), fail_when="paper")
 
 
