@@ -12,7 +12,7 @@ from merge_sumo.commands import campaigns, inputs, studies
 from merge_sumo.commands.application import app
 from merge_sumo.commands.printing import say
 from merge_sumo.errors import UserError
-from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.limits import check_limits, exhausted
 from merge_sumo.system.streams import prepare_streams
 
@@ -48,9 +48,11 @@ def main() -> None:
     """
     prepare_streams()
     try:
-        _check_here()
-        check_limits()
-        app()
+        # From here on, so that no signal finds a temporary folder that nobody removes.
+        with stopping_in_order():
+            _check_here()
+            check_limits()
+            app()
     except UserError as error:
         say(f"merge-sumo: {error}")
         sys.exit(2)

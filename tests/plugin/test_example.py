@@ -105,7 +105,7 @@ class TestCampaignOfBraking:
         with pytest.raises(UserError, match="`at` a_pov_mps2=NUMBER is missing"):
             ms.run(keep_distance, case={"gap0_m": 6.0}, **keywords)
         with pytest.raises(UserError, match="a case has no gap: it has gap0_m"):
-            ms.run(keep_distance, **(keywords | {"gap": 6.0}))
+            ms.run(keep_distance, at={"gap": 6.0}, **keywords)
 
     def test_its_road_is_one_lane(self):
         lines = api.check_scenario(BrakingScenario()).lines()
