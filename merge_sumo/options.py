@@ -1,6 +1,6 @@
 """Every option of a verb, once: the keyword in Python, the option on the command line, its help.
 
-A verb has a record. Its fields are the keywords of the function in `api.py` and, where a field is
+A verb has a record. Its fields are the keywords of the function in `api/` and, where a field is
 an `option`, the options of the command. `Test` says what decides the outcome of a case, `Search`
 which cases run, and `Execution` where they run, which decides nothing.
 """
@@ -141,8 +141,13 @@ def _seed(help: str) -> Any:
     return option(0, int, help, CASES)
 
 
-def _level(default: str | None, help: str, **more: Any) -> Any:
-    return option(default, str, help, TESTED, **more)
+def _level() -> Any:
+    return option("all", str, "POV level: 0, 1, 2, own or all.", TESTED)
+
+
+def _tolerated() -> Any:
+    about = "A case fails where more than this share of its runs do."
+    return option(0.0, float, about, VERDICT, "--tolerate", metavar="SHARE")
 
 
 def _params(help: str) -> dict[str, Any]:
@@ -157,15 +162,15 @@ def _vut_again(help: str = "", shown: str = "the campaign's") -> Any:
     return option(None, str, help or about, TESTED, metavar="SPEC", shown=shown)
 
 
-def _engine(default: str | None, shown: str | None = None) -> Any:
+def _engine() -> Any:
     return option(
-        default,
+        None,
         str,
         "kinematic: the equations of motion alone, and SUMO for at least one case of a hundred. Or "
         "sumo for all.",
         EXPERTS,
         metavar="NAME",
-        shown=shown,
+        shown="kinematic where VUT and POV are of this package",
     )
 
 
@@ -347,14 +352,7 @@ class Search(Asked):
         metavar="N|auto",
         parse=_runs_of_a_case,
     )
-    tolerated: float = option(
-        0.0,
-        float,
-        "A case fails where more than this share of its runs do.",
-        VERDICT,
-        "--tolerate",
-        metavar="SHARE",
-    )
+    tolerated: float = _tolerated()
     seed: int = _seed("Same seed, same outcomes.")
     stop_when_converged: bool = option(
         False,
@@ -401,7 +399,7 @@ COORDINATES: Final = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "h
 class SearchOfTest(Execution, Search, Test):
     """The keywords of a campaign, begun or gone on with."""
 
-    level: int | str = _level("all", "POV level: 0, 1, 2, own or all.")
+    level: int | str = _level()
     against: AnyVut | None = option(
         None,
         str,
@@ -492,8 +490,8 @@ class Case(Test):
     recorded: tuple[AnyRun, int] | None = keyword(
         None, "A campaign, or its folder, and the index of its case: default of everything."
     )
-    level: int | str | None = _level(
-        None, "POV level: 0, 1, 2 or own.", shown="0, with --case the campaign's"
+    level: int | str | None = option(
+        None, str, "POV level: 0, 1, 2 or own.", TESTED, shown="0, with --case the campaign's"
     )
     x_pov0_m: float | None = option(
         None, float, "Initial position of the POV in m; M is 0.", TESTED, "--x"
@@ -565,7 +563,7 @@ class Probability(Recorded):
     )
     seed: int = _seed("Same seed, same cases.")
     out: AnyPath | None = _out("New file to write.", "RUN/probability.json", metavar="FILE")
-    engine: str | None = _engine(None, "kinematic where VUT and POV are of this package")
+    engine: str | None = _engine()
 
 
 # Verbs: look
@@ -638,7 +636,7 @@ class Rerun(Recorded):
     run: AnyRun = field(metadata=RUN)
     indices: Iterable[int] | int = keyword((), "Cases of the campaign; all of them by default.")
     _: KW_ONLY
-    level: int | str = _level("all", "POV level: 0, 1, 2, own or all.")
+    level: int | str = _level()
 
 
 @dataclass(frozen=True)
@@ -840,11 +838,11 @@ class Truth(Execution, Test):
     """
 
     vut: AnyVut = field(metadata=VUT)
-    level: int | str = _level("all", "POV level: 0, 1, 2, own or all.")
+    level: int | str = _level()
     _: KW_ONLY
     cases: int | None = option(None, int, "Uniform cases of a level.", CASES, shown=TRUTH_CASES)
     seed: int = _seed("Same seed, same cases.")
-    engine: str | None = _engine(None, "kinematic where VUT and POV are of this package")
+    engine: str | None = _engine()
     repeat: int | None = option(
         None,
         int,
@@ -854,14 +852,7 @@ class Truth(Execution, Test):
         metavar="N",
         shown="1, with --tolerate 20",
     )
-    tolerated: float = option(
-        0.0,
-        float,
-        "A case fails where more than this share of its runs do.",
-        VERDICT,
-        "--tolerate",
-        metavar="SHARE",
-    )
+    tolerated: float = _tolerated()
 
 
 @dataclass(frozen=True)
@@ -877,7 +868,7 @@ class Benchmark(Execution, Test):
     """
 
     vut: AnyVut = field(metadata=VUT)
-    level: int | str = _level("all", "POV level: 0, 1, 2, own or all.")
+    level: int | str = _level()
     _: KW_ONLY
     samplers: Iterable[str] | None = option(
         None,

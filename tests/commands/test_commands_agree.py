@@ -94,7 +94,7 @@ class World:
             self.tried.vut,
             level=self.tried.level,
             scenario=self.scenario,
-            **{name: value for name, value in given.items() if value is not None},
+            at={name: value for name, value in given.items() if value is not None},
         )
         return Criterion(CRITERION).outcome(0, 0, found.trajectory).failed
 
