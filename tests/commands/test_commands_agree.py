@@ -57,8 +57,7 @@ TRIED = {
 }
 CASES = 12
 OF_A_CASE = (
-    *("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s"),
-    "sense_delay_s",
+    *("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s", "sense_delay_s"),
 )
 
 
@@ -89,13 +88,9 @@ class World:
 
     def judged(self, case: Case) -> bool:
         """Return whether a case fails when it is run alone."""
-        given = {name: getattr(case, name) for name in OF_A_CASE}
-        found = ms.run(
-            self.tried.vut,
-            level=self.tried.level,
-            scenario=self.scenario,
-            at={name: value for name, value in given.items() if value is not None},
-        )
+        at = {name: x for name in OF_A_CASE if (x := getattr(case, name)) is not None}
+        vut, level = self.tried.vut, self.tried.level
+        found = ms.run(vut, level=level, scenario=self.scenario, at=at)
         return Criterion(CRITERION).outcome(0, 0, found.trajectory).failed
 
 
