@@ -374,7 +374,7 @@ class Execution(Asked):
         "same.",
         WHERE,
         metavar="N|ADDRESS",
-        shown="one a core, as soon as it pays",
+        shown="one a core",
         parse=_workers,
         written=None,
     )

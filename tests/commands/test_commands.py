@@ -80,7 +80,7 @@ class TestHelp:
     def test_shows_defaults_that_are_said_in_words(self):
         shown = " ".join(help_of("campaign", 100).replace("│", " ").split())
         assert "[default: (runs/VUT-DATE)]" in shown
-        assert "[default: (one a core, as soon" in shown
+        assert "[default: (one a core)]" in shown
         assert "[default: (kinematic where" in " ".join(help_of("probability", 200).split())
 
 
