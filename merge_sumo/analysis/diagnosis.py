@@ -40,14 +40,14 @@ ROUNDING_MPS: Final = 1e-6
 class Kind(StrEnum):
     """Kinds of failures under the paper's rule; each such failure is of exactly one.
 
-    "Together" is |dx| < 6 m at M, a way out full braking or acceleration.
+    "Together" is within the scenario's limit at M, a way out full braking or acceleration.
     """
 
     meaning: str
 
     STALEMATE = "stalemate", "both brake, and arrive together"
-    SQUEEZE = "squeeze", "neither brakes, and both arrive together"
-    POV_BRAKES = "only the POV brakes", "the VUT does not brake, and both arrive together"
+    SQUEEZE = "squeeze", "neither loses 1 m/s, and both arrive together"
+    POV_BRAKES = "only the POV brakes", "the VUT loses less than 1 m/s, and both arrive together"
     LATE_BRAKE = "late brake", "only the VUT brakes, and begins when no way out is left"
     WEAK_BRAKE = "weak brake", "only the VUT brakes, and begins while a way out is left"
 

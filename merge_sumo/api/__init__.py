@@ -30,7 +30,7 @@ from merge_sumo.api.asked import (
     path_of,
     scenario_of,
     settings_for,
-    stated,
+    stated_again,
     today,
 )
 from merge_sumo.api.campaigns import concluded, notice_untrained
@@ -125,7 +125,9 @@ def resume(asked: options.Resume) -> CampaignRun:
     """Go on with a campaign that was stopped."""
     folder = folder_of(asked.run)
     recorded = read_settings(folder)
-    fields, where = stated(asked, asked.vut, {name: recorded.get(name) for name in ("vut", "pov")})
+    fields, where = stated_again(
+        asked, asked.vut, {name: recorded.get(name) for name in ("vut", "pov")}
+    )
     settings = settings_of(folder, recorded, fields, goes_on=True)
     if "level" in asked.given:
         policies = policies_folder(settings.policies, settings.scenario)

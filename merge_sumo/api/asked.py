@@ -75,7 +75,7 @@ def opened_study(
 
 def today(run: Run, asked: Recorded) -> tuple[CampaignSettings, SimulationPlan, Execution]:
     """Return how and where cases of a campaign run today: settings, their plan, and the place."""
-    fields, where = stated(asked, asked.vut, {"vut": run.vut})
+    fields, where = stated_again(asked, asked.vut, {"vut": run.vut})
     settings = settings_of(run.folder, run.settings, fields)
     return settings, resolve(settings), where
 
@@ -125,13 +125,10 @@ def settings_for(
     `search` has settings that the study chooses.
     """
     spec, pov, workers = drivers_of(asked.vut, asked.pov, asked.workers)
-    fields = {
-        **asked.values(Limits),
-        **(asked.values(Search) if isinstance(asked, Campaign) else {}),
-    }
+    fields = asked.values(Limits)
     if isinstance(asked, Campaign):
         against, workers = _earlier(asked, workers)
-        fields |= against
+        fields |= asked.values(Search) | against
     scenario = scenario_of(asked.scenario, asked.values(OfScenario))
     folder = policies_folder(asked.policies, scenario)
     levels = parse_levels(str(asked.level), folder, scenario.levels, own=pov is not None)
@@ -154,7 +151,7 @@ def criterion_of(asked: Judged, scenario: Scenario) -> dict[str, Any]:
     return {"fail_when": fail_when, "require": asked.require}
 
 
-def stated(
+def stated_again(
     asked: Hosting, vut: AnyVut | None, recorded: Mapping[str, Any]
 ) -> tuple[dict[str, Any], Execution]:
     """Return what a person states anew of a recorded campaign, and where its cases run.

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from merge_sumo import options
-from merge_sumo.api.asked import scenario_of, settings_in, stated
+from merge_sumo.api.asked import scenario_of, settings_in, stated_again
 from merge_sumo.api.results import campaign_of
 from merge_sumo.campaigns.one_case import ONE, case_of
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 def recorded_case(asked: options.Case) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     assert asked.recorded is not None, "one of a campaign"  # noqa: S101
-    fields, _ = stated(asked, asked.vut, {})
+    fields, _ = stated_again(asked, asked.vut, {})
     run = campaign_of(asked.recorded[0]).run
     before = run.outcome(asked.recorded[1]).case
     level = before.level

@@ -16,9 +16,7 @@ A = TypeVar("A", bound=Asked)
 R = TypeVar("R")
 
 
-def verb(
-    record: Callable[P, A], *, of: type[A] | None = None
-) -> Callable[[Callable[[A], R]], Callable[P, R]]:
+def verb(record: Callable[P, A]) -> Callable[[Callable[[A], R]], Callable[P, R]]:
     """Return a decorator of a function of a record, which is then called with the keywords of that.
 
     A type checker takes the signature from the record, and so does `help`. An unknown keyword is a
