@@ -9,7 +9,7 @@ from merge_sumo.system.suggestions import either
 
 REGISTRIES: Final = {
     "{samplers}": "merge_sumo.samplers.registry:SAMPLERS",
-    "{criteria}": "merge_sumo.values.criteria:CRITERIA",
+    "{criteria}": "merge_sumo.verdict.criteria:CRITERIA",
     "{formats}": "merge_sumo.reports.formats:FORMATS",
 }
 """Registries whose names stand in help texts: they are imported where a text is shown."""

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.scenario import DEADLINE_S, MEMORY_GIB
+from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
 
 if TYPE_CHECKING:
-    from merge_sumo.values.imperfection import Actuation, Sensing
-    from merge_sumo.values.scenario import Scenario
-    from merge_sumo.values.score import Outcome
+    from merge_sumo.scenario.imperfection import Actuation, Sensing
+    from merge_sumo.scenario.scenario import Scenario
+    from merge_sumo.verdict.score import Outcome
     from merge_sumo.vuts.in_memory import AnyVut
 else:  # the command line reads no annotation, and importing these takes time
     AnyVut = Actuation = Outcome = Scenario = Sensing = Any

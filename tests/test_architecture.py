@@ -27,8 +27,9 @@ HEAVY_MODULES = {"numpy", "scipy", "sklearn", "libsumo", "torch"}
 
 
 LAYERS = (
-    *("system", "values", "road", "samplers", "analysis", "sumo", "drivers", "vuts", "engine"),
-    *("twin", "campaigns", "studies", "training", "reports", "api", "testing", "commands"),
+    *("system", "scenario", "coverage", "verdict", "road", "samplers", "sumo", "drivers"),
+    *("vuts", "engine", "twin", "campaigns", "studies", "training", "reports", "api"),
+    *("testing", "commands"),
 )
 """The rooms, from the ground up: each imports from itself and from those before it."""
 

@@ -35,15 +35,15 @@ from merge_sumo.campaigns.campaign import twin_of
 from merge_sumo.campaigns.plan import resolve, resolve_earlier
 from merge_sumo.campaigns.scheduler import Scheduler, groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.twin.pair import TwinPair
-from merge_sumo.values.case import Case, FloatArray, to_unit
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.fmc import radius_for
+from merge_sumo.verdict.episode import Episode
 
 sys.path.append(str(Path(__file__).parent / "benchmark"))
 from oracle import greedy_cover

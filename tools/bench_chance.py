@@ -27,13 +27,13 @@ from bench_record import add_record_option, append_record
 from numpy.typing import NDArray
 
 from merge_sumo import api
+from merge_sumo.coverage.fmc import fmc
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
-from merge_sumo.values.case import Pool, from_unit, to_unit
-from merge_sumo.values.chance import failing_cases
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.scenario.case import Pool, from_unit, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.verdict.chance import failing_cases
+from merge_sumo.verdict.score import Outcome
 
 FloatArray = NDArray[np.float64]
 

@@ -32,12 +32,12 @@ from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, from_unit
+from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_program
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
 from merge_sumo.sumo.world import MAX_SPEED_MPS, World
-from merge_sumo.values.case import Case, from_unit
-from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
-from merge_sumo.values.trajectory import Trajectory
 from merge_sumo.vuts.factory import VutFactory
 
 KS = (1, 8, 32, 64)

@@ -30,14 +30,14 @@ from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, FloatArray, from_unit
+from merge_sumo.scenario.scenario import DT_S, US23, Bounds, as_merge
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.check import returns_of
 from merge_sumo.training.game import Game
 from merge_sumo.training.reward import Reward
-from merge_sumo.values.case import Case, FloatArray, from_unit
-from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S, US23, Bounds, as_merge
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.merge import brake_after_mps2
 
 
 class MergesAt(Level0Vut):

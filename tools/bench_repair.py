@@ -19,7 +19,7 @@ import numpy as np
 from bench_record import add_record_option, append_record
 
 from merge_sumo import api
-from merge_sumo.values.fmc import fmc
+from merge_sumo.coverage.fmc import fmc
 
 TRUTH_SEED = 12_345
 

@@ -52,17 +52,17 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
 from merge_sumo.campaigns.scheduler import Scheduler
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import fmc, regions
 from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate, run_cases
 from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.truth import _margins, ground_truth
 from merge_sumo.system.workers import LocalProcesses, Workers
-from merge_sumo.values.case import Case, Pool, from_unit, to_unit
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import Outcome
 
 VUT = "design1"
 ROUNDS = 5

@@ -38,10 +38,10 @@ from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.world import MAX_SPEED_MPS
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
-from merge_sumo.values.trajectory import Trajectory
 
 AGREED: Final = 1e-6
 """Positions and speeds this near to each other, in m and m/s, are the same. Measured: 5e-12."""

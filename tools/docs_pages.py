@@ -91,8 +91,8 @@ COMPLETION = """
 
 def measures_page() -> str:
     """Return the measures of an episode as a table."""
-    from merge_sumo.values.measures import MEASURES
-    from merge_sumo.values.score import Measures
+    from merge_sumo.verdict.measures import MEASURES
+    from merge_sumo.verdict.score import Measures
 
     rows = ""
     for name, measure in MEASURES.items():
@@ -189,7 +189,7 @@ def samplers_table() -> str:
 
 def criteria_table() -> str:
     """Return the registered criteria as a table."""
-    from merge_sumo.values.criteria import CRITERIA
+    from merge_sumo.verdict.criteria import CRITERIA
 
     rows = [f"| `{name}` | `{one.condition}` | {one.about} |" for name, one in CRITERIA.items()]
     return "\n".join(("| `--fail-when` | condition | failure |", "|---|---|---|", *rows))

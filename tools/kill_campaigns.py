@@ -31,9 +31,9 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.settings import settings_of as settings_in
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23
 
 PLACES = ("moment", "sync", "torn", "worker")
 SAMPLERS = ("gpr", "coverage", "uniform")

@@ -19,11 +19,11 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import DT_S, US23, Scenario
-from merge_sumo.values.score import Outcome, measure
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.score import Outcome, measure
 
 STYLES: dict[str, dict[str, Any]] = {
     "POV": {"color": "#e69f00"},

@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from merge_sumo import options
-from merge_sumo.analysis.coordinates import outside_of_the_pool
-from merge_sumo.analysis.result import Shown
 from merge_sumo.api.asked import (
     opened,
     opened_study,
@@ -57,6 +55,8 @@ from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.coordinates import outside_of_the_pool
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.studies import (
     comparison,
     explanation,
@@ -91,8 +91,8 @@ from merge_sumo.system.folders import (
 )
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import US23, Scenario
+from merge_sumo.system.result import Shown
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 from merge_sumo.vuts.parameters import Range

@@ -34,11 +34,11 @@ from merge_sumo.options import (
 )
 from merge_sumo.reports.progress import Bars, Counter
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.imperfection import Actuation, Sensing
+from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
-from merge_sumo.values.imperfection import Actuation, Sensing
-from merge_sumo.values.scenario import Scenario
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 
 

@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 from merge_sumo import options
-from merge_sumo.analysis.verdict import parse_gates
 from merge_sumo.api.asked import opened
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
@@ -20,14 +19,15 @@ from merge_sumo.errors import notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
 from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.scenario.scenario import LEVELS, MergeScenario, Scenario, level_name
 from merge_sumo.studies.counterfactuals import AVOIDANCE, avoidance
 from merge_sumo.studies.explanation import note_explanation
 from merge_sumo.system.folders import check_new, link_latest
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import LEVELS, MergeScenario, Scenario, level_name
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.campaign_verdict import parse_gates
+from merge_sumo.verdict.score import Outcome
 
 
 def concluded(

@@ -13,11 +13,11 @@ from merge_sumo.campaigns.one_case import ONE, case_of
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.engine.povs import one_level, policies_folder
 from merge_sumo.errors import UserError
-from merge_sumo.values.scenario import level_name
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.vuts.in_memory import drivers_of
 
 if TYPE_CHECKING:
-    from merge_sumo.values.case import Case
+    from merge_sumo.scenario.case import Case
 
 
 def recorded_case(asked: options.Case) -> tuple[CampaignSettings, Case]:

@@ -8,18 +8,6 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.plausibility import doubts
-from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.summary import Summary, summarise
-from merge_sumo.analysis.verdict import (
-    MESSAGE_CHARACTERS,
-    GateResult,
-    Verdict,
-    judge,
-    parse_gates,
-    shortened,
-)
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
@@ -29,13 +17,25 @@ from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
+from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.studies.comparison import Change, Comparison, compare_against
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.system.result import Result
+from merge_sumo.verdict.campaign_verdict import (
+    MESSAGE_CHARACTERS,
+    GateResult,
+    Verdict,
+    judge,
+    parse_gates,
+    shortened,
+)
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.plausibility import doubts
+from merge_sumo.verdict.score import Measures, Outcome
+from merge_sumo.verdict.summary import Summary, summarise
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""

@@ -20,11 +20,11 @@ from merge_sumo.campaigns.scheduler import motions_of
 from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.scenario.case import Case
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
-from merge_sumo.values.case import Case
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.regression import regression
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.regression import regression
 
 FIRST_BATCH: Final = 5
 """Cases of each level in the first batch where twins predict, which they do from four cases on.

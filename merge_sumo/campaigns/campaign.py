@@ -30,8 +30,8 @@ from merge_sumo.system.hashing import files_now
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.output import LOG
 
 EXPORTED_FAILURES: Final = 10

@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.values.case import Case, FloatArray, to_unit
-from merge_sumo.values.chance import MOST_RUNS, RunsOfCase, runs_needed
-from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome
+from merge_sumo.scenario.case import Case, FloatArray, to_unit
+from merge_sumo.verdict.chance import MOST_RUNS, RunsOfCase, runs_needed
+from merge_sumo.verdict.prediction import Prediction
+from merge_sumo.verdict.score import Outcome
 
 ONE_IN: Final = 8
 """While no chance was seen, a case repeats in every eighth place of a campaign at most,"""

@@ -25,13 +25,13 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluate, evaluate_anew
 from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.folders import replace_own
 from merge_sumo.system.records import Record, read_indexed, replaced, to_json
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.spec import is_built_in, waits_for_client
 
 REPEATS: Final = "repeats.jsonl"

@@ -27,20 +27,20 @@ import numpy as np
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
+from merge_sumo.coverage.fmc import regions
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import FloatArray, to_unit
+from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.scenario.scenario import ALL_LEVELS, US23, Scenario
+from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.records import convert, decode
-from merge_sumo.values.case import FloatArray, to_unit
-from merge_sumo.values.chance import one_per_case
-from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.fmc import regions
-from merge_sumo.values.scenario import ALL_LEVELS, US23, Scenario
-from merge_sumo.values.scenario_kinds import scenario_of_record
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.signals import SignalRuns, Signals, from_runs
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.chance import one_per_case
+from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import Outcome
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"

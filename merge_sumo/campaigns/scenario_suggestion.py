@@ -12,7 +12,8 @@ import numpy as np
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
 from merge_sumo.road.corridor import MAX_LANE_M, MIN_LANE_M, Corridor, LanePath, lane_around_m
-from merge_sumo.values.scenario import (
+from merge_sumo.scenario.scale import Units
+from merge_sumo.scenario.scenario import (
     MAX_EPISODE_S,
     US23,
     V_VUT0_MPS,
@@ -21,7 +22,6 @@ from merge_sumo.values.scenario import (
     Scenario,
     as_merge,
 )
-from merge_sumo.values.scenario_scale import Units
 
 MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""

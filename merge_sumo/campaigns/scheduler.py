@@ -28,11 +28,11 @@ from typing import Final
 from merge_sumo.engine.evaluate import THIS_PROCESS, evaluate_chunks
 from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.system.workers import MAX_CHUNK, Workers, cut
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.prediction import Prediction
+from merge_sumo.verdict.score import Outcome
 
 GROUPS: Final = 3
 """Groups in flight: the sampler is asked for one while the cases of others keep workers busy."""

@@ -19,13 +19,13 @@ from merge_sumo.options import Limits, Search
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import OWN, US23, Scenario, level_name
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import RecordError, check_fields, to_plain
-from merge_sumo.values.case import Pool
-from merge_sumo.values.chance import check_tolerated
-from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import OWN, US23, Scenario, level_name
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.chance import check_tolerated
+from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.spec import is_built_in, names_code, waits_for_client
 

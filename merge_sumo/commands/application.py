@@ -27,7 +27,7 @@ from merge_sumo.options import (
 )
 
 if TYPE_CHECKING:
-    from merge_sumo.analysis.result import Result
+    from merge_sumo.system.result import Result
 
 
 PANELS: Final[Mapping[str, tuple[str, ...]]] = {

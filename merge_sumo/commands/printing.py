@@ -21,7 +21,7 @@ from merge_sumo.system.interrupt import Interrupt, Stopped
 from merge_sumo.system.printable import printable, quoted
 
 if TYPE_CHECKING:
-    from merge_sumo.analysis.result import Result
+    from merge_sumo.system.result import Result
 
 __all__ = ["folder_of", "notices_printed", "print_json", "print_result", "quoted"]
 __all__ += ["say", "show", "stoppable"]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S
 
 ROUNDING_MPS2: Final = 1e-9
 """A command this little outside the limits is a rounding error."""

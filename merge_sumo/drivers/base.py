@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import POV, VUT
-from merge_sumo.values.signals import Left
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import POV, VUT
+from merge_sumo.scenario.signals import Left
 
 
 class Scene(NamedTuple):

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
 
 FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
 LEADERS: Final = slice(AHEAD, None, POV - AHEAD)

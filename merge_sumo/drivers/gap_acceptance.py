@@ -9,8 +9,8 @@ import numpy as np
 
 from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, US23
 
 STANDS_MPS: Final = 1e-3
 """A POV that is slower is taken to be as fast as this: it is due at M in hours."""

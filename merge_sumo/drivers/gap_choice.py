@@ -12,8 +12,8 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, BuiltInVut, Design, Sc
 from merge_sumo.drivers.lane import acc_mps2, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23, VUT, lane_of
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, US23, VUT, lane_of
 
 END_MARGIN_M: Final = 1.0
 """It stands so far before the end of the lane."""

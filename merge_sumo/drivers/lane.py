@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, Driver, DriverWrapper, Scene
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, OWN, US23, VUT, Scenario, lane_of
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, OWN, US23, VUT, Scenario, lane_of
 
 RECOVERY_MPS2: Final = 1.0
 """Acceleration with which a POV comes back to the speed at which it started."""

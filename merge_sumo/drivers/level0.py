@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.base import BuiltInVut, Driver, Scene
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, US23
 
 
 def level0_acceleration(

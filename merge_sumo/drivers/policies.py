@@ -14,11 +14,11 @@ import numpy as np
 from merge_sumo.drivers.base import BuiltInVut
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, convert, decode
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import US23, Scenario
-from merge_sumo.values.scenario_kinds import scenario_of_record
 
 MANIFEST: Final = "manifest.json"
 NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")

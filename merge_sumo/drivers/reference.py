@@ -45,8 +45,8 @@ from merge_sumo.drivers.safety_models import (
     rss_distance_m,
     ttc_s,
 )
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, US23
 
 SLOWEST_MPS: Final = 1e-9
 """A slower vehicle stands."""

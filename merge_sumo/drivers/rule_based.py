@@ -10,8 +10,8 @@ import numpy as np
 from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, US23
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S
 
 Flags = NDArray[np.bool_]
 

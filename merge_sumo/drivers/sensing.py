@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.actuation import whole_steps
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.following import car_met
-from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.scenario import DT_S, VUT, Scenario
+from merge_sumo.scenario.case import Case, FloatArray, ToldCase
+from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 
 STREAM: Final = 26
 """Of the random numbers of a case, which others draw from, too."""

@@ -19,6 +19,8 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.scenario.case import Case, FloatArray, Pool
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.blame import MAX_DEATHS
 from merge_sumo.system.hashing import Files, hashed
 from merge_sumo.system.workers import (
@@ -29,10 +31,8 @@ from merge_sumo.system.workers import (
     open_workers,
     when_worker_ends,
 )
-from merge_sumo.values.case import Case, FloatArray, Pool
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.score import CaseVerdict, Outcome, measure_all
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import CaseVerdict, Outcome, measure_all
 
 R = TypeVar("R")
 

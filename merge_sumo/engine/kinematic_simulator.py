@@ -24,9 +24,9 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import VUT, lane_of
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import VUT, lane_of
+from merge_sumo.scenario.trajectory import Trajectory
 
 CHECKED_SHARE: Final = 0.01
 """Least share of the cases that run in SUMO as well."""

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, Scenario
 from merge_sumo.sumo.world import PARKING_M
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, Scenario
 
 
 class EquationWorld:

@@ -14,11 +14,11 @@ from typing import Any, Final
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.system.workers import AnyWorkers
-from merge_sumo.values.criteria import CRITERIA
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.measures import MEASURES
-from merge_sumo.values.scenario import OWN, Scenario
+from merge_sumo.verdict.criteria import CRITERIA
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.measures import MEASURES
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.spec import runs_code
 

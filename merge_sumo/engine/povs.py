@@ -18,11 +18,11 @@ from merge_sumo.drivers.policies import (
     policies_sha256,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray, ToldCase
+from merge_sumo.scenario.scenario import ALL_LEVELS, OWN, VUT, Scenario, lane_of, level_name
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files
 from merge_sumo.system.suggestions import either
-from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.scenario import ALL_LEVELS, OWN, VUT, Scenario, lane_of, level_name
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.spec import parse

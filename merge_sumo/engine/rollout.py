@@ -14,13 +14,13 @@ from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following, keep_behind_vut
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.kinematic_world import EquationWorld
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
+from merge_sumo.scenario.signals import Left, series
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.system.blame import Blame
 from merge_sumo.system.pulse import Pulse
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
-from merge_sumo.values.signals import Left, series
-from merge_sumo.values.trajectory import End, Trajectory
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""

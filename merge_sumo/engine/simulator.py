@@ -14,10 +14,10 @@ from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import Scenario, lane_of
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import Scenario, lane_of
-from merge_sumo.values.trajectory import Trajectory
 
 
 class Simulator:

@@ -10,14 +10,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.reports.pages import page
+from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.scenario import VEHICLES, VUT
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.system.folders import replace_own
-from merge_sumo.values.scenario import VEHICLES, VUT
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.campaign_verdict import judge
 
 SHOWN: Final = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""

@@ -16,19 +16,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.analysis.coordinates import coordinates
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
-from merge_sumo.values.bodies import WIDTH_M
-from merge_sumo.values.merge import merged_rows
-from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.bodies import WIDTH_M
+from merge_sumo.verdict.merge import merged_rows
 
 TABLE: Final = "trajectories"
 SEVERITY: Final = "severity"

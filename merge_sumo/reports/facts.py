@@ -11,19 +11,19 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.analysis.summary import LevelSummary, Summary
-from merge_sumo.analysis.verdict import Verdict
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.scenario.scenario import lane_of, level_name
 from merge_sumo.studies.counterfactuals import AVOIDANCE
 from merge_sumo.studies.probability import PROBABILITY
 from merge_sumo.studies.stress import STRESS
 from merge_sumo.system.printable import printable
-from merge_sumo.values.chance import MOST_RUNS, by_case, is_decided
-from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import lane_of, level_name
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.severity import Severity
+from merge_sumo.verdict.campaign_verdict import Verdict
+from merge_sumo.verdict.chance import MOST_RUNS, by_case, is_decided
+from merge_sumo.verdict.score import Outcome
+from merge_sumo.verdict.severity import Severity
+from merge_sumo.verdict.summary import LevelSummary, Summary
 
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"

@@ -16,18 +16,18 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.verdict import GateResult, Verdict, message_of
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
+from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
-from merge_sumo.values.chance import by_case
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.campaign_verdict import GateResult, Verdict, message_of
+from merge_sumo.verdict.chance import by_case
+from merge_sumo.verdict.score import Outcome
 
 CLASS: Final = "merge-sumo"
 FAILED: Final = "failed"

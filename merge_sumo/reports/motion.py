@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
-from merge_sumo.analysis.coordinates import described
-from merge_sumo.analysis.diagnosis import diagnose
-from merge_sumo.analysis.verdict import message_of
-from merge_sumo.values.scenario import DT_S, POV, VEHICLES, level_name
-from merge_sumo.values.score import Measures, Outcome, measures_in
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, level_name
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.verdict.campaign_verdict import message_of
+from merge_sumo.verdict.diagnosis import diagnose
+from merge_sumo.verdict.score import Measures, Outcome, measures_in
 
 LABEL: Final = 31
 """Characters of the name of a measure; more where one is longer."""

@@ -11,20 +11,13 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.analysis.coordinates import Coordinate
-from merge_sumo.analysis.diagnosis import Diagnosis
-from merge_sumo.analysis.surface import Grid, Surface, nodes
-from merge_sumo.analysis.verdict import shortened
+from merge_sumo.coverage.fmc import fmc, radius_for
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.studies.explanation import in_words, name_and_unit
-from merge_sumo.system.records import to_plain
-from merge_sumo.values.case import FloatArray, to_unit
-from merge_sumo.values.chance import RunsOfCase
-from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.measures import Measure
-from merge_sumo.values.scenario import (
+from merge_sumo.scenario.case import FloatArray, to_unit
+from merge_sumo.scenario.coordinates import Coordinate
+from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
     DT_S,
     VEHICLES,
@@ -33,10 +26,17 @@ from merge_sumo.values.scenario import (
     lane_of,
     level_name,
 )
-from merge_sumo.values.score import Outcome, measures_in
-from merge_sumo.values.severity import Severity
-from merge_sumo.values.signals import to_record
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.scenario.signals import to_record
+from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.studies.explanation import in_words, name_and_unit
+from merge_sumo.studies.surface import Grid, Surface, nodes
+from merge_sumo.system.records import to_plain
+from merge_sumo.verdict.campaign_verdict import shortened
+from merge_sumo.verdict.chance import RunsOfCase
+from merge_sumo.verdict.diagnosis import Diagnosis
+from merge_sumo.verdict.measures import Measure
+from merge_sumo.verdict.score import Outcome, measures_in
+from merge_sumo.verdict.severity import Severity
 
 NEAR_SHARE: Final = 1.0 / 16.0
 STEPS: Final = 20

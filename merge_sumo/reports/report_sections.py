@@ -8,17 +8,17 @@ from typing import Any, Final
 
 from markupsafe import Markup
 
-from merge_sumo.analysis.diagnosis import BRAKED_MPS
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_data import pairs_of
 from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.scenario.scenario import MergeScenario, lane_of
 from merge_sumo.system.registry import Registry
-from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.scenario import MergeScenario, lane_of
-from merge_sumo.values.severity import meanings
+from merge_sumo.verdict.diagnosis import BRAKED_MPS
+from merge_sumo.verdict.severity import meanings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from lxml import etree
 
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.values.scenario import MergeScenario
+from merge_sumo.scenario.scenario import MergeScenario
 
 WIDTH_PX = 1000
 LANE_M = 3.2

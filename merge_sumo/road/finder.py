@@ -27,7 +27,7 @@ from merge_sumo.road.corridor import (
     lane_around_m,
 )
 from merge_sumo.road.netfile import Lane, Link, NetFile, Point
-from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds
+from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds
 
 SURROUNDINGS_M: Final = 500.0
 """Distance to M up to which lanes beside the paths are drawn."""

@@ -11,8 +11,8 @@ from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
+from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
 RAMP_EDGES: Final = ("ramp", "main_out")

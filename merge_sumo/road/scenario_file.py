@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.records import read_toml
 from merge_sumo.system.resources import resource
 from merge_sumo.system.suggestions import meant
-from merge_sumo.values.scenario import US23, Scenario
-from merge_sumo.values.scenario_kinds import scenario_of_record
 
 SUFFIX: Final = ".toml"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 
 
 def even_shares(proposed: Mapping[int, int], n: int) -> dict[int, int]:

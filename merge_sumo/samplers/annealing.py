@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.samplers.base import LevelwiseSampler, reflect
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 CHAINS: Final = 2
 """Chains per level: a single one may spend the whole budget around a minimum of no failures."""

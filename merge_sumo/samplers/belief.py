@@ -31,12 +31,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import radius_for
-from merge_sumo.values.prediction import NO_GAP
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.verdict.prediction import NO_GAP
 
 MAX_LEARNED: Final = 500
 """Cases that a process learns from; bounds the time per batch in a long campaign. The FMC

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.samplers.belief import Belief
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import radius_for
+from merge_sumo.scenario.case import FloatArray
 
 UNIFORM_QUERIES: Final = 1500
 LOCAL_QUERIES: Final = 600

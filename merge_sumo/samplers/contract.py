@@ -13,10 +13,10 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.values.case import Case, Pool, to_unit
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import Case, Pool, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.score import Measures, Outcome
 
 HALF_WIDTH: Final = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""

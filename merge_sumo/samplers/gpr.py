@@ -13,7 +13,7 @@ from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.surrogate import most_telling
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 QUERIES: Final = 4000
 """p, the uniform queries among which a batch is chosen."""

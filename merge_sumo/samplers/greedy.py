@@ -9,8 +9,8 @@ import numpy as np
 
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import Prediction
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.verdict.prediction import Prediction
 
 PICKED: Final = 0.8
 """Least share of a pick's ball that counts as covered for the later picks of the batch, and the

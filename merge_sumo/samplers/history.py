@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 LINEAR: Final = 1.25
 """Size up to which a margin is learned as it is; the paper's are all within."""

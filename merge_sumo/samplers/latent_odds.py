@@ -21,7 +21,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import expit, log_expit, logit, ndtr
 
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 IntArray = NDArray[np.int64]
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
 from merge_sumo.samplers.greedy import Proposal
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.prediction import NO_GAP, Prediction
-from merge_sumo.values.score import Outcome
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.verdict.prediction import NO_GAP, Prediction
+from merge_sumo.verdict.score import Outcome
 
 Known = Sequence[tuple[Outcome, Prediction]]
 

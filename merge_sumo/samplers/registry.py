@@ -9,7 +9,7 @@ from merge_sumo.system.registry import Registry
 if TYPE_CHECKING:
     from merge_sumo.samplers.base import Sampler
     from merge_sumo.samplers.prediction_skill import Predictor
-    from merge_sumo.values.case import Pool
+    from merge_sumo.scenario.case import Pool
 
 
 def _is_sampler(item: object) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 
 from merge_sumo.samplers.base import LevelwiseSampler, reflect
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 STAGE_SIZE: Final = 100
 """Samples of a stage, that is of one conditional region."""

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.special import log_ndtr, ndtr
 
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 LEARN_FROM: Final = 150
 """Most cases for the parameters of the kernel, SPACING apart."""

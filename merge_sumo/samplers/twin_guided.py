@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration
 from merge_sumo.samplers.candidates import (
@@ -21,8 +22,7 @@ from merge_sumo.samplers.candidates import (
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.fmc import radius_for
+from merge_sumo.scenario.case import FloatArray
 
 ANYWHERE: Final = 1000
 ANYWHERE_ABOVE_3D: Final = 5000

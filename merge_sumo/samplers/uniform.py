@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.values.case import Case
+from merge_sumo.scenario.case import Case
 
 
 class UniformSampler(Sampler):

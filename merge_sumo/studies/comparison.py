@@ -23,23 +23,23 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from merge_sumo.analysis.coordinates import coordinates
-from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.summary import LevelSummary, summarise
-from merge_sumo.analysis.verdict import judge
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
+from merge_sumo.coverage.fmc import fmc, radius_for, regions
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, to_unit
+from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_plain
-from merge_sumo.values.case import Case, to_unit
-from merge_sumo.values.chance import RunsOfCase, by_case, one_per_case
-from merge_sumo.values.fmc import fmc, radius_for, regions
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.severity import Severity
+from merge_sumo.system.result import Result
+from merge_sumo.verdict.campaign_verdict import judge
+from merge_sumo.verdict.chance import RunsOfCase, by_case, one_per_case
+from merge_sumo.verdict.score import Outcome
+from merge_sumo.verdict.severity import Severity
+from merge_sumo.verdict.summary import LevelSummary, summarise
 
 LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""

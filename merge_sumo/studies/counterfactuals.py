@@ -34,16 +34,16 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import povs_for
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.scenario.case import Case, FloatArray, MergeCase
+from merge_sumo.scenario.scenario import DT_S, EpisodeTime, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.sumo.world import World
 from merge_sumo.system.records import Record
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import Case, FloatArray, MergeCase
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S, EpisodeTime, Scenario
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.merge import brake_after_mps2
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.output import LOG
 

@@ -19,23 +19,23 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta
 
-from merge_sumo.analysis.coordinates import coordinates, described
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, replaced, to_plain
+from merge_sumo.system.result import Result
 from merge_sumo.system.suggestions import either
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import VutSpec
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range

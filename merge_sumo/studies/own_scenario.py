@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from merge_sumo import options
-from merge_sumo.analysis.result import Shown
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
     kind_of_merge,
@@ -20,9 +19,10 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
+from merge_sumo.scenario.scenario import MergeScenario, Scenario
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.system.printable import quoted
-from merge_sumo.values.scenario import MergeScenario, Scenario
+from merge_sumo.system.result import Shown
 
 
 def shipped() -> Shown:

@@ -34,21 +34,21 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from merge_sumo import options
-from merge_sumo.analysis.exposure import Distribution, read_distribution
-from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.surface import learn_surface
-from merge_sumo.analysis.traffic import Traffic, named_traffic
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import Scenario, level_name
+from merge_sumo.studies.exposure import Distribution, read_distribution
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
+from merge_sumo.studies.surface import learn_surface
+from merge_sumo.studies.traffic import Traffic, named_traffic
 from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.system.records import Record, to_json
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.chance import clopper_pearson
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.scenario import Scenario, level_name
+from merge_sumo.system.result import Result
+from merge_sumo.verdict.chance import clopper_pearson
+from merge_sumo.verdict.criterion import Criterion
 
 DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
 STREAM: Final = 7

@@ -36,21 +36,21 @@ import numpy as np
 from msgspec import Meta, field
 
 from merge_sumo import options
-from merge_sumo.analysis.result import Result
-from merge_sumo.analysis.summary import summarise
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, from_unit, to_unit
 from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
 from merge_sumo.studies.run_study import OnPart, RunStudy
 from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, replaced, to_json, to_plain
-from merge_sumo.values.case import Case, from_unit, to_unit
-from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.score import Outcome
+from merge_sumo.system.result import Result
+from merge_sumo.verdict.score import Outcome
+from merge_sumo.verdict.summary import summarise
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.spec import parse

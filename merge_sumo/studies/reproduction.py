@@ -16,24 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo import options
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import fmc
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import versions
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_margin
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import FloatArray, Pool, to_unit
+from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.studies.run_study import OnPart
 from merge_sumo.studies.sampler_study import SamplerRun, SamplerStudy, Study
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.records import to_plain
+from merge_sumo.system.result import Result
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import FloatArray, Pool, to_unit
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import LEVELS, US23
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 
 SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
 ADAPTIVE: Final = ("gpr", "coverage")

@@ -10,10 +10,10 @@ from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError, notice
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.system.hashing import files_now
 from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.scenario import level_name
 
 OnPart = Callable[[str, int, int, str, str], None]
 """Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""

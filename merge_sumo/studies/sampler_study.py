@@ -16,14 +16,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from merge_sumo import options
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import covered, fmc
 from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError, notice
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.scenario.case import FloatArray, Pool, to_unit
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.run_study import OnPart
 from merge_sumo.studies.truth import (
     DENSE_CASES,
@@ -36,12 +38,10 @@ from merge_sumo.studies.truth import (
 )
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import to_plain
+from merge_sumo.system.result import Result
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import FloatArray, Pool, to_unit
-from merge_sumo.values.fmc import covered, fmc
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.in_memory import is_here
 
 MOST_PROBES: Final = 10_000

@@ -16,19 +16,19 @@ from typing import Annotated, Any, Final
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.run import failures
 from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import COORDINATES, DT_S, Scenario
 from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record
-from merge_sumo.values.case import Case
-from merge_sumo.values.scenario import COORDINATES, DT_S, Scenario
-from merge_sumo.values.score import CaseVerdict, Outcome
+from merge_sumo.system.result import Result
+from merge_sumo.verdict.score import CaseVerdict, Outcome
 
 LISTED: Final = 10
 """Failures that are not robust that a sentence names."""

@@ -14,24 +14,24 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import FloatArray, Pool
+from merge_sumo.scenario.scenario import OWN, Scenario, level_name
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
+from merge_sumo.system.result import Result
 from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
-from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.chance import MOST_RUNS, check_tolerated, is_decided
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
-from merge_sumo.values.scenario import OWN, Scenario, level_name
+from merge_sumo.verdict.chance import MOST_RUNS, check_tolerated, is_decided
+from merge_sumo.verdict.criterion import Criterion
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""

@@ -12,14 +12,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.analysis.result import Result, Shown
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, FloatArray, MergeCase, from_unit
-from merge_sumo.values.scenario import DT_S, US23, Scenario, lane_of
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.scenario.case import Case, FloatArray, MergeCase, from_unit
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario, lane_of
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.system.result import Result, Shown
 from merge_sumo.vuts.base import HERE
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.python import installed_vuts

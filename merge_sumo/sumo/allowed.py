@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from merge_sumo.road.received import Allowed, Values, is_number, matching, number
-from merge_sumo.values.scenario import VEHICLES
+from merge_sumo.scenario.scenario import VEHICLES
 
 
 def _are_points(text: str) -> bool:

@@ -20,7 +20,7 @@ from lxml import etree
 
 from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
 from merge_sumo.road.netfile import Point
-from merge_sumo.values.scenario import Bounds
+from merge_sumo.scenario.scenario import Bounds
 
 COPY: Final = "@"
 """Stands in an id for the number of the copy."""

@@ -19,12 +19,12 @@ from typing import Any, Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
 from merge_sumo.sumo.replay import check_display
 from merge_sumo.sumo.replay_folder import COLOURS, TEXT, WINDOW, beside, view_settings
 from merge_sumo.system.interrupt import stopping_in_order
-from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT
 
 LEAST_M: Final = 120.0
 """Width of the road that the window shows at least, with the VUT in the middle."""

@@ -12,11 +12,11 @@ from typing import Final, NamedTuple
 
 from lxml import etree
 
-from merge_sumo.analysis.result import Result
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.received import Allowed
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.replay_folder import (
@@ -34,7 +34,7 @@ from merge_sumo.sumo.replay_folder import (
     files_of,
 )
 from merge_sumo.system.interrupt import stopping_in_order
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
+from merge_sumo.system.result import Result
 
 REPLAYED: Final = "replayed.fcd.xml"
 

@@ -24,14 +24,14 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile, Point
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
 from merge_sumo.system.records import to_json
-from merge_sumo.values.case import Case
-from merge_sumo.values.merge import merged_rows
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, level_name
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.merge import merged_rows
+from merge_sumo.verdict.score import Outcome
 
 CONFIG: Final = "replay.sumocfg"
 NET: Final = "us23.net.xml"

@@ -17,9 +17,9 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario
 
 NET: Final = "road.net.xml"
 TYPES: Final = "types.add.xml"

@@ -35,6 +35,8 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import (
     SPEED_MODE_COMMANDED,
     SUMO_OPTIONS,
@@ -42,8 +44,6 @@ from merge_sumo.sumo.binding import (
     scratch_folder,
 )
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 
 PARKING_M: Final = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from merge_sumo import api, options
-from merge_sumo.analysis.coordinates import described
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.reports.motion import verdict_of
+from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.values.scenario import level_name
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 
 
 @verb(options.NoFailures)

@@ -36,16 +36,16 @@ from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
+from merge_sumo.scenario.case import Case, FloatArray, MergeCase, Pool, ToldCase, from_unit
+from merge_sumo.scenario.imperfection import Sensing
+from merge_sumo.scenario.kinds import SCENARIO_KINDS, scenario_of_record
+from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, FloatArray, MergeCase, Pool, ToldCase, from_unit
-from merge_sumo.values.criteria import NamedCriterion
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.imperfection import Sensing
-from merge_sumo.values.measures import Measure
-from merge_sumo.values.scenario import DT_S, US23, VUT, Scenario
-from merge_sumo.values.scenario_kinds import SCENARIO_KINDS, scenario_of_record
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.criteria import NamedCriterion
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.measures import Measure
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.factory import VutFactory
 
 __all__ = [

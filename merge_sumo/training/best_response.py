@@ -20,8 +20,8 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.levelk import ACTIONS, LEVEL0_GAP_FEATURE, QNetwork
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.training.game import Game, IntArray, inputs_of
-from merge_sumo.values.case import FloatArray
 
 _CHUNK: Final = 16
 """Cases that are searched at once."""

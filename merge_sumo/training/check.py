@@ -14,13 +14,13 @@ from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.case import Case, FloatArray, from_unit
+from merge_sumo.scenario.scenario import SVO, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
-from merge_sumo.values.case import Case, FloatArray, from_unit
-from merge_sumo.values.scenario import SVO, Scenario
-from merge_sumo.values.trajectory import End, Trajectory
 
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201

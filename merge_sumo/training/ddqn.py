@@ -23,10 +23,10 @@ import torch
 from torch import Tensor, nn
 
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.env import MergeGame, exploring_starts
 from merge_sumo.training.reward import RewardParts, Role
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import SVO
 
 SQUASH_BELOW: Final = -2.0
 

@@ -28,12 +28,12 @@ from merge_sumo.drivers.policies import load_driver
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.case import FloatArray, MergeCase
+from merge_sumo.scenario.scale import Units
+from merge_sumo.scenario.scenario import POV, SVO, US23, VUT, Scenario, as_merge
 from merge_sumo.sumo.world import World
 from merge_sumo.training.game import of_two
 from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
-from merge_sumo.values.case import FloatArray, MergeCase
-from merge_sumo.values.scenario import POV, SVO, US23, VUT, Scenario, as_merge
-from merge_sumo.values.scenario_scale import Units
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])

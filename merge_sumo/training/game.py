@@ -23,9 +23,9 @@ from merge_sumo.drivers.levelk import (
     actions_mps2,
     features,
 )
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, MergeScenario, Scenario, as_merge
 from merge_sumo.training.reward import Reward, RewardParts, Role
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, MergeScenario, Scenario, as_merge
 
 IntArray = NDArray[np.int64]
 

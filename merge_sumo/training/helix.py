@@ -37,6 +37,7 @@ from merge_sumo.drivers.policies import (
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.folders import (
     NO_LINK,
     cannot_write,
@@ -55,7 +56,6 @@ from merge_sumo.training.env import MergeGame, make_opponent
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
 from merge_sumo.training.reward import Reward, RewardWeights, Role
-from merge_sumo.values.scenario import US23, Scenario
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),

@@ -7,12 +7,12 @@ from functools import partial
 from pathlib import Path
 
 from merge_sumo import options
-from merge_sumo.analysis.result import Result
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_of, read_manifest, scenario_of
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.system.result import Result
 from merge_sumo.training.check import PolicyCheck, check_policy
 from merge_sumo.training.helix import TrainingProgress, train_library
-from merge_sumo.values.scenario import US23, Scenario
 
 
 class PolicyChecks(Result, dict[str, PolicyCheck]):

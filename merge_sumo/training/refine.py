@@ -30,12 +30,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from merge_sumo.drivers.levelk import ACTIONS, QNetwork
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import Progress, as_torch, export, squash
 from merge_sumo.training.env import exploring_starts
 from merge_sumo.training.game import Game, IntArray, greedy, inputs_of
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import SVO
 
 BETTER: Final = 1e-3
 """A game that was found is better than the policy's where its return is higher by more."""

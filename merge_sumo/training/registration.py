@@ -7,7 +7,7 @@ from typing import Final
 from gymnasium.envs import registration
 
 from merge_sumo.drivers.levelk import DECISION_STEPS
-from merge_sumo.values.scenario import DT_S, MAX_EPISODE_S
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S
 
 ENV_ID: Final = "merge_sumo/Merge-v0"
 

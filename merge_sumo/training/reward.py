@@ -15,9 +15,9 @@ from typing import Final, Literal, Self
 
 import numpy as np
 
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, Scenario
-from merge_sumo.values.scenario_scale import Units
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scale import Units
+from merge_sumo.scenario.scenario import DT_S, Scenario
 
 Role = Literal["pov", "vut"]
 FULL_GAP_M: Final = 45.0

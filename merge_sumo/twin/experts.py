@@ -15,8 +15,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.twin.observation import Inputs
-from merge_sumo.values.case import FloatArray
 
 GROUPS: Final = 4
 """Members of an expert."""

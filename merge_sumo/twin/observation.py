@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.following import car_met
 from merge_sumo.drivers.levelk import prospects
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import AHEAD, BEHIND, POV, VUT, Scenario
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, POV, VUT, Scenario
 
 Inputs = NDArray[np.float32]
 """As trees read them."""

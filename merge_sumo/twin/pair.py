@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from merge_sumo.samplers.prediction_skill import Query
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.regression import regression_gaps
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.regression import regression_gaps
+from merge_sumo.verdict.score import Outcome
 
 
 class TwinPair:

@@ -13,12 +13,12 @@ from merge_sumo.drivers.following import keep_safe
 from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, feature_columns
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.povs import POLICIES, Povs
+from merge_sumo.scenario.case import FloatArray, Pool
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, MergeScenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.twin.observation import Inputs, Observation
-from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, VUT, MergeScenario
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 
 Answer = Callable[[Inputs], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs)."""

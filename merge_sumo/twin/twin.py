@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from merge_sumo.engine.povs import Povs
 from merge_sumo.samplers.prediction_skill import Query
+from merge_sumo.scenario.case import FloatArray, Pool
+from merge_sumo.scenario.scenario import VUT
 from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
 from merge_sumo.twin.observation import HISTORY, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
-from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import FloatArray, Pool
-from merge_sumo.values.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.values.scenario import VUT
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.verdict.score import Outcome
 
 EXPERTS: Final = (Expert(history=False), Expert(history=True))
 FEWEST: Final = 4

@@ -22,11 +22,11 @@ import numpy as np
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT, Bounds, lane_of
+from merge_sumo.scenario.signals import Left
+from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.system.interrupt import Stopped
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DEADLINE_S, DT_S, MEMORY_GIB, POV, VUT, Bounds, lane_of
-from merge_sumo.values.signals import Left
-from merge_sumo.values.trajectory import as_reason
 from merge_sumo.vuts.blame_cell import NO_CORRIDOR, current_call
 
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.system.suggestions import either
-from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
 from merge_sumo.vuts.blame_cell import current_call
 

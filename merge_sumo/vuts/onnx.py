@@ -13,8 +13,8 @@ import numpy as np
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
 
 PERIOD: Final = "decision_period_s"

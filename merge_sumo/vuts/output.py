@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
+from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.system.printable import printable
-from merge_sumo.values.trajectory import as_reason
 
 LOG: Final = "controller.log"
 """In the folder of a campaign."""

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, VUT, lane_of
+from merge_sumo.scenario.signals import as_signals
 from merge_sumo.system.registry import entries_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.system.trust import check_code
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, VUT, lane_of
-from merge_sumo.values.signals import as_signals
 from merge_sumo.vuts.base import (
     Deadline,
     PerCorridor,

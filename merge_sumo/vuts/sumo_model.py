@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.scenario import DT_S, VUT
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 
 SHARED_OPTIONS: Final = {

@@ -15,8 +15,8 @@ from handmade import write_run
 from lxml import html
 
 import merge_sumo as ms
-from merge_sumo.analysis.summary import summarise
 from merge_sumo.errors import UserError
+from merge_sumo.verdict.summary import summarise
 
 
 @pytest.fixture(scope="module")

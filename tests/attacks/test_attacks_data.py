@@ -27,9 +27,9 @@ from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read
 from merge_sumo.errors import UserError
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.truth import Truth, ground_truth, read_truth
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.severity import Severity
+from merge_sumo.verdict.severity import Severity
 from merge_sumo.vuts.output import LOG
 
 

@@ -36,10 +36,10 @@ from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import replay, replay_folder
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.system.resources import resource
-from merge_sumo.values.scenario import US23
 
 here = settings(
     max_examples=60,

@@ -27,6 +27,7 @@ from processes import cpu_s
 from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo import opendrive as opendrive_module
 from merge_sumo.sumo import replay as replay_module
@@ -36,7 +37,6 @@ from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import Replay, open_gui, replay
 from merge_sumo.sumo.replay_folder import CASE, CONFIG, LABELS, NET, RECORD, TYPES, VIEW
 from merge_sumo.sumo.world import World
-from merge_sumo.values.scenario import US23
 
 HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "no-reaction"
 LIMIT_S = 20.0

@@ -15,8 +15,8 @@ from processes import none_left
 from vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Case
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.trajectory import Trajectory
 
 CASES = [case for k, case in enumerate(cases_of(6)) if k != 4]
 SOME = (

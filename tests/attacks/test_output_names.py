@@ -25,12 +25,12 @@ from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, fail
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.system import folders
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.workers import Workers
 from merge_sumo.training import helix
-from merge_sumo.values.scenario import US23
 
 NAMELESS = ["", ".", "./", "..", "../.", "./..", "../..", "theirs/..", "missing/../..", "here/.."]
 BELOW = ["file/new", "file/a/b", "to-file/new", "dangling/new", "loop/new", "pipe/new"]

@@ -18,13 +18,13 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.campaigns.run import AGAINST, OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.candidates import spread_out
+from merge_sumo.scenario.case import Case, Pool, to_unit
+from merge_sumo.scenario.scenario import DT_S, US23, V_VUT0_MPS
 from merge_sumo.studies.comparison import Change, compare_against
 from merge_sumo.system.interrupt import Stopped
-from merge_sumo.values.case import Case, Pool, to_unit
-from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import DT_S, US23, V_VUT0_MPS
 
 OLD = "def f(seen):\n    return 0.0\n"
 NEW = "def f(seen):\n    return 0.5 if seen.t_s < 3.0 else 0.0\n"

@@ -18,13 +18,13 @@ from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import Case, Pool
+from merge_sumo.scenario.imperfection import Sensing
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.testing.contracts import SamplerContract, play, play_case
-from merge_sumo.values.case import Case, Pool
-from merge_sumo.values.chance import by_case, failing_cases, is_decided
-from merge_sumo.values.imperfection import Sensing
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.chance import by_case, failing_cases, is_decided
+from merge_sumo.verdict.score import Measures, Outcome
 
 POOL = Pool(levels=(0,), scenario=US23)
 

@@ -16,9 +16,9 @@ from merge_sumo.campaigns.one_case import case_of, run_one
 from merge_sumo.errors import UserError
 from merge_sumo.reports.motion import lines_of, motion_lines
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.live import Window
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
 COLLIDES = MergeCase(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6, scenario=US23)

@@ -23,10 +23,10 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.trajectory import End
 
 SHY = """
     def act(self, seen):

@@ -21,13 +21,13 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.workers import InProcess, Workers, open_workers
 from merge_sumo.testing.contracts import episode
-from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import PAPER_CRITERION
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import US23
+from merge_sumo.verdict.criterion import PAPER_CRITERION
+from merge_sumo.verdict.episode import Episode
 
 POOL = Pool(levels=(0, 1), scenario=US23)
 LEARNING = sorted(name for name, kind in SAMPLERS.items() if kind.learns)

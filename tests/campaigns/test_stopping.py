@@ -10,11 +10,11 @@ from campaigning import run_campaign
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, coverage_by_level, has_converged
-from merge_sumo.values.case import MergeCase, to_unit
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.coverage.fmc import fmc
+from merge_sumo.scenario.case import MergeCase, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.score import Measures, Outcome
 
 
 def outcomes(*failing: int, cases: int) -> list[Outcome]:

@@ -18,10 +18,10 @@ from conftest import some
 
 import merge_sumo as ms
 from merge_sumo.campaigns.run import OUTCOMES
-from merge_sumo.values.case import Case, MergeCase, Pool
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import Scenario
+from merge_sumo.coverage.fmc import fmc
+from merge_sumo.scenario.case import Case, MergeCase, Pool
+from merge_sumo.scenario.scenario import Scenario
+from merge_sumo.verdict.criterion import Criterion
 
 CRITERION = "after_gap_m < 12 or ttc_s < 3"
 FOLLOW_UP_S = 3

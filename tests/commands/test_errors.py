@@ -12,10 +12,10 @@ import merge_sumo as ms
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.system.suggestions import either, meant, nearest
-from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.scenario import US23
+from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.signatures import check_call, check_methods
 

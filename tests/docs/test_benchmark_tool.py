@@ -29,10 +29,10 @@ from problems import (
     shipped_truth,
 )
 
+from merge_sumo.coverage.fmc import RADIUS, fmc
 from merge_sumo.errors import UserError
 from merge_sumo.studies.truth import Truth
 from merge_sumo.testing import SamplerContract
-from merge_sumo.values.fmc import RADIUS, fmc
 
 ROOT = Path(__file__).resolve().parents[2]
 GUESTS = ROOT / "tools" / "benchmark" / "guests"

@@ -27,7 +27,7 @@ class Recipe:
 RECIPES = {
     "a measure": Recipe(
         more={
-            "values/measures.py": {
+            "verdict/measures.py": {
                 "OURS: Final = (": "def _last_m(trajectory: Trajectory, _lines: object) -> float:\n"
                 "    return float(trajectory.motion[-1, 1, 0])\n\n\n",
                 '    Measure("end", ': '    Measure("last_m", "of the VUT at last", unit="m", '
@@ -82,13 +82,13 @@ RECIPES = {
     ),
     "a kind of scenario": Recipe(
         new={
-            "values/leader.py": (ROOT / "tests/plugin/merge_sumo_braking.py")
+            "scenario/leader.py": (ROOT / "tests/plugin/merge_sumo_braking.py")
             .read_text(encoding="utf-8")
             .replace('= "braking"', '= "leader"')
         },
         more={
-            "values/scenario_kinds.py": {
-                'MergeScenario.kind: "': '"leader": "merge_sumo.values.leader:BrakingScenario", '
+            "scenario/kinds.py": {
+                'MergeScenario.kind: "': '"leader": "merge_sumo.scenario.leader:BrakingScenario", '
             }
         },
     ),
@@ -98,7 +98,7 @@ RECIPES = {
                 "    sense: Sensing": "    late_m: float | None = option(None, float, "
                 '"Distance behind M at which episodes end.", TESTED, "--late")\n'
             },
-            "values/scenario.py": {
+            "scenario/scenario.py": {
                 "    mainline: Edges": "    late_m: float = 0.0\n",
                 "        arrived: NDArray": "        end_m += self.late_m\n",
             },

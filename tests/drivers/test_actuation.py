@@ -9,9 +9,9 @@ import pytest
 
 from merge_sumo.drivers.actuation import ActuatedDriver
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.imperfection import Actuation
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.imperfection import Actuation
+from merge_sumo.scenario.scenario import US23
 
 
 class Commands(Driver):

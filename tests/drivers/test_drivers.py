@@ -9,8 +9,8 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.factory import VutFactory
 

@@ -13,9 +13,9 @@ from vut_contract import LANE, ON_LANE, begin, factory, run_on
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.trajectory import End
 
 
 def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scene:

@@ -10,6 +10,7 @@ import pytest
 from merges import HALF, SMALLER
 from plans import POVS
 
+from merge_sumo.coverage.fmc import fmc, regions
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.levelk import (
     FEATURES,
@@ -28,16 +29,15 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
+from merge_sumo.scenario.case import from_unit, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.env import pool_starts
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.reward import Reward, RewardWeights
-from merge_sumo.values.case import from_unit, to_unit
-from merge_sumo.values.fmc import fmc, regions
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.factory import VutFactory
 
 REGRET_BOUNDS = {

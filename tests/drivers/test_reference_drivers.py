@@ -27,10 +27,10 @@ from merge_sumo.drivers.safety_models import (
     ttc_s,
 )
 from merge_sumo.engine.povs import PovLibrary
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import DT_S, US23, MergeScenario
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23, MergeScenario
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.verdict.merge import brake_after_mps2
 
 CASE = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
 TABLES = Path(__file__).parents[1] / "data" / "reference"

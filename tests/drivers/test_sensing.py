@@ -16,10 +16,10 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.sensing import SensedDriver, far_m
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.imperfection import Actuation, Sensing
+from merge_sumo.scenario.scenario import POV, US23, VUT
 from merge_sumo.testing.contracts import assert_sees_late
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.imperfection import Actuation, Sensing
-from merge_sumo.values.scenario import POV, US23, VUT
 
 FAR_M = -522.0
 """340 m, where a POV may start, behind -182 m, where the VUT starts."""

@@ -11,8 +11,8 @@ from campaigning import campaign_settings, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
-from merge_sumo.values.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
 

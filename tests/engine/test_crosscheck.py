@@ -13,7 +13,7 @@ from crosscheck import HighwayEnvWorld, crosscheck
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import US23, VUT
+from merge_sumo.scenario.scenario import US23, VUT
 
 
 @pytest.fixture(autouse=True)

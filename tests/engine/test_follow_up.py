@@ -16,12 +16,12 @@ from test_score import CASE, ending
 from merge_sumo.drivers.following import keep_behind_vut
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import Pool
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.merge import followed_up
-from merge_sumo.values.scenario import DT_S, US23, VUT
-from merge_sumo.values.score import FOLLOWED_UP, Outcome, measure
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import DT_S, US23, VUT
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.merge import followed_up
+from merge_sumo.verdict.score import FOLLOWED_UP, Outcome, measure
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 

@@ -17,10 +17,10 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, MergeCase, Pool, from_unit
+from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
 from merge_sumo.studies.truth import ground_truth, known_truth
-from merge_sumo.values.case import Case, MergeCase, Pool, from_unit
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.scenario import OWN, US23, VUT, Scenario
+from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.vuts.base import VutOptions
 
 

@@ -14,11 +14,11 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import FloatArray, MergeCase
+from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, MergeScenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import FloatArray, MergeCase
-from merge_sumo.values.scenario import DT_S, POV, US23, VUT, MergeScenario
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.score import measure
 
 LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 LATE = """

@@ -18,10 +18,10 @@ from merge_sumo.drivers.levelk import actions_mps2, features
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.scenario import as_merge
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.scenario import as_merge
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.criterion import Criterion
 
 ROAD = as_merge(named_scenario("us23-lane"))
 BEGIN_M, END_M = -70.0, 130.0

@@ -26,9 +26,9 @@ from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, polic
 from merge_sumo.engine.evaluate import open_simulators
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.workers import open_workers
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.trajectory import End
 
 SMALL: dict[str, Any] = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2, "sampler": "uniform"}
 

@@ -21,10 +21,10 @@ from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import LEVELS, OWN, US23
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.scenario import LEVELS, OWN, US23
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.base import VutOptions, seen_at_start
 
 KEEPS = "def Pov(seen):\n    return 0.0\n"

@@ -20,9 +20,9 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
+from merge_sumo.scenario.case import from_unit
+from merge_sumo.scenario.scenario import US23, as_merge
 from merge_sumo.training.reward import RewardWeights
-from merge_sumo.values.case import from_unit
-from merge_sumo.values.scenario import US23, as_merge
 
 ROUNDABOUT = as_merge(named_scenario("roundabout"))
 RADIUS_M = 25.0

@@ -11,12 +11,12 @@ from plans import plan_for
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import Case, Pool, from_unit, to_unit
-from merge_sumo.values.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.base import VutOptions, seen_in
 from merge_sumo.vuts.factory import VutFactory
 

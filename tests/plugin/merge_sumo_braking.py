@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import POV, VUT, Bounds, Edges, Notation, Scenario
-from merge_sumo.values.score import Measures
-from merge_sumo.values.severity import Severity
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import POV, VUT, Bounds, Edges, Notation, Scenario
+from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.score import Measures
+from merge_sumo.verdict.severity import Severity
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

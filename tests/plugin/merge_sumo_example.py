@@ -18,13 +18,13 @@ from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import POV, VUT
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.system.folders import check_new, make_place, new_file
-from merge_sumo.values.bodies import CentreLines
-from merge_sumo.values.case import FloatArray
-from merge_sumo.values.criteria import NamedCriterion
-from merge_sumo.values.measures import Measure
-from merge_sumo.values.scenario import POV, VUT
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.criteria import NamedCriterion
+from merge_sumo.verdict.measures import Measure
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 
 

@@ -17,13 +17,13 @@ from conftest import require, some
 from foreign_nets import corridor_of
 from handmade import write_run
 
-from merge_sumo.analysis import diagnosis
 from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report, report_model
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
+from merge_sumo.verdict import diagnosis
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"

@@ -18,7 +18,7 @@ from test_browser import browser, shown  # noqa: F401 (a fixture)
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.scenario import US23
 
 CONTROLLERS = Path(__file__).parents[2] / "tools" / "chance_vuts.py"
 TOLERATED, RUNS = 0.5, 4

@@ -25,7 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import BEHIND, DT_S
+from merge_sumo.scenario.scenario import BEHIND, DT_S
 
 
 @pytest.fixture(scope="module")

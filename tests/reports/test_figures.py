@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 
+from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
-from merge_sumo.values.fmc import RADIUS
 
 
 def curves():

@@ -16,7 +16,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.reports.motion import lines_of
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.severity import Severity, meanings
+from merge_sumo.verdict.severity import Severity, meanings
 
 LANE = named_scenario("us23-lane")
 OF_M = (

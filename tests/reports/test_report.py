@@ -15,14 +15,14 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.case import to_unit
-from merge_sumo.values.scenario import DT_S, US23
+from merge_sumo.scenario.case import to_unit
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.studies.surface import learn_surface
 from merge_sumo.vuts.output import LINES, LOG
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from handmade import write_run
 
-from merge_sumo.analysis.coordinates import coordinates, described
 from merge_sumo.reports.report_data import PAIR_NODES, map_data
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.scenario import US23
 
 TRAFFIC = named_scenario("us23-traffic")
 RANGED = replace(US23, v_vut0_mps=(14.0, 22.0))

@@ -22,9 +22,9 @@ from merge_sumo.reports.motion import verdict_of
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import US23, as_merge, lane_of
-from merge_sumo.values.score import Outcome
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.scenario.scenario import US23, as_merge, lane_of
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.verdict.score import Outcome
 
 TRIALS = Path(__file__).parents[2] / "tools" / "trial_vuts.py"
 OWN = {

@@ -24,7 +24,7 @@ from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import MergeScenario
+from merge_sumo.scenario.scenario import MergeScenario
 
 EXACT = 1e-9
 

@@ -13,10 +13,10 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Piece
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
+from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.hosting import hosted_paths
 from merge_sumo.sumo.world import World
-from merge_sumo.values.scenario import DT_S, US23
 
 EXACT = 1e-9
 

@@ -19,16 +19,16 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.reports.report_data import road_data
 from merge_sumo.road.merge import road_of
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import (
     HOLD_STEPS,
     write_scenario,
 )
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.values.score import Outcome, measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.score import Outcome, measure
 
 LANE_WIDTH_M = 3.2
 

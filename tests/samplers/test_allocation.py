@@ -13,10 +13,10 @@ from merge_sumo.samplers.allocation import (
     softmax_shares,
     whole_shares,
 )
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.score import Measures, Outcome
 
 
 @st.composite

@@ -8,8 +8,8 @@ import pytest
 from merge_sumo.samplers.annealing import CHAINS, AnnealingSampler
 from merge_sumo.samplers.base import reflect
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import Pool
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import US23
 
 FloatArray = np.ndarray
 

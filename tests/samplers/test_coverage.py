@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import some
 
+from merge_sumo.coverage.fmc import fmc, radius_for
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import (
     _calibrated,
@@ -23,11 +24,10 @@ from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
-from merge_sumo.values.case import Case, Pool, to_unit
-from merge_sumo.values.fmc import fmc, radius_for
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import Case, Pool, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.score import Measures, Outcome
 
 
 def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:

@@ -6,8 +6,8 @@ import numpy as np
 
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.subset import STAGE_SIZE, SubsetSampler, SubsetState, replay
-from merge_sumo.values.case import Pool
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import US23
 
 FloatArray = np.ndarray
 

@@ -24,6 +24,9 @@ from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison_page as pages
+from merge_sumo.scenario.case import MergeCase, from_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import (
     Change,
     ComparedCase,
@@ -32,12 +35,9 @@ from merge_sumo.studies.comparison import (
     rerun,
 )
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.values.case import MergeCase, from_unit
-from merge_sumo.values.chance import RunsOfCase
-from merge_sumo.values.episode import Episode
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome, measure
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.chance import RunsOfCase
+from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.score import Measures, Outcome, measure
 
 BALL = math.pi * 0.05**2
 CASE = MergeCase(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)

@@ -23,6 +23,7 @@ from merge_sumo.engine.evaluate import opened_simulator, run_cases
 from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.scenario import OWN, US23
 from merge_sumo.studies.counterfactuals import (
     AVOIDANCE,
     Stage,
@@ -30,8 +31,7 @@ from merge_sumo.studies.counterfactuals import (
     avoidances,
     run_counterfactuals,
 )
-from merge_sumo.values.merge import brake_after_mps2
-from merge_sumo.values.scenario import OWN, US23
+from merge_sumo.verdict.merge import brake_after_mps2
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 

@@ -25,7 +25,7 @@ from merge_sumo.studies.explanation import (
     Explanation,
     in_words,
 )
-from merge_sumo.values.criterion import Criterion
+from merge_sumo.verdict.criterion import Criterion
 
 
 @pytest.fixture(scope="module")

@@ -12,12 +12,12 @@ from campaigning import campaign_settings, run_campaign
 from scipy.stats import kstest, norm, truncnorm
 
 from merge_sumo import options
-from merge_sumo.analysis.exposure import Normal, read_distribution
-from merge_sumo.analysis.traffic import FOLDER, Traffic, named_traffic, shipped_traffics
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.studies.exposure import Normal, read_distribution
 from merge_sumo.studies.probability import (
     EXPECTED_LEAST,
     PROBABILITY,
@@ -29,8 +29,8 @@ from merge_sumo.studies.probability import (
 )
 from merge_sumo.studies.probability import failure_probability as failure_probability_of
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.values.chance import clopper_pearson
-from merge_sumo.values.scenario import US23
+from merge_sumo.studies.traffic import FOLDER, Traffic, named_traffic, shipped_traffics
+from merge_sumo.verdict.chance import clopper_pearson
 
 LEVELS = (0, 1, 2)
 UNIFORM = read_distribution(None, LEVELS, scenario=US23)

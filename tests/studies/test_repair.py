@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from merge_sumo import api
+from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import MergeCase, to_unit
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies.repair import BISECTIONS, RESERVE
-from merge_sumo.values.case import MergeCase, to_unit
-from merge_sumo.values.fmc import RADIUS
-from merge_sumo.values.scenario import US23
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.spec import parse

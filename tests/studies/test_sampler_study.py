@@ -17,6 +17,10 @@ from plans import key_of, plan_for
 from vut_contract import factory
 
 from merge_sumo import options
+from merge_sumo.coverage.fmc import fmc
+from merge_sumo.scenario.case import from_unit, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.sampler_study import (
     SamplerRun,
     SamplerStudy,
@@ -25,11 +29,7 @@ from merge_sumo.studies.sampler_study import (
     Study,
 )
 from merge_sumo.studies.truth import Truth, ground_truth
-from merge_sumo.values.case import from_unit, to_unit
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.score import Measures, Outcome
 
 
 @pytest.fixture(scope="module")

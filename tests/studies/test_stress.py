@@ -14,11 +14,11 @@ import merge_sumo as ms
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.imperfection import Actuation
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.stress import DRAWS, RUNGS, STRESS, Flips, Rung, StressResult, flips_of
 from merge_sumo.system.records import to_plain
-from merge_sumo.values.imperfection import Actuation
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import CaseVerdict
+from merge_sumo.verdict.score import CaseVerdict
 
 FAIL_WHEN = "bumper_gap_m < 15"
 """Two fifths of the cases fail: no sampler need look for them."""

@@ -11,10 +11,10 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import from_unit
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.truth import Truth
-from merge_sumo.values.case import from_unit
-from merge_sumo.values.chance import MOST_RUNS, is_decided
-from merge_sumo.values.scenario import US23
+from merge_sumo.verdict.chance import MOST_RUNS, is_decided
 from merge_sumo.vuts.base import Seen
 
 

@@ -23,6 +23,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23, MergeScenario
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
 from merge_sumo.sumo.replay import MAX_TIMESTEPS, replay
@@ -39,10 +42,7 @@ from merge_sumo.sumo.replay_folder import (
     VIEW,
     write_scenario,
 )
-from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import DT_S, US23, MergeScenario
-from merge_sumo.values.score import Outcome, measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.score import Outcome, measure
 
 SHIPPED = sorted(path.parent for path in Path(__file__).parents[2].glob(f"scenarios/*/{CONFIG}"))
 FILES = {CONFIG, NET, TYPES, LABELS, RECORD, VIEW, CASE}

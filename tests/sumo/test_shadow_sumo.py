@@ -10,7 +10,7 @@ from traci_pair import ToSession, close_shadow, shadow
 
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.scenario import DT_S, US23, VEHICLES
+from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES
 from merge_sumo.vuts.traci.session import Session
 
 

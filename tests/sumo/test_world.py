@@ -13,11 +13,11 @@ from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import SimulationError, World
-from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.values.score import measure
-from merge_sumo.values.trajectory import End, Trajectory
+from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.factory import VutFactory
 
 EXACT = 1e-9

@@ -10,7 +10,7 @@ from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.values.scenario import US23
+from merge_sumo.scenario.scenario import US23
 
 
 def campaign_settings(**settings: Any) -> CampaignSettings:

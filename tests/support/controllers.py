@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from vut_contract import factory, run_cases
 
-from merge_sumo.values.case import Case
+from merge_sumo.scenario.case import Case
 from merge_sumo.vuts.factory import VutFactory
 
 SUPPORT = Path(__file__).parent

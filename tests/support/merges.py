@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
-from merge_sumo.values.scenario import US23, MergeScenario
+from merge_sumo.scenario.scenario import US23, MergeScenario
 
 LIKE_A_ROUNDABOUT = MergeScenario(
     name="ring",

@@ -20,6 +20,7 @@ from traci.storage import Storage
 
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
+from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_environment, sumo_program
 from merge_sumo.sumo.shadow_sumo import (
     COLOURS,
@@ -30,7 +31,6 @@ from merge_sumo.sumo.shadow_sumo import (
     _edges,
     write_files,
 )
-from merge_sumo.values.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.session import Session
 

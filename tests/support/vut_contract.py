@@ -11,9 +11,9 @@ from plans import plan_for
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.values.case import Case, MergeCase, from_unit
-from merge_sumo.values.scenario import US23, Scenario
-from merge_sumo.values.trajectory import Trajectory
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 

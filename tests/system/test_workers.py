@@ -23,6 +23,9 @@ from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
 from merge_sumo.engine.plan import versions
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import from_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.workers import (
     LocalProcesses,
     Workers,
@@ -30,9 +33,6 @@ from merge_sumo.system.workers import (
     open_workers,
     workers_or_cores,
 )
-from merge_sumo.values.case import from_unit
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.trajectory import End
 
 SETTINGS = campaign_settings(
     vut="design1", levels=(0, 1, 2), sampler="gpr", cases=60, batch=20, seed=3

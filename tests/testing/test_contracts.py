@@ -10,7 +10,7 @@ from networks import constant_network
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.report_sections import SECTIONS
 from merge_sumo.testing import CriterionContract, ExportContract, ReportSectionContract, VutContract
-from merge_sumo.values.criteria import CRITERIA
+from merge_sumo.verdict.criteria import CRITERIA
 
 VUTS = (
     "level0",

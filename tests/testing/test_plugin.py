@@ -108,7 +108,7 @@ def test_records_survive_although_its_measure_has_no_value(merge_sumo):
     tests = PLUGIN.parent
     said = merge_sumo(
         *("-q", "-n", "0", "-p", "no:cacheprovider", "-k", "record or Record"),
-        *(tests / "campaigns/test_journal.py", tests / "values/test_chance.py"),
+        *(tests / "campaigns/test_journal.py", tests / "verdict/test_chance.py"),
         program=("-m", "pytest"),
     )
     assert " passed" in said

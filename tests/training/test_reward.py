@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from merges import HALF, LIKE_A_ROUNDABOUT
 
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.training import reward
-from merge_sumo.values.scenario import US23
 
 R = reward.Reward(reward.RewardWeights(
     pov_acc=0.1, pov_v_hw=0.2, vut_acc=0.04, vut_v_min=0.3, vut_v_end=0.5,

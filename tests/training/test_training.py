@@ -29,14 +29,14 @@ from merge_sumo.drivers.levelk import (
 from merge_sumo.drivers.policies import MANIFEST, load_network, plays_as, read_manifest, scenario_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
+from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import play, returns_of
 from merge_sumo.training.env import MergeGame, MergeVectorEnv, pool_starts
 from merge_sumo.training.game import Game, greedy
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
-from merge_sumo.values.case import Case, MergeCase
-from merge_sumo.values.scenario import US23
 
 WEIGHTS = reward.RewardWeights()
 REWARD = reward.Reward(WEIGHTS, US23)

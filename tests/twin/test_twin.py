@@ -19,17 +19,17 @@ from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
+from merge_sumo.scenario.case import MergeCase, Pool
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.records import decode, to_plain
 from merge_sumo.twin.experts import Expert, Forest, Steps
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import MergeCase, Pool
-from merge_sumo.values.criterion import Criterion
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.score import Measures, Outcome
-from merge_sumo.values.trajectory import End
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.prediction import Prediction
+from merge_sumo.verdict.score import Measures, Outcome
 
 SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=2)
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"

@@ -23,7 +23,7 @@ from vut_contract import (
 
 from merge_sumo.drivers.base import MERGE, STAY
 from merge_sumo.errors import UserError
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.trajectory import End
 
 pytest.importorskip("fmpy")
 

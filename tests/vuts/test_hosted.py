@@ -22,9 +22,9 @@ from vut_contract import LEVEL0_CLASS
 
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23, as_merge, lane_of
-from merge_sumo.values.trajectory import as_reason
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23, as_merge, lane_of
+from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import Host, HostedVut

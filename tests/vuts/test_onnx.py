@@ -18,10 +18,10 @@ from merge_sumo.drivers.base import MERGE, STAY
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.policies import NETWORKS, load_network
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import from_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.truth import ground_truth
-from merge_sumo.values.case import from_unit
-from merge_sumo.values.scenario import US23
-from merge_sumo.values.trajectory import End
 
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")

@@ -16,9 +16,9 @@ from campaigning import campaign_settings, run_campaign
 from vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
 from merge_sumo.errors import UserError
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import US23, VUT
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23, VUT
+from merge_sumo.scenario.trajectory import End
 
 
 @pytest.fixture

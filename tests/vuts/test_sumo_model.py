@@ -10,10 +10,10 @@ from vut_contract import cases_of, factory, run_cases, run_on
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23, VUT
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import World
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import DT_S, US23, VUT
-from merge_sumo.values.trajectory import End
 from merge_sumo.vuts.sumo_model import MODELS
 
 FREE = MergeCase(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)

@@ -24,9 +24,9 @@ from vut_contract import cases_of, factory, run_cases
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
-from merge_sumo.values.case import MergeCase
-from merge_sumo.values.scenario import DT_S, US23
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.traci.vut import TraciVut
 

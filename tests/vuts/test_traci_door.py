@@ -27,7 +27,7 @@ from processes import none_left
 from raw_traci import Client, GoneError
 from vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.vuts.traci import door
 from merge_sumo.vuts.traci.door import descends, owner_of
 

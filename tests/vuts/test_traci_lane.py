@@ -14,7 +14,7 @@ from vut_contract import factory, run_on
 
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.values.trajectory import End
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.vuts.traci.session import STAYED, Session
 
 LANE = named_scenario("us23-lane")

@@ -37,20 +37,20 @@ from problems import (
     shipped_truth,
 )
 
-from merge_sumo.analysis.result import Result
 from merge_sumo.campaigns.scheduler import groups_here
+from merge_sumo.coverage.fmc import fmc
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.system.arrays import regular
 from merge_sumo.system.folders import check_own, make_place, replace_own
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import decode
+from merge_sumo.system.result import Result
 from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
-from merge_sumo.values.case import FloatArray, to_unit
-from merge_sumo.values.fmc import fmc
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.score import Outcome
 
 COUNTED: Final = (50, 100, 400)
 """Numbers of cases N after which the share counts."""

@@ -21,12 +21,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.contract import violation
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.scenario.case import Case, FloatArray, Pool
 from merge_sumo.studies.sampler_study import COMPARED_BATCH
 from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.source_files import module_of_file
-from merge_sumo.values.case import Case, FloatArray, Pool
-from merge_sumo.values.prediction import Prediction
-from merge_sumo.values.score import Outcome
+from merge_sumo.verdict.prediction import Prediction
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import Deadline, DeadlineExceeded, text_of
 
 T = TypeVar("T")

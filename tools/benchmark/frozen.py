@@ -14,9 +14,9 @@ import numpy as np
 
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.system.suggestions import meant
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 from merge_sumo.vuts.registry import KINDS
 

@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.signals import Left
 from merge_sumo.system.blame import Blame, how_it_ended
 from merge_sumo.system.hashing import Files, changed, hashed
 from merge_sumo.system.pulse import AwakeClock
 from merge_sumo.system.spawning import python_command
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.signals import Left
 from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
 from merge_sumo.vuts.host import wire

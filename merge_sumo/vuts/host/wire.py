@@ -20,9 +20,9 @@ import msgspec
 import numpy as np
 
 from merge_sumo.drivers.base import Scene
-from merge_sumo.values.case import Case, FloatArray, ToldCase
-from merge_sumo.values.scenario import RANGES, US23, Bounds, Scenario, lane_of
-from merge_sumo.values.signals import as_signals
+from merge_sumo.scenario.case import Case, FloatArray, ToldCase
+from merge_sumo.scenario.scenario import RANGES, US23, Bounds, Scenario, lane_of
+from merge_sumo.scenario.signals import as_signals
 from merge_sumo.vuts.base import VutSpec
 
 T = TypeVar("T")

@@ -8,8 +8,8 @@ from enum import Enum
 from functools import cache
 from typing import Final
 
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo.shadow_sumo import RefusedError
-from merge_sumo.values.scenario import DT_S
 from merge_sumo.vuts.traci.protocol import Reader
 from merge_sumo.vuts.traci.questions import Call
 

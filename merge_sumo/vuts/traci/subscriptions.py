@@ -11,9 +11,9 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
+from merge_sumo.scenario.scenario import VEHICLES
 from merge_sumo.sumo.shadow_sumo import RefusedError, ShadowSumo
 from merge_sumo.sumo.traci_names import named
-from merge_sumo.values.scenario import VEHICLES
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.protocol import GET_VEHICLE, PARAMETER, Reader, pack
 

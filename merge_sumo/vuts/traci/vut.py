@@ -25,13 +25,13 @@ from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.child import ChildDiedError, SumoChild
 from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
-from merge_sumo.values.case import Case, FloatArray
-from merge_sumo.values.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 from merge_sumo.vuts.output import append
 from merge_sumo.vuts.process import GRACE_S, Program, split_command

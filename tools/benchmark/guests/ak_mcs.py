@@ -9,7 +9,7 @@ import numpy as np
 
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.values.case import FloatArray
+from merge_sumo.scenario.case import FloatArray
 
 DESIGN: Final = 12
 """Cases of a level before the first process is fitted: those of the paper."""

@@ -1,0 +1,1 @@
+"""Failure mode coverage, and the geometry of it."""

@@ -1,0 +1,538 @@
+"""Scenarios as values: where vehicles start, what they can do, what is too near.
+
+`Scenario` is what every kind of scenario has; `MergeScenario` is the kind of this package, a merge
+from a ramp. Each path has its own coordinate: the distance of the front bumper along its lanes from
+a reference point M, in metres, negative before M; of a merge that is the merge point. A case is a
+point of a scenario and knows which: drivers, rollout and score take what holds for it from the
+case. `US23` is the paper's: Wang et al., sections VI and VII and Table I.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+
+from msgspec import Meta
+
+from merge_sumo.errors import UserError
+from merge_sumo.scenario.imperfection import (
+    ACT,
+    PERFECT_ACTUATION,
+    PERFECT_SENSING,
+    SENSE,
+    Actuation,
+    Imperfection,
+    Sensing,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+DT_S: Final = 0.1
+"""Step of the equations of motion, eq. (4)."""
+LEVELS: Final = (0, 1, 2)
+"""Levels of reasoning of the POV."""
+OWN: Final = 3
+"""Stands for a level where a person's own controller is the POV; people write and read "own"."""
+ALL_LEVELS: Final = (*LEVELS, OWN)
+DEADLINE_S: Final = 5.0
+"""A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
+MEMORY_GIB: Final = 4.0
+"""A user's code that takes more memory than this fails to get it."""
+MAX_EPISODE_S: Final = 120.0
+"""No scenario lets an episode last longer."""
+
+MAX_FOLLOW_UP_S: Final = 30.0
+"""None follows vehicles for longer behind M."""
+
+ROOM_AFTER_M: Final = 2000.0
+"""Length behind M that the road has at least."""
+
+Bounds = tuple[float, float]
+Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in ["e1", "e2"]')]
+
+
+def level_name(level: int) -> str:
+    """Return a level as people write it."""
+    return "own" if level == OWN else str(level)
+
+
+@dataclass(frozen=True, slots=True)
+class Dimension:
+    """One continuous coordinate of the pool: the name of a `Case` field and its bounds."""
+
+    field: str
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Notation:
+    """How people write a coordinate: name, unit, digits after the point, and in formulas."""
+
+    name: str
+    unit: str
+    digits: int
+    symbol: str
+
+
+COORDINATES: Final = {
+    "sense_delay_s": Notation("sensing delay", "s", 2, "sensing delay (s)"),
+    "sense_noise_x_m": Notation("noise of x", "m", 2, "noise of $x$ (m)"),
+    "sense_noise_v_mps": Notation("noise of v", "m/s", 2, "noise of $v$ (m/s)"),
+    "sense_dropout": Notation("dropout", "", 2, "dropout"),
+    "sense_range_m": Notation("range", "m", 1, "range (m)"),
+    "sense_occluded_until_m": Notation("occluded until", "m", 1, "occluded until (m)"),
+    "act_lag_s": Notation("actuator lag", "s", 2, "actuator lag (s)"),
+    "act_delay_s": Notation("actuator delay", "s", 2, "actuator delay (s)"),
+    "act_power_w_per_kg": Notation("power", "W/kg", 1, "power (W/kg)"),
+}
+"""Coordinates of the pool, by the fields of a case: `SENSE` or `ACT`, and the field of those."""
+
+SVO: Final = Dimension("svo_rad", 0.0, math.pi / 2)
+"""psi in [0, pi/2): the upper end itself is outside the pool."""
+
+POV: Final = 0
+VUT: Final = 1
+AHEAD: Final = 2
+BEHIND: Final = 3
+"""Rows of the vehicles of an episode, in every array that has one for each. The mainline is driven
+on by the POV and, in traffic, by a car ahead of it and one behind it."""
+VEHICLES: Final = ("pov", "vut", "ahead", "behind")
+"""Their names."""
+Vehicle = Annotated[str, Meta(pattern="^(pov|vut|ahead|behind)$", description="a vehicle's name")]
+
+EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
+"""A time of an episode in a record, in s."""
+
+
+_LENGTH_M: Final = (0.1, 100.0)
+_SPEED_MPS: Final = (0.0, 100.0)
+_HEADWAY_S: Final = (0.0, 60.0)
+RANGES: Final[dict[str, Bounds]] = {
+    "x_pov0_m": (-5000.0, 0.0),
+    "v_pov0_mps": _SPEED_MPS,
+    "x_vut0_m": (-5000.0, 0.0),
+    "v_vut0_mps": _SPEED_MPS,
+    "headway_ahead_s": _HEADWAY_S,
+    "headway_behind_s": _HEADWAY_S,
+    "tau_s": (DT_S, 10.0),
+    "min_gap_m": (0.0, 100.0),
+    "pov_length_m": _LENGTH_M,
+    "vut_length_m": _LENGTH_M,
+    "a_min_mps2": (-20.0, 0.0),
+    "a_max_mps2": (0.0, 20.0),
+    "timeout_s": (DT_S, MAX_EPISODE_S),
+    "follow_up_s": (0.0, MAX_FOLLOW_UP_S),
+    "v_hw_min_mps": _SPEED_MPS,
+    "v_hw_max_mps": _SPEED_MPS,
+    "v_min_mps": _SPEED_MPS,
+    "ttc_min_s": (0.0, 100.0),
+    "dx_crash_m": (0.0, 1000.0),
+    "dx_critical_m": (0.0, 1000.0),
+    "level0_a_mps2": (0.0, 20.0),
+    "level0_v_mps": _SPEED_MPS,
+    "reach_m": (0.0, 5000.0),
+    "v_start_max_mps": _SPEED_MPS,
+    "lane_m": (-2000.0, 2000.0),
+}
+"""What a road and its cars can have, by field: 360 km/h, 2 g, 5 km. Beyond, nothing is computed."""
+
+V_VUT0_MPS: Final = 18.0
+"""Speed at which the paper's VUT starts."""
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Scenario:
+    """What every kind of scenario has; a kind is a subclass, registered in `SCENARIO_KINDS`.
+
+    A kind says what its cases are (`case_type`, `notation`, `case_fields`), which roads they need
+    (`pov_edges`, `vut_edges`), when an episode ends (`has_ended`) and what is measured of it
+    (`measures`). Raises `UserError` for numbers that make no scenario.
+
+    Attributes:
+        name: how people call it.
+        net: the SUMO net; None for the shipped one.
+        x_vut0_m: where the VUT starts.
+        v_vut0_mps: how fast the VUT is then, unless a campaign says otherwise: it is observed, not
+            chosen by the tester. A range makes it a coordinate of the pool.
+        tau_s: reaction time with which a car of the mainline follows the one ahead of it (Krauss).
+        min_gap_m: distance that it keeps from it at a stand.
+        pov_length_m: length of the POV and of other cars of the mainline.
+        vut_length_m: length of the VUT.
+        a_min_mps2: hardest braking of all vehicles, negative.
+        a_max_mps2: hardest acceleration of all vehicles.
+        timeout_s: an episode that has not ended by then is a TIMEOUT.
+        follow_up_s: how long all drive on behind M; the verdict of the paper is at M.
+        v_hw_min_mps: lowest speed that the mainline drives at.
+        v_hw_max_mps: highest speed that it drives at.
+        v_min_mps: below this the VUT is slow.
+        ttc_min_s: a time to collision below this is short.
+        dx_crash_m: front bumpers nearer than this are a collision under the paper's rule.
+        dx_critical_m: nearer than this is critical.
+        level0_a_mps2: acceleration of a level-0 VUT (section VI-B),
+        level0_v_mps: up to this speed, which it holds.
+        reach_m: no vehicle starts farther from M than this.
+        v_start_max_mps: no vehicle starts faster than this.
+        sense: how the VUT senses other cars.
+        act: how it obeys its controller.
+    """
+
+    kind: ClassVar[str]
+    """Name of the kind in `SCENARIO_KINDS`."""
+    case_type: ClassVar[type[Any]]
+    """The `Case` of the kind."""
+    measures: ClassVar[Callable[..., Any]]
+    """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
+    lines of the road (None: nothing is measured before M), and whether the last way out is searched
+    for."""
+    score: ClassVar[Callable[..., Any] | None] = None
+    """Gives the score of the paper's criterion by a trajectory, the same as `measures`, in less
+    time; None where a kind has no such function."""
+    levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
+    """POV levels that the kind has."""
+    notation: ClassVar[Mapping[str, Notation]]
+    """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
+    name says by its range whether it is one; the SVO is one at level 2."""
+    ends_as: ClassVar[str] = "COMPLETED"
+    """The `End` of an episode that `has_ended`."""
+    level_about: ClassVar[Mapping[int, str]] = {}
+    """What the POV of a level does, in the words of a caption."""
+    default_goal: ClassVar[str] = "the end of the scenario"
+    """What the VUT reaches in an episode that is no TIMEOUT, where its cases do not say."""
+    measure_labels: ClassVar[Mapping[str, str]] = {}
+    """What listings call measures of which `MEASURES` has the words for merges, by name."""
+    default_criterion: ClassVar[str] = "contact"
+    """The criterion of a campaign that names none. The paper's is one of merges alone."""
+
+    name: str
+    net: str | None = None
+    x_vut0_m: float = -182.0
+    v_vut0_mps: float | Bounds = V_VUT0_MPS
+    tau_s: float = 1.0
+    min_gap_m: float = 2.5
+    pov_length_m: float = 5.0
+    vut_length_m: float = 5.0
+    a_min_mps2: float = -4.0
+    a_max_mps2: float = 2.0
+    timeout_s: float = 30.0
+    follow_up_s: float = 0.0
+    v_hw_min_mps: float = 24.6
+    v_hw_max_mps: float = 35.0
+    v_min_mps: float = 12.0
+    ttc_min_s: float = 7.0
+    dx_crash_m: float = 6.0
+    dx_critical_m: float = 15.0
+    level0_a_mps2: float = 1.0
+    level0_v_mps: float = 28.0
+    reach_m: float = 900.0
+    v_start_max_mps: float = 45.0
+    sense: Sensing = PERFECT_SENSING
+    act: Actuation = PERFECT_ACTUATION
+
+    def __post_init__(self) -> None:
+        """Check the numbers one by one, then together."""
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name, None)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not math.isfinite(number):
+                    raise UserError(f"{name} is {value}: it must be finite")
+                if number is not None and not low <= number <= high:
+                    raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
+        for name, fits, wanted in self._checks():
+            if not fits:
+                raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
+
+    def _checks(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield (field, whether it fits with the others, what would)."""
+        v_vut0 = self.bounds("v_vut0_mps")
+        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, self._before_m
+        yield "v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, self._speeds
+        is_number = type(self.v_vut0_mps) is float
+        yield "v_vut0_mps", is_number or v_vut0[0] < v_vut0[1], "low < high"
+        yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
+        yield "a_max_mps2", self.a_max_mps2 > 0.0, "above 0"
+        yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
+        yield "v_min_mps", self.v_min_mps > 0.0, "above 0"
+        yield "ttc_min_s", self.ttc_min_s > 0.0, "above 0"
+        yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
+        yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
+        yield "level0_v_mps", self.level0_v_mps > 0.0, "above 0"
+        known = COORDINATES.keys() & self.notation.keys()
+        for name, imperfection in self._imperfections():
+            fits = known.issuperset(f"{name}_{field}" for field in imperfection.ranged)
+            yield name, fits, f"numbers: a range is a coordinate that {self.kind} does not have"
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the scenario as JSON keeps it.
+
+        `kind` is left out where it is a merge, and what is perfect of `sense` and `act`.
+        """
+        kind = {} if self.kind == MergeScenario.kind else {"kind": self.kind}
+        record = kind | asdict(self)
+        for name, known in self._imperfections():
+            del record[name]
+            record |= {} if known.is_perfect else {name: known.to_record()}
+        return record
+
+    def _imperfections(self) -> Iterator[tuple[str, Imperfection]]:
+        """Yield `sense` and `act` with their names."""
+        yield SENSE, self.sense
+        yield ACT, self.act
+
+    @property
+    def criterion(self) -> str:
+        """The criterion of a campaign that names none."""
+        return self.default_criterion
+
+    @property
+    def goal(self) -> str:
+        """What the VUT reaches in an episode that is no TIMEOUT."""
+        return self.default_goal
+
+    @property
+    def place(self) -> str:
+        """What sentences call the place of a merge; texts that are written with M are said so."""
+        return "M"
+
+    def said(self, text: str) -> str:
+        """Return a text of this package, written with M, as it is true of this scenario."""
+        if self.place == "M":
+            return text
+        return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
+
+    @property
+    def _before_m(self) -> str:
+        return f"metres before M, -{self.reach_m:g} to 0, low < high"
+
+    @property
+    def _speeds(self) -> str:
+        return f"between 0 and {self.v_start_max_mps:g}"
+
+    def bounds(self, name: str) -> Bounds:
+        """Return the bounds of a number that may be a range; twice the number where it is none."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
+
+    @property
+    def vehicles(self) -> int:
+        """A: how many vehicles an episode has, the VUT among them."""
+        return 2
+
+    @property
+    def pov_edges(self) -> tuple[str, ...]:
+        """Edges of the net on which the POV and other cars drive, in order, past M."""
+        raise NotImplementedError
+
+    @property
+    def vut_edges(self) -> tuple[str, ...]:
+        """Edges on which the VUT drives, past M, where they merge with those of the POV.
+
+        Where both drive on one lane, they are the same, and M is where the last edge begins.
+        """
+        raise NotImplementedError
+
+    @property
+    def farthest_start_m(self) -> float:
+        """Distance to M of the farthest start of a car other than the VUT."""
+        return self.reach_m
+
+    @property
+    def max_steps(self) -> int:
+        """Steps after which an episode that has not ended is a TIMEOUT."""
+        return round(self.timeout_s / DT_S)
+
+    @property
+    def room_after_m(self) -> float:
+        """How far behind M a POV may get until the timeout, at full acceleration."""
+        far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
+        ahead_m = self.reach_m if self.vehicles > 2 else 0.0
+        return max(far_m, ROOM_AFTER_M) + ahead_m
+
+    def dimensions(self, level: int) -> tuple[Dimension, ...]:
+        """Return the continuous coordinates of the pool at a level: those that have a range.
+
+        At level 2 the POV's orientation is the last one.
+        """
+        ranges = [
+            Dimension(name, *value)
+            for name in self.notation
+            if isinstance(value := self._given(name), tuple)
+        ]
+        return (*ranges, SVO) if level == 2 and SVO.field in self.notation else tuple(ranges)
+
+    def _given(self, coordinate: str) -> Any:
+        """Return what the scenario says of a coordinate: a number, a range, or None for nothing."""
+        if coordinate not in COORDINATES:
+            return getattr(self, coordinate, None)
+        prefix, _, name = coordinate.partition("_")
+        return getattr(getattr(self, prefix), name)
+
+    @property
+    def imperfect_fields(self) -> tuple[str, ...]:
+        """Fields of a case that are ranges of `sense` and `act`."""
+        known = (f"{name}_{field}" for name, of in self._imperfections() for field in of.ranged)
+        return tuple(known)
+
+    @property
+    def case_fields(self) -> tuple[str, ...]:
+        """Fields of a case beside its level that say where it is in the scenario."""
+        fields = [dimension.field for level in self.levels for dimension in self.dimensions(level)]
+        return tuple(dict.fromkeys((*fields, "v_vut0_mps")))
+
+    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which corridors the episode has ended in states (A, K), (K,)."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class MergeScenario(Scenario):
+    """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
+
+    Attributes:
+        mainline: edges of the mainline, in driving order, past M.
+        ramp: edges of the ramp, in driving order, past M.
+        x_pov0_m: where the POV may start, low and high.
+        v_pov0_mps: how fast it may be then.
+        headway_ahead_s: time headways at which a car drives ahead of the POV, low and high: the
+            distance of their front bumpers is the headway times the POV's speed, which is also
+            that of the car. A coordinate of the pool; None where there is no such car.
+        headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
+        lane_m: where the acceleration lane begins and ends, around M, which is where a merge is
+            expected; None where M is the only place to merge.
+        lane_end: what the end of that lane does to a VUT that has not merged: "merge" moves it to
+            the mainline, "stop" brakes it to a stand before the end.
+    """
+
+    kind: ClassVar[str] = "merge"
+    notation: ClassVar[Mapping[str, Notation]] = {
+        "x_pov0_m": Notation("x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
+        "v_pov0_mps": Notation("v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
+        "v_vut0_mps": Notation("v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
+        "headway_ahead_s": Notation("headway ahead", "s", 2, "headway ahead (s)"),
+        "headway_behind_s": Notation("headway behind", "s", 2, "headway behind (s)"),
+        **COORDINATES,
+        "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
+    }
+    ends_as: ClassVar[str] = "MERGED"
+    level_about: ClassVar[Mapping[int, str]] = {
+        0: "keeps its speed",
+        1: "makes room for a VUT that accelerates",
+        2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
+    }
+    default_goal: ClassVar[str] = "the merge point"
+    default_criterion: ClassVar[str] = "paper"
+
+    name: str = "us23"
+    mainline: Edges = ("main_in", "main_out")
+    ramp: Edges = ("ramp", "main_out")
+    x_pov0_m: Bounds = (-340.0, -180.0)
+    v_pov0_mps: Bounds = (25.0, 35.0)
+    headway_ahead_s: Bounds | None = None
+    headway_behind_s: Bounds | None = None
+    lane_m: Bounds | None = None
+    lane_end: Literal["merge", "stop"] = "merge"
+
+    def _checks(self) -> Iterator[tuple[str, bool, str]]:
+        """Yield (field, whether it fits with the others, what would)."""
+        x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
+        shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
+        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
+        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, self._before_m
+        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
+        yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, self._speeds
+        has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
+        yield "headway_behind_s", has_both, "both headways, or none"
+        for name in ("headway_ahead_s", "headway_behind_s"):
+            headway_s = getattr(self, name)
+            fits = headway_s is None or shortest_s <= headway_s[0] < headway_s[1]
+            yield name, fits, apart
+        near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
+        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
+        begin_m, end_m = self.lane_m or (0.0, 0.0)
+        around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
+        fits = self.lane_m is None or self.x_vut0_m <= begin_m <= 0.0 < end_m
+        yield "lane_m", fits, around
+        # No zero-argument super(): `slots` makes another class of this one.
+        yield from Scenario._checks(self)
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the scenario as JSON keeps it; without a lane, nothing is said of one."""
+        record = Scenario.to_record(self)
+        if self.lane_m is None:
+            del record["lane_m"], record["lane_end"]
+        return record
+
+    @property
+    def criterion(self) -> str:
+        """The criterion of a campaign that names none; the paper's is not for a lane."""
+        return "unsafe" if self.lane_m is not None else self.default_criterion
+
+    @property
+    def goal(self) -> str:
+        """The merge point; on an acceleration lane that is no point."""
+        return "the mainline" if self.lane_m is not None else self.default_goal
+
+    @property
+    def place(self) -> str:
+        """M; on an acceleration lane, where M is only expected, the merge."""
+        return "the merge" if self.lane_m is not None else "M"
+
+    @property
+    def vehicles(self) -> int:
+        """A: how many vehicles an episode has, the VUT among them."""
+        return 2 if self.headway_ahead_s is None else len(VEHICLES)
+
+    @property
+    def pov_edges(self) -> tuple[str, ...]:
+        """The mainline."""
+        return self.mainline
+
+    @property
+    def vut_edges(self) -> tuple[str, ...]:
+        """The ramp."""
+        return self.ramp
+
+    @property
+    def farthest_start_m(self) -> float:
+        """Distance to M of the farthest start on the mainline."""
+        behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
+        return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
+
+    @property
+    def case_fields(self) -> tuple[str, ...]:
+        """Start and speed of the POV, speed of the VUT, orientation; in traffic, headways."""
+        headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
+        own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
+        return (*own, *headways, *self.imperfect_fields)
+
+    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which corridors the VUT has to be on the mainline in states (A, K), (K,).
+
+        It is there from M on, or from the end of the acceleration lane on.
+        """
+        end_m = 0.0 if self.lane_m is None else self.lane_m[1]
+        arrived: NDArray[np.bool_] = x_m[VUT] >= end_m
+        return arrived
+
+
+US23: Final = MergeScenario()
+"""The paper's."""
+
+
+def lane_of(scenario: Scenario) -> Bounds | None:
+    """Return where the acceleration lane of a scenario begins and ends; None without one."""
+    return scenario.lane_m if isinstance(scenario, MergeScenario) else None
+
+
+def as_merge(scenario: Scenario) -> MergeScenario:
+    """Return a scenario that is a merge; `UserError` for another kind."""
+    if not isinstance(scenario, MergeScenario):
+        raise UserError(
+            f"{scenario.name} is a scenario of kind {scenario.kind}: this needs a merge"
+        )
+    return scenario

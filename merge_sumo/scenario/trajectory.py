@@ -1,0 +1,126 @@
+"""What happened in one episode."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final
+
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, POV, VUT
+from merge_sumo.scenario.signals import Signals
+from merge_sumo.system.pickling import quickly_pickled
+from merge_sumo.system.printable import printable
+
+
+class End(StrEnum):
+    """Why an episode ended."""
+
+    MERGED = "MERGED"
+    TIMEOUT = "TIMEOUT"
+    VUT_ERROR = "VUT_ERROR"
+    SIM_ERROR = "SIM_ERROR"
+    COMPLETED = "COMPLETED"
+    """Of kinds of scenarios without a merge: the episode ended as the kind says."""
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether the VUT reached the merge point, or else the end of its scenario."""
+        return self in (End.MERGED, End.COMPLETED)
+
+    @property
+    def is_error(self) -> bool:
+        """Whether the VUT or the simulation went wrong; the POV is of the simulation."""
+        return self in (End.VUT_ERROR, End.SIM_ERROR)
+
+
+REASON_CHARACTERS: Final = 600
+_ADDRESS: Final = re.compile("0x[0-9a-fA-F]{6,}")
+
+
+def as_reason(text: str) -> str:
+    """Return the reason of an error as records hold it: one printable line, not too long.
+
+    Without memory addresses: they differ from run to run, and records of equal runs must not.
+    """
+    without = _ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS])
+    return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
+
+
+@quickly_pickled
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Positions, speeds and accelerations of all vehicles in one episode.
+
+    `motion` has shape (T + 1, A, 3): one row per step, from t = 0 to the end of the episode; the
+    vehicles POV, VUT and, in traffic, the cars ahead of and behind the POV; their x, v and a in m,
+    m/s and m/s2. The acceleration of a step acts from it to the next; it is 0 in the last one.
+
+    `end` is MERGED whenever the VUT arrived at M: how near the bodies came is its severity
+    (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
+    the simulation did wrong. `clipped_steps` counts the answers of the VUT that were outside the
+    limits of acceleration and were clipped. `after` is the motion behind M where the scenario has
+    it followed up, its first row that of the merge; it is measured and not kept. `signals` are what
+    the VUT left for each row, where it left any.
+    """
+
+    case: Case
+    motion: FloatArray
+    end: End
+    error: str | None = None
+    clipped_steps: int = 0
+    after: FloatArray | None = None
+    signals: Signals | None = None
+
+    def __repr__(self) -> str:
+        """Return its end in a line: the motion is an array of hundreds of numbers."""
+        cars, rows = self.motion.shape[1], len(self.motion)
+        return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
+
+    @property
+    def x_pov_m(self) -> FloatArray:
+        """Positions of the POV, (T + 1,)."""
+        return self.motion[:, POV, 0]
+
+    @property
+    def v_pov_mps(self) -> FloatArray:
+        """Speeds of the POV, (T + 1,)."""
+        return self.motion[:, POV, 1]
+
+    @property
+    def a_pov_mps2(self) -> FloatArray:
+        """Accelerations of the POV, (T + 1,), the last one 0."""
+        return self.motion[:, POV, 2]
+
+    @property
+    def x_vut_m(self) -> FloatArray:
+        """Positions of the VUT, (T + 1,)."""
+        return self.motion[:, VUT, 0]
+
+    @property
+    def v_vut_mps(self) -> FloatArray:
+        """Speeds of the VUT, (T + 1,)."""
+        return self.motion[:, VUT, 1]
+
+    @property
+    def a_vut_mps2(self) -> FloatArray:
+        """Accelerations of the VUT, (T + 1,), the last one 0."""
+        return self.motion[:, VUT, 2]
+
+    @property
+    def nearest(self) -> int:
+        """Row of the car of the mainline that is nearest to the VUT at the end."""
+        if self.motion.shape[1] == 2:
+            return POV
+        cars = [row for row in range(self.motion.shape[1]) if row != VUT]
+        return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
+
+    def facing(self, car: int) -> Trajectory:
+        """Return the motion of the VUT and one car of the mainline, in the POV's row."""
+        return replace(self, motion=self.motion[:, [car, VUT]])
+
+    @property
+    def t_end_s(self) -> float:
+        """Time of the last row."""
+        return round((len(self.motion) - 1) * DT_S, 1)

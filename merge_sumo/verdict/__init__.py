@@ -1,0 +1,1 @@
+"""What is measured of an episode, when it fails, and by which margin."""

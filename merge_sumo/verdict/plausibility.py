@@ -1,0 +1,70 @@
+"""Doubts about the outcomes of a campaign, in sentences: what to know before believing them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from merge_sumo.scenario.scenario import DT_S
+from merge_sumo.system.printable import counted
+from merge_sumo.verdict.criteria import CRITERIA
+from merge_sumo.verdict.criterion import Criterion, condition_of, values_of
+from merge_sumo.verdict.score import Outcome
+
+KMH_PER_MPS: Final = 3.6
+CLIPPED_SHARE: Final = 0.01
+"""Share of the steps from which on it is said that accelerations were clipped."""
+_THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
+"""A measure, and the number that it is compared with."""
+
+
+def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
+    """Return sentences on what is odd about the outcomes of a campaign; none for most.
+
+    Of a criterion that says the same of all cases, a neighbour that would not.
+    """
+    return [*_clipped(outcomes), *_one_verdict(outcomes, criterion)]
+
+
+def _clipped(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield in how many steps a VUT asked for more than its limits, where that is often."""
+    clipped = sum(outcome.measures.clipped_steps for outcome in outcomes)
+    steps = sum(round(outcome.measures.t_end_s / DT_S) for outcome in outcomes)
+    if clipped and clipped >= CLIPPED_SHARE * steps:
+        scenario = outcomes[0].case.scenario
+        yield (
+            f"in {clipped} of {steps} steps the VUT asks for an acceleration outside "
+            f"{scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped"
+        )
+
+
+def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[str]:
+    """Yield a neighbour of a criterion that tells cases apart, where itself does not."""
+    judged = [outcome for outcome in outcomes if outcome.margin is not None]
+    failures = sum(outcome.failed for outcome in judged)
+    is_own = criterion.require is None and criterion.fail_when not in CRITERIA
+    if not is_own or 0 < failures < len(judged):
+        return
+    for text, why in _with_other_thresholds(criterion.words):
+        other = condition_of(text)
+        met = sum(other.margin(values_of(outcome.measures)) < 0.0 for outcome in judged)
+        if 0 < met < len(judged):
+            every = "every case fails" if failures else "no case fails"
+            yield (
+                f"{every} under {criterion.words}; with {text} ({why}) {met} of "
+                f"{counted(len(judged), 'case')} would"
+            )
+            return
+
+
+def _with_other_thresholds(condition: str) -> Iterator[tuple[str, str]]:
+    """Yield a condition with a threshold in another unit or of the other sign, and what it is."""
+    for found in _THRESHOLD.finditer(condition):
+        name, number = found[1], float(found[2])
+        others = [(-number, "the other sign")]
+        if name.endswith("_mps"):
+            others.insert(0, (number / KMH_PER_MPS, f"{number:g} km/h"))
+            others.append((number * KMH_PER_MPS, f"{number:g} m/s as km/h"))
+        for other, why in others if number else []:
+            yield f"{condition[: found.start(2)]}{other:.3g}{condition[found.end(2) :]}", why

@@ -1,0 +1,58 @@
+"""How severe an encounter is, by geometry alone: contact, conflict, harsh or safe.
+
+The four words are the same in records, terminal, report, history, exports and documentation. They
+follow from the bodies of the cars and from the braking that the state at M requires of the car
+behind; what counts as a failure is another question (`criterion.py`).
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from merge_sumo.scenario.scenario import MergeScenario, Scenario, lane_of
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.merge import HARSH_MPS2
+
+
+class Severity(StrEnum):
+    """Classes of encounters, the most severe first; an episode is of the first that fits."""
+
+    CONTACT = "contact"
+    CONFLICT = "conflict"
+    HARSH = "harsh"
+    SAFE = "safe"
+
+
+def meanings(scenario: Scenario) -> dict[Severity, str]:
+    """Return what the words mean in a scenario."""
+    if not isinstance(scenario, MergeScenario):
+        return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
+    follow_up_s = 0.0 if lane_of(scenario) is None else scenario.follow_up_s
+    soon = f"within {follow_up_s:g} s after" if follow_up_s else "right after"
+    found = {
+        Severity.CONTACT: f"bodies touch at M or {soon} it",
+        Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
+        Severity.HARSH: f"the rear car must brake harder than {HARSH_MPS2:g} m/s² after M",
+        Severity.SAFE: "none of these",
+    }
+    return {severity: scenario.said(meaning) for severity, meaning in found.items()}
+
+
+def severity_of(
+    end: End, clearance_m: float, *, is_close: bool, brake_mps2: float
+) -> Severity | None:
+    """Return the class of an encounter; None where the VUT never reached M.
+
+    Args:
+        end: why the episode ended.
+        clearance_m: smallest clearance of bodies from M on.
+        is_close: whether the front bumpers were nearer at M than the paper allows.
+        brake_mps2: deceleration that the car behind at M needs.
+    """
+    if not end.is_tested:
+        return None
+    if clearance_m <= 0.0:
+        return Severity.CONTACT
+    if is_close:
+        return Severity.CONFLICT
+    return Severity.HARSH if brake_mps2 > HARSH_MPS2 else Severity.SAFE

@@ -1,0 +1,284 @@
+"""The verdict on a campaign: what was not tested, gates, JUnit, and the exit codes."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import signal
+from pathlib import Path
+
+import pytest
+from calling import invoke
+from campaigning import campaign_settings, run_campaign
+from handmade import write_run
+from lxml import etree
+from typer.testing import Result
+
+import merge_sumo as ms
+from merge_sumo.campaigns.run import failures, read_settings
+from merge_sumo.errors import UserError
+from merge_sumo.reports.junit import check_junit, write_junit
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.system.interrupt import Stopped
+from merge_sumo.system.printable import counted, printable
+from merge_sumo.verdict.campaign_verdict import Gate, judge, parse_gates
+from merge_sumo.verdict.summary import LevelSummary, Summary, summarise
+
+HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
+VUTS = {
+    "raises": "raise RuntimeError('boom')",
+    "stops": "return -4.0",
+    "mixed": "assert seen.v_pov_mps < 33, 'fast'; return 1.0 if seen.v_pov_mps < 30 else -4.0",
+}
+
+
+@pytest.fixture(scope="module")
+def vuts(tmp_path_factory) -> dict[str, str]:
+    """Return by name what goes behind --vut: one raises, one stops, one does both at times."""
+    folder = tmp_path_factory.mktemp("vuts")
+    specs = {}
+    for name, body in VUTS.items():
+        (folder / f"{name}.py").write_text(f"def act(seen):\n    {body}\n")
+        specs[name] = f"{folder / name}.py:act"
+    return specs
+
+
+def campaign(vut: str, folder: Path, *options: object) -> Result:
+    small = (
+        *("--level", 0, "--cases", 20, "--seed", 1, "--sampler", "uniform"),
+        "-q",
+    )
+    return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
+
+
+class TestErrorsAndTimeouts:
+    def test_are_grouped_by_message_errors_first_then_the_most_frequent(self, tmp_path):
+        errors = {2: "boom", 5: "other", 6: "other"}
+        timeouts = (0, 1, 3, 4)
+        run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=timeouts)
+        found = judge(run.outcomes)
+        assert [(t.end, t.message, t.cases) for t in found.troubles] == [
+            (End.VUT_ERROR, "other", (5, 6)),
+            (End.VUT_ERROR, "boom", (2,)),
+            (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
+        ]
+        assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
+        number = len(failures(run.outcomes))
+        assert found.found == ["3 errors", "4 timeouts", counted(number, "failure")]
+        contacts = counted(found.contacts, "contact")
+        assert found.counts.endswith(f"{counted(number, 'failure')} ({contacts}) in 10 cases")
+
+
+def summary_of(fmc: float, level: int = 1) -> Summary:
+    levels = {0: LevelSummary(10, 10, 0, {}, 0.0, 0), level: LevelSummary(10, 10, 1, {}, fmc, 1)}
+    return Summary(20, 1, {"MERGED": 20}, {}, levels)
+
+
+class TestAGate:
+    def test_has_a_name_however_it_is_written_and_is_there_once(self):
+        gates = parse_gates(["errors", "fmc>0.05", "fmc > 0.050", "errors", "timeouts"])
+        assert [gate.name for gate in gates] == ["errors", "fmc>0.05", "timeouts"]
+
+    @pytest.mark.parametrize(
+        "text", ["", "fmc", "error", "FMC>0.1", "failures>3", "fmc<0.1", "\x1b"]
+    )
+    def test_that_is_none_is_refused(self, text):
+        with pytest.raises(UserError, match="choose failures, errors"):
+            parse_gates([text])
+
+    @pytest.mark.parametrize(("fmc", "met"), [(0.05, False), (0.0501, True), (0.0, False)])
+    def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, tmp_path, fmc, met):
+        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc))
+        assert found.met is met
+        level = 1 if fmc else 0
+        assert found.sentence == (
+            f"gate fmc>0.05: {'met' if met else 'not met'} (FMC {fmc:.4f} at level {level})"
+        )
+
+    def test_on_cases_is_met_by_one_of_them(self, tmp_path):
+        run = write_run(tmp_path / "run", 20, levels=(0,), errors={0: "x"}, timeouts=(1,))
+        summary = summarise(run.outcomes, (0,))
+        for name in ("failures", "errors", "timeouts"):
+            assert Gate(name).check(judge(run.outcomes), summary).met
+            assert not Gate(name).check(judge([]), summary).met
+
+
+def read_junit(file: Path) -> etree._Element:
+    root = etree.parse(file).getroot()
+    etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd"))).assertValid(root)
+    return root
+
+
+class TestJUnit:
+    @pytest.fixture
+    def root(self, tmp_path) -> etree._Element:
+        run = write_run(
+            *(tmp_path / "run", 20, (0, 2)),
+            vut=HOSTILE.replace("\ud800", ""),
+            errors={3: HOSTILE},
+            timeouts=(4, 6),
+        )
+        opened = ms.open_run(run.folder)
+        gates = [Gate(name).check(opened.verdict, opened.summary) for name in ("errors", "fmc")]
+        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.verdict, gates)
+        self.run = run
+        return read_junit(tmp_path / "junit.xml")
+
+    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, root):
+        assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
+        names = root.xpath("//testcase/@name")
+        assert len(set(names)) == len(names) == 3 + 40
+        found = judge(self.run.outcomes)
+        for suite, level in zip(root[1:], (0, 2), strict=True):
+            at = [o for o in self.run.outcomes if o.case.level == level]
+            assert suite.get("tests") == "20"
+            errors = sum(o.measures.end.is_error for o in at)
+            wrong = sum(o.failed or o.measures.end is End.TIMEOUT for o in at)
+            assert (suite.get("errors"), suite.get("failures")) == (str(errors), str(wrong))
+            assert float(suite.get("time")) == pytest.approx(sum(o.measures.t_end_s for o in at))
+        assert root.get("errors") == "1"
+        assert root.get("failures") == str(found.failures + 2 + 2), "and both gates are met"
+
+    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, root):
+        (error,) = root.xpath("//error")
+        assert error.get("type") == "VUT_ERROR"
+        said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
+        assert error.get("message") == error.text == said
+
+    def test_fails_where_nothing_was_tested(self, tmp_path):
+        run = write_run(tmp_path / "run", 4, levels=(0,), timeouts=range(4))
+        write_junit(tmp_path / "junit.xml", run, [], judge(run.outcomes), [])
+        (failure,) = read_junit(tmp_path / "junit.xml").iter("failure")
+        assert failure.text.startswith("nothing was tested")
+
+    def test_is_refused_where_something_is_or_nothing_can_be(self, tmp_path):
+        folder = tmp_path / "run"
+        (tmp_path / "file").write_text("mine")
+        (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+        for name in ("file", "link", "."):
+            with pytest.raises(UserError, match="exists"):
+                check_junit(tmp_path / name, folder)
+        with pytest.raises(UserError, match="the folder of the campaign"):
+            check_junit(folder, folder)
+        with pytest.raises(UserError, match="there is no folder"):
+            check_junit(tmp_path / "no" / "junit.xml", folder)
+        check_junit(folder / "junit.xml", folder)  # the campaign makes that folder
+        check_junit(tmp_path / "junit.xml", folder)
+
+
+class TestACampaignThatTestedNothing:
+    @pytest.mark.parametrize(
+        ("name", "counts", "message"),
+        [
+            ("raises", "20 errors and 0 failures in 20 cases", "20 VUT_ERROR, the first in case 0"),
+            ("stops", "20 timeouts and 0 failures in 20 cases", "20 TIMEOUT, the first in case 0"),
+        ],
+    )
+    def test_exits_with_1_and_says_why_first(self, vuts, tmp_path, name, counts, message):
+        said = campaign(vuts[name], tmp_path / "run")
+        assert said.exit_code == 1
+        first, second, _, level, *_ = said.stdout.splitlines()
+        assert first == counts
+        assert second.strip().startswith(message)
+        assert level.split()[:3] == ["0", "20", "20"]
+        without = " without an error" if name == "raises" else ""
+        assert said.stderr.endswith(f"the VUT reached the merge point{without} in no case\n")
+        assert "Nothing was tested." in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def mixed(vuts, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("mixed") / "run"
+    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, seed=1)
+    found = judge(run_campaign(settings, folder).outcomes)
+    assert min(found.errors, found.timeouts, found.tested) > 0
+    return folder
+
+
+def again(folder: Path, vuts: dict[str, str]) -> tuple[object, ...]:
+    """Return how to go on with the mixed campaign, whose folder names no code to run."""
+    return ("--resume", folder, "--vut", vuts["mixed"])
+
+
+class TestACampaignWithGates:
+    @pytest.mark.parametrize(
+        ("gates", "code"),
+        [
+            ((), 0),
+            (("errors",), 1),
+            (("fmc>0.99", "timeouts"), 1),
+        ],
+    )
+    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, vuts, mixed, gates, code):
+        before = (mixed / "campaign.json").read_bytes()
+        options = [word for gate in gates for word in ("--gate", gate)]
+        said = invoke("campaign", *again(mixed, vuts), "-q", "--json", *options)
+        assert said.exit_code == code
+        found = json.loads(said.stdout)
+        assert found["passed"] is (code == 0)
+        assert found["gates"] == {gate: gate in ("errors", "timeouts") for gate in gates}
+        assert said.stderr.count("gate ") == len(gates)
+        assert (mixed / "campaign.json").read_bytes() == before
+
+    def test_writes_junit_and_never_over_a_file(self, vuts, tmp_path, mixed):
+        file = tmp_path / "junit.xml"
+        options = ("--junit", file, "--gate", "errors")
+        assert campaign(vuts["mixed"], tmp_path / "run", *options).exit_code == 1
+        root = read_junit(file)
+        assert root.get("tests") == "22"
+        before = file.read_bytes()
+        for words in (
+            ("--vut", "design2", "--level", 0, "--cases", 4, "--out", tmp_path / "other"),
+            again(mixed, vuts),
+        ):
+            said = invoke("campaign", *words, "--junit", file)
+            assert isinstance(said.exception, UserError)
+            assert "choose another name with `junit`" in str(said.exception)
+        assert not (tmp_path / "other").exists()
+        assert file.read_bytes() == before
+
+    def test_that_is_stopped_says_them_in_the_command_that_goes_on(self, tmp_path, monkeypatch):
+        def stop(self) -> None:
+            raise Stopped(signal.SIGINT)
+
+        monkeypatch.setattr("merge_sumo.system.interrupt.Interrupt.check", stop)
+        said: list = []
+        monkeypatch.setattr("merge_sumo.commands.printing.say", said.append)
+        file = tmp_path / "a file.xml"
+        with pytest.raises(Stopped):
+            campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)
+        assert said[-1].endswith(f"--gate 'fmc>0.5' --junit '{file}'")
+        assert not file.exists()
+
+
+def test_a_campaign_that_converged_says_so(tmp_path, monkeypatch):
+    def check() -> None:
+        raise Stopped(signal.SIGINT)
+
+    folder = tmp_path / "run"
+    settings = campaign_settings(vut="design2", sampler="annealing", cases=20, batch=10, seed=1)
+    with pytest.raises(Stopped):
+        run_campaign(settings, folder, check=check)
+    changed = read_settings(folder) | {"sampler": "coverage", "stop_when_converged": True}
+    (folder / "campaign.json").write_text(json.dumps(changed))
+    rule = "merge_sumo.campaigns.settings.has_converged"
+    monkeypatch.setattr(rule, lambda outcomes, tolerated: True)
+    text = invoke("campaign", "--resume", folder, "-q")
+    assert text.exit_code == 0, text.exception
+    assert text.stdout.startswith("stopped after 10 of 20 cases")
+
+
+def test_errors_and_timeouts_are_tables_in_python(tmp_path):
+    made = write_run(*(tmp_path / "run", 10, (0,)), errors={1: "<b>x</b>\x1b"}, timeouts=(2, 3))
+    opened = ms.open_run(made.folder)
+    assert [row["index"] for row in opened.errors] == [1]
+    assert [row["index"] for row in opened.timeouts] == [2, 3]
+    assert repr(opened).startswith(f"<campaign {made.folder}: 1 error, 2 timeouts and ")
+    assert "<b>x</b>" not in opened._repr_html_() + opened.errors._repr_html_()
+    assert "&lt;b&gt;x&lt;/b&gt;" in opened.errors._repr_html_()
+
+
+def test_what_prints_is_left_as_it_is():
+    assert printable("straße 一 <&>") == "straße 一 <&>"
+    assert printable("\r\t\x7f\u2028") == "\\r\\t\\x7f\\u2028"
