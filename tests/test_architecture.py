@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -300,7 +301,13 @@ class TestImports:
         commands = {f for f in files_below("commands") if f.stem not in beside}
         assert len(commands) > 1
         allowed = {
-            *("merge_sumo.api", "merge_sumo.errors", "merge_sumo.options", "merge_sumo.commands")
+            *(
+                "merge_sumo.api",
+                "merge_sumo.errors",
+                "merge_sumo.options",
+                "merge_sumo.verbs",
+                "merge_sumo.commands",
+            )
         }
         others = {
             module_of(file): {
@@ -337,6 +344,69 @@ class TestImports:
 def test_no_file_runs_a_shell_or_hidden_code_follows_an_entity_or_listens_beyond_loopback(check):
     found = {module_of(file): check(file.read_text(encoding="utf-8")) for file in FILES}
     assert {module: calls for module, calls in found.items() if calls} == {}
+
+
+LINES_OF_A_FILE = 600
+LINES_OF_A_FUNCTION = 60
+
+
+def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
+    long = {}
+    for file in FILES:
+        source = file.read_text(encoding="utf-8")
+        if (lines := len(source.splitlines())) > LINES_OF_A_FILE:
+            long[module_of(file)] = lines
+        for node in nodes_of(source):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = (node.end_lineno or 0) - node.lineno + 1
+                if lines > LINES_OF_A_FUNCTION:
+                    long[f"{module_of(file)}.{node.name}"] = lines
+    assert long == {}
+
+
+def test_no_two_classes_have_one_name():
+    files = defaultdict(list)
+    for file in FILES:
+        for node in nodes_of(file.read_text(encoding="utf-8")):
+            if isinstance(node, ast.ClassDef):
+                files[node.name].append(module_of(file))
+    assert {name: known for name, known in files.items() if len(known) > 1} == {}
+
+
+FLAG = re.compile(r"^[^-].*[ (`]--[a-z]")
+"""A flag behind a word: what begins with one is an argument of a program."""
+A_COMMAND = re.compile(r"(?:merge-sumo|pip|netconvert) ")
+
+
+def flags_in_messages(source: str) -> list[str]:
+    """Return the texts of a source that name a flag, but for those that give a command to copy."""
+    prose = {node.value for node in nodes_of(source) if isinstance(node, ast.Expr)}
+    parts = {
+        part for node in nodes_of(source) if isinstance(node, ast.JoinedStr) for part in node.values
+    }
+    texts = [
+        ast.unparse(node)
+        for node in nodes_of(source)
+        if isinstance(node, ast.JoinedStr)
+        or (isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in parts)
+        if node not in prose
+    ]
+    return [
+        text for text in texts if FLAG.search(text.lstrip("f'\" ")) and not A_COMMAND.search(text)
+    ]
+
+
+def test_no_message_below_the_commands_names_a_flag():
+    """A message names a field in backticks; a command turns it into its flag."""
+    others = [
+        file
+        for file in FILES
+        if file.relative_to(PACKAGE).parts[0] not in ("commands", "sumo") and file.parent != PACKAGE
+    ]
+    found = {
+        module_of(file): flags_in_messages(file.read_text(encoding="utf-8")) for file in others
+    }
+    assert {module: texts for module, texts in found.items() if texts} == {}
 
 
 def test_what_removes_files_is_in_one_place():

@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from merge_sumo import options
+from merge_sumo import options, verbs
 from merge_sumo.api.asked import (
     opened,
     opened_study,
@@ -110,8 +110,8 @@ __all__ += ["truth", "vuts"]
 # Campaigns
 
 
-@verb(options.Campaign)
-def campaign(asked: options.Campaign) -> CampaignRun:
+@verb(verbs.Campaign)
+def campaign(asked: verbs.Campaign) -> CampaignRun:
     """Test a VUT and return the campaign, also one without failures."""
     settings, where = settings_for(asked)
     folder = dated(settings.vut) if asked.out is None else Path(asked.out)
@@ -120,8 +120,8 @@ def campaign(asked: options.Campaign) -> CampaignRun:
     return concluded(settings, plan, folder, where, asked)
 
 
-@verb(options.Resume)
-def resume(asked: options.Resume) -> CampaignRun:
+@verb(verbs.Resume)
+def resume(asked: verbs.Resume) -> CampaignRun:
     """Go on with a campaign that was stopped."""
     folder = folder_of(asked.run)
     recorded = read_settings(folder)
@@ -145,8 +145,8 @@ def open_run(folder: AnyPath) -> CampaignRun:
 # Cases
 
 
-@verb(options.Case)
-def run(asked: options.Case) -> CaseRun:
+@verb(verbs.RunCase)
+def run(asked: verbs.RunCase) -> CaseRun:
     """Run one case and return it."""
     settings, case = given_case(asked) if asked.recorded is None else recorded_case(asked)
     if asked.out is not None:
@@ -166,8 +166,8 @@ def run(asked: options.Case) -> CaseRun:
     return CaseRun(run_one(plan, case, live=asked.gui, on_end=ended))
 
 
-@verb(options.Rerun)
-def rerun(asked: options.Rerun) -> Comparison:
+@verb(verbs.Rerun)
+def rerun(asked: verbs.Rerun) -> Comparison:
     """Run recorded cases again with a changed VUT."""
     before = campaign_of(asked.run).run
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
@@ -176,8 +176,8 @@ def rerun(asked: options.Rerun) -> Comparison:
         return comparison.rerun(study, chosen)
 
 
-@verb(options.Export)
-def export(asked: options.Export) -> list[Path]:
+@verb(verbs.Export)
+def export(asked: verbs.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
     loaded, export_format = campaign_of(asked.run).run, FORMATS[asked.file_format]
     given = asked.indices
@@ -242,8 +242,8 @@ def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
 # Studies
 
 
-@verb(options.Compare)
-def compare(asked: options.Compare) -> Comparison:
+@verb(verbs.Compare)
+def compare(asked: verbs.Compare) -> Comparison:
     """Compare recorded campaigns: what broke, and what was fixed."""
     if isinstance(asked.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
@@ -260,16 +260,16 @@ def compare(asked: options.Compare) -> Comparison:
     return compared
 
 
-@verb(options.Truth)
-def truth(asked: options.Truth) -> TruthResult:
+@verb(verbs.GroundTruth)
+def truth(asked: verbs.GroundTruth) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases."""
     settings, where = settings_for(asked)
     with opened_truths(settings, where, asked.engine) as study:
         return study.truths(settings, asked)
 
 
-@verb(options.Benchmark)
-def benchmark(asked: options.Benchmark) -> SamplerStudy:
+@verb(verbs.Benchmark)
+def benchmark(asked: verbs.Benchmark) -> SamplerStudy:
     """Compare samplers with each other and with the ground truth."""
     picture = path_of(asked.figure)
     if picture is not None:
@@ -287,8 +287,8 @@ def benchmark(asked: options.Benchmark) -> SamplerStudy:
     return replace(result, figure=picture)
 
 
-@verb(options.Probability)
-def probability(asked: options.Probability) -> ProbabilityResult:
+@verb(verbs.Probability)
+def probability(asked: verbs.Probability) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail."""
     before = campaign_of(asked.run).run
     target = path_of(asked.out) or before.folder / PROBABILITY.name
@@ -297,8 +297,8 @@ def probability(asked: options.Probability) -> ProbabilityResult:
         return estimates.failure_probability(study, asked, target)
 
 
-@verb(options.Stress)
-def stress(asked: options.Stress) -> StressResult:
+@verb(verbs.Stress)
+def stress(asked: verbs.Stress) -> StressResult:
     """Run the cases of a campaign again, each time a little otherwise."""
     before = campaign_of(asked.run).run
     STRESS.check(before.folder)
@@ -307,8 +307,8 @@ def stress(asked: options.Stress) -> StressResult:
         return ladder.stress(study)
 
 
-@verb(options.Repair)
-def repair(asked: options.Repair) -> RepairResult:
+@verb(verbs.Repair)
+def repair(asked: verbs.Repair) -> RepairResult:
     """Search for values of a controller's parameters that repair it."""
     mending.ranges_of(asked)
     before = campaign_of(asked.run).run
@@ -330,7 +330,7 @@ def repair(asked: options.Repair) -> RepairResult:
             def on_case(_: object) -> None:
                 bars.counted(f"fresh campaign {number}", next(number_of), total, "cases")
 
-            of_plan, listening = resolve(of_round), options.SearchOfTest(on_case=on_case)
+            of_plan, listening = resolve(of_round), verbs.SearchOfTest(on_case=on_case)
             quietly = replace(where, progress=False)
             return concluded(of_round, of_plan, to, quietly, listening, workers=workers).run
 
@@ -340,8 +340,8 @@ def repair(asked: options.Repair) -> RepairResult:
     return found
 
 
-@verb(options.Explain)
-def explain(asked: options.Explain) -> ExplanationResult:
+@verb(verbs.Explain)
+def explain(asked: verbs.Explain) -> ExplanationResult:
     """Find the smallest changes with which a failure passes."""
     before = campaign_of(asked.run).run
     EXPLANATIONS.check(before.folder)
@@ -351,8 +351,8 @@ def explain(asked: options.Explain) -> ExplanationResult:
         return explanation.explain(study, asked.case, ranges)
 
 
-@verb(options.Reproduce)
-def reproduce(asked: options.Reproduce) -> Reproduction:
+@verb(verbs.Reproduce)
+def reproduce(asked: verbs.Reproduce) -> Reproduction:
     """Reproduce Table II and the figures of the paper."""
     scale = reproduction.scale_of(asked)
     policies, folder = policies_folder(asked.policies, US23), path_of(asked.out)
@@ -369,14 +369,14 @@ def reproduce(asked: options.Reproduce) -> Reproduction:
 # What a person brings: VUTs, scenarios, learned drivers
 
 
-@verb(options.Vuts)
-def vuts(asked: options.Vuts) -> Shown:
+@verb(verbs.Vuts)
+def vuts(asked: verbs.Vuts) -> Shown:
     """Return the VUTs that can be tested, and the kinds that a person can bring."""
     return vut_check.known_vuts(asked.policies)
 
 
-@verb(options.CheckVut)
-def check_vut(asked: options.CheckVut) -> VutCheck:
+@verb(verbs.CheckVut)
+def check_vut(asked: verbs.CheckVut) -> VutCheck:
     """Let a VUT drive a few cases and say what is wrong with it."""
     spec, _, _ = drivers_of(asked.vut, None, 1)
     scenario = US23 if asked.scenario is None else scenario_of(asked.scenario)
@@ -393,14 +393,14 @@ def scenarios() -> Shown:
     return own_scenario.shipped()
 
 
-@verb(options.NewScenario)
-def new_scenario(asked: options.NewScenario) -> Shown:
+@verb(verbs.NewScenario)
+def new_scenario(asked: verbs.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road."""
     return own_scenario.write_scenario(asked)
 
 
-@verb(options.CheckScenario)
-def check_scenario(asked: options.CheckScenario) -> Shown:
+@verb(verbs.CheckScenario)
+def check_scenario(asked: verbs.CheckScenario) -> Shown:
     """Say whether a scenario can be hosted, and whether the learned drivers were trained on it."""
     folder = None if asked.policies is None else policies_in(asked.policies)
     scenario = scenario_of(asked.scenario)
@@ -408,8 +408,8 @@ def check_scenario(asked: options.CheckScenario) -> Shown:
     return own_scenario.check_scenario(scenario, name, folder)
 
 
-@verb(options.Train)
-def train(asked: options.Train) -> PolicyChecks:
+@verb(verbs.Train)
+def train(asked: verbs.Train) -> PolicyChecks:
     """Train the learned drivers in SUMO and return what each loses, by the name of the network."""
     for package in ("torch", "gymnasium"):
         if find_spec(package) is None:

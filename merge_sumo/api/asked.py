@@ -19,8 +19,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.options import (
     AnyPath,
     Asked,
-    Benchmark,
-    Campaign,
     Execution,
     Hosting,
     Judged,
@@ -28,9 +26,7 @@ from merge_sumo.options import (
     OfScenario,
     Recorded,
     Search,
-    SearchOfTest,
     Test,
-    Truth,
 )
 from merge_sumo.reports.progress import Bars, Counter
 from merge_sumo.road.scenario_file import named_scenario
@@ -39,6 +35,7 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
+from merge_sumo.verbs import Benchmark, Campaign, GroundTruth, SearchOfTest
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 
 
@@ -118,7 +115,7 @@ def scenario_of(
 
 
 def settings_for(
-    asked: Campaign | Truth | Benchmark, **search: Any
+    asked: Campaign | GroundTruth | Benchmark, **search: Any
 ) -> tuple[CampaignSettings, Execution]:
     """Return the settings of a campaign that is asked for, or of a study, and where it runs.
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
-from merge_sumo import options
+from merge_sumo import options, verbs
 from merge_sumo.api.asked import opened
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
@@ -35,7 +35,7 @@ def concluded(
     plan: SimulationPlan,
     folder: Path,
     where: options.Execution,
-    asked: options.SearchOfTest,
+    asked: verbs.SearchOfTest,
     *,
     goes_on: bool = False,
     workers: Workers | None = None,
@@ -111,7 +111,7 @@ def _write_findings(
 
 
 def notice_untrained(
-    settings: CampaignSettings, plan: SimulationPlan, asked: options.Campaign
+    settings: CampaignSettings, plan: SimulationPlan, asked: verbs.Campaign
 ) -> None:
     """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
     levels = set(LEVELS) & set(settings.scenario.levels)

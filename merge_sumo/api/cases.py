@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from merge_sumo import options
+from merge_sumo import options, verbs
 from merge_sumo.api.asked import scenario_of, settings_in, stated_again
 from merge_sumo.api.results import campaign_of
 from merge_sumo.campaigns.one_case import ONE, case_of
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from merge_sumo.scenario.case import Case
 
 
-def recorded_case(asked: options.Case) -> tuple[CampaignSettings, Case]:
+def recorded_case(asked: verbs.RunCase) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     assert asked.recorded is not None, "one of a campaign"  # noqa: S101
     fields, _ = stated_again(asked, asked.vut, {})
@@ -37,7 +37,7 @@ def recorded_case(asked: options.Case) -> tuple[CampaignSettings, Case]:
     return settings, replace(case, draw=before.draw)
 
 
-def given_case(asked: options.Case) -> tuple[CampaignSettings, Case]:
+def given_case(asked: verbs.RunCase) -> tuple[CampaignSettings, Case]:
     """Return a case by its coordinates, which win over those of a row, and how it is run."""
     if asked.vut is None:
         raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
@@ -60,7 +60,7 @@ def given_case(asked: options.Case) -> tuple[CampaignSettings, Case]:
         raise UserError(f"draw is {draw!r:.60}: it must be a whole number") from None
 
 
-def _coordinates(asked: options.Case) -> dict[str, float]:
+def _coordinates(asked: verbs.RunCase) -> dict[str, float]:
     """Return the coordinates that are stated."""
-    named = {name: getattr(asked, name) for name in options.COORDINATES}
+    named = {name: getattr(asked, name) for name in verbs.COORDINATES}
     return {**{n: x for n, x in named.items() if x is not None}, **(asked.at or {})}

@@ -55,7 +55,7 @@ def kind_of_merge(road: Corridor) -> list[str]:
     lane = road.acceleration_lane
     if lane is None:
         why = (
-            "the lane that ends is that of the mainline (exchange --mainline and --ramp?)"
+            "the lane that ends is that of the mainline (exchange `mainline` and `ramp`?)"
             if road.lane_drop
             else "ramp and mainline have no lanes side by side before it"
         )
@@ -66,7 +66,7 @@ def kind_of_merge(road: Corridor) -> list[str]:
     )
     if road.lane_m is not None:
         mark = ", and the net marks it" if lane.is_marked else ""
-        lines = [f"kind: acceleration lane, because {beside}{mark}; `--point` makes M a point"]
+        lines = [f"kind: acceleration lane, because {beside}{mark}; `point` makes M a point"]
     elif lane.gives_a_choice:
         lines = [f"kind: merge at the point M, as asked for, although {beside}"]
     else:

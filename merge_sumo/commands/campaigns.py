@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from merge_sumo import options
+from merge_sumo import options, verbs
 from merge_sumo.commands.application import Given, app
 from merge_sumo.commands.printing import folder_of, print_json, quoted, say, show, stoppable
 from merge_sumo.errors import UserError
@@ -28,7 +28,7 @@ VutOption = Annotated[
 RunArgument = Annotated[Path, typer.Argument(help="Folder of a campaign.")]
 
 
-@app.verb(options.Campaign)
+@app.verb(verbs.Campaign)
 def campaign(
     given: Given,
     vut: VutOption = "",
@@ -73,7 +73,7 @@ def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
 
 
-@app.verb(options.Case)
+@app.verb(verbs.RunCase)
 def run(
     given: Given,
     case: Annotated[
@@ -124,7 +124,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
     return values
 
 
-@app.verb(options.Rerun)
+@app.verb(verbs.Rerun)
 def rerun(
     given: Given,
     run: RunArgument,
@@ -155,7 +155,7 @@ def rerun(
     raise typer.Exit(1 if result.worse else 0)
 
 
-@app.verb(options.Compare)
+@app.verb(verbs.Compare)
 def compare(
     given: Given,
     runs: Annotated[
@@ -170,7 +170,7 @@ def compare(
     raise typer.Exit(1 if result.worse else 0)
 
 
-@app.verb(options.Export)
+@app.verb(verbs.Export)
 def export(
     given: Given,
     run: RunArgument,

@@ -7,21 +7,21 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.commands.application import PANEL_OF, Commands, Given, app
 
 scenario = Commands(help="The road and the numbers of a merge.", no_args_is_help=True)
 app.add_typer(scenario, name="scenario", rich_help_panel=PANEL_OF["scenario"])
 
 
-@app.verb(options.Vuts)
+@app.verb(verbs.Vuts)
 def vuts(given: Given) -> None:
     from merge_sumo import api
 
     given.print(api.vuts(**given.keywords))
 
 
-@app.verb(options.CheckVut, "check-vut")
+@app.verb(verbs.CheckVut, "check-vut")
 def check_vut(
     given: Given,
     vut: Annotated[
@@ -47,7 +47,7 @@ def list_scenarios(given: Given) -> None:
     given.print(api.scenarios())
 
 
-@scenario.verb(options.NewScenario, "new")
+@scenario.verb(verbs.NewScenario, "new")
 def new_scenario(
     given: Given, file: Annotated[Path, typer.Argument(help="New TOML file to write.")]
 ) -> None:
@@ -56,7 +56,7 @@ def new_scenario(
     given.print(api.new_scenario(file, **given.keywords))
 
 
-@scenario.verb(options.CheckScenario, "check")
+@scenario.verb(verbs.CheckScenario, "check")
 def check_scenario(
     given: Given,
     name: Annotated[
@@ -69,7 +69,7 @@ def check_scenario(
     given.print(api.check_scenario(name, **given.keywords))
 
 
-@app.verb(options.Train)
+@app.verb(verbs.Train)
 def train(given: Given) -> None:
     from merge_sumo import api
 

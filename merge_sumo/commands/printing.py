@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
 
-from merge_sumo import options
+from merge_sumo import options, verbs
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Interrupt, Stopped
@@ -40,7 +40,7 @@ def say(line: str) -> None:
 @cache
 def _flags() -> dict[str, str]:
     """Return the option of the command line by the keyword of Python."""
-    records = [one for one in vars(options).values() if is_dataclass(one) and isinstance(one, type)]
+    records = [one for one in vars(verbs).values() if is_dataclass(one) and isinstance(one, type)]
     known = {
         name: max(options.flags_of(name, one), key=len)
         for record in records
@@ -69,7 +69,8 @@ def print_result(result: Result, *, as_json: bool, **more: object) -> None:
     if as_json:
         print_json({**result.to_record(), **paths})
         return
-    for line in (*result.lines(), *(f"{name}: {path}" for name, path in paths.items())):
+    lines = map(_in_flags, result.lines())
+    for line in (*lines, *(f"{name}: {path}" for name, path in paths.items())):
         show(line)
 
 

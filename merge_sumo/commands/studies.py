@@ -6,26 +6,26 @@ from typing import Annotated
 
 import typer
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.commands.application import Given, app
 from merge_sumo.commands.campaigns import RunArgument, VutOption
 
 
-@app.verb(options.Truth)
+@app.verb(verbs.GroundTruth)
 def truth(given: Given, vut: VutOption) -> None:
     from merge_sumo import api
 
     given.print(api.truth(vut, **given.keywords))
 
 
-@app.verb(options.Benchmark)
+@app.verb(verbs.Benchmark)
 def benchmark(given: Given, vut: VutOption) -> None:
     from merge_sumo import api
 
     given.print(api.benchmark(vut, **given.keywords))
 
 
-@app.verb(options.Probability)
+@app.verb(verbs.Probability)
 def probability(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
@@ -33,7 +33,7 @@ def probability(given: Given, run: RunArgument) -> None:
     given.print(api.probability(run, **given.written), file=file)
 
 
-@app.verb(options.Explain)
+@app.verb(verbs.Explain)
 def explain(
     given: Given,
     run: RunArgument,
@@ -47,7 +47,7 @@ def explain(
     given.print(api.explain(run, case, **given.written))
 
 
-@app.verb(options.Repair)
+@app.verb(verbs.Repair)
 def repair(given: Given, run: RunArgument) -> None:
     from merge_sumo import api
 
@@ -56,7 +56,7 @@ def repair(given: Given, run: RunArgument) -> None:
     raise typer.Exit(0 if result.verified else 1)
 
 
-@app.verb(options.Reproduce)
+@app.verb(verbs.Reproduce)
 def reproduce(given: Given) -> None:
     from merge_sumo import api
 

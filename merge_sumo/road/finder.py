@@ -68,15 +68,7 @@ def find_corridor(
         shared = _placed(net, _continued(onward, room_after_m - end_m), end_m, pieces[-1])
         paths.append(LanePath((*pieces, *shared)))
     junction_id, junction_type = net.junction(meeting.ramp.source)
-    approaches = []
-    for link, other in permutations((meeting.mainline, meeting.ramp)):
-        if meeting.drop is not None:
-            yields = link is meeting.drop
-        elif junction_type.startswith("traffic_light"):
-            yields = link is meeting.ramp
-        else:
-            yields = net.yields(link, other)
-        approaches.append(Approach(link.state, yields, link.visibility_m))
+    mainline_approach, ramp_approach = _approaches(net, meeting, junction_type)
     used = {piece.lane for path in paths for piece in path.pieces}
     near = net.lanes_near(shared[0].shape[0], SURROUNDINGS_M)
     return Corridor(
@@ -88,14 +80,28 @@ def find_corridor(
         ramp=paths[1],
         junction_type=junction_type,
         junction_id=junction_id,
-        mainline_approach=approaches[0],
-        ramp_approach=approaches[1],
+        mainline_approach=mainline_approach,
+        ramp_approach=ramp_approach,
         lane_drop=meeting.drop is not None,
         drawn_after_m=end_m + _length_m(onward),
         surroundings=tuple(lane.shape for lane in near if lane.id not in used),
         lane_m=lane_m and (begin_m, end_m),
         acceleration_lane=_lane_of_road(net, meeting, along, end_m if lane_m else None),
     )
+
+
+def _approaches(net: NetFile, meeting: _Meeting, junction_type: str) -> list[Approach]:
+    """Return how mainline and ramp come to the junction."""
+    approaches = []
+    for link, other in permutations((meeting.mainline, meeting.ramp)):
+        if meeting.drop is not None:
+            yields = link is meeting.drop
+        elif junction_type.startswith("traffic_light"):
+            yields = link is meeting.ramp
+        else:
+            yields = net.yields(link, other)
+        approaches.append(Approach(link.state, yields, link.visibility_m))
+    return approaches
 
 
 _Edges = tuple[str, ...]

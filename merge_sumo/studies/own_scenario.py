@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
     kind_of_merge,
@@ -38,7 +38,7 @@ def shipped() -> Shown:
     return Shown({name: scenario.to_record() for name, scenario in known.items()}, lines)
 
 
-def write_scenario(asked: options.NewScenario) -> Shown:
+def write_scenario(asked: verbs.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road.
 
     Raises `UserError` for a net without such a merge, and where something is there.
@@ -78,7 +78,7 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
             "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
             *(f"  {sentence}" for sentence in differing),
             f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
-            f"then add to a campaign: --policies {made}",
+            f"then name it to campaigns with `policies`: {made}",
         ]
     elif isinstance(scenario, MergeScenario):
         lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or like ones"]

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
@@ -227,9 +227,7 @@ class Counted(NamedTuple):
     without_verdict: int
 
 
-def failure_probability(
-    study: RunStudy, asked: options.Probability, out: Path
-) -> ProbabilityResult:
+def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases; write it to a file.
 
     Raises `UserError` for a distribution, a traffic or numbers that make no sense, for a campaign
@@ -284,7 +282,7 @@ def failure_probability(
     return result
 
 
-def _check(asked: options.Probability, cases: int) -> None:
+def _check(asked: verbs.Probability, cases: int) -> None:
     if asked.distribution is not None and asked.traffic is not None:
         raise UserError("choose a distribution or a traffic: a traffic states its own")
     for name, number, fits, bounds in (

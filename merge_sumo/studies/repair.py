@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import numpy as np
 from msgspec import Meta, field
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import RADIUS
@@ -269,7 +269,7 @@ class RepairResult(Result):
         return [*lines, f"the repaired controller: {command}"]
 
 
-def ranges_of(asked: options.Repair) -> tuple[Range, ...]:
+def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
     """Return the parameters that may change, with their ranges.
 
     Raises `UserError` for values that make no search, and where optuna is not installed.
@@ -295,7 +295,7 @@ def ranges_of(asked: options.Repair) -> tuple[Range, ...]:
 
 
 def fresh_settings(
-    today: CampaignSettings, asked: options.Repair, spec: str, number: int
+    today: CampaignSettings, asked: verbs.Repair, spec: str, number: int
 ) -> CampaignSettings:
     """Return the settings of the fresh campaign of a round: another seed, and no earlier lesson.
 
@@ -314,7 +314,7 @@ def fresh_settings(
 
 def repair(
     study: RunStudy,
-    asked: options.Repair,
+    asked: verbs.Repair,
     folder: Path,
     fresh: Callable[[str, int], Run],
     on_part: OnPart = lambda *_: None,
@@ -366,7 +366,7 @@ class _Repair:
     def __init__(
         self,
         study: RunStudy,
-        asked: options.Repair,
+        asked: verbs.Repair,
         ranges: tuple[Range, ...],
         folder: Path,
         on_part: OnPart,

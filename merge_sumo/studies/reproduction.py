@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import fmc
@@ -107,7 +107,7 @@ def quick(seeds: int) -> Scale:
     return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
 
 
-def scale_of(asked: options.Reproduce) -> Scale:
+def scale_of(asked: verbs.Reproduce) -> Scale:
     """Return the scale that a person asks for."""
     if asked.quick:
         return quick(2 if asked.seeds is None else asked.seeds)
@@ -298,7 +298,7 @@ def reproduce(
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.
-        asked = options.Benchmark(
+        asked = verbs.Benchmark(
             column.vut,
             seeds=scale.seeds,
             cases=scale.batches * scale.batch,

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import covered, fmc
@@ -126,7 +126,7 @@ def _lost_search(task: Task) -> SamplerRun:
     raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
 
 
-def names_of(asked: options.Benchmark) -> list[str]:
+def names_of(asked: verbs.Benchmark) -> list[str]:
     """Return the names of the samplers that are compared; `UserError` for none, or no seeds."""
     known = SAMPLERS if asked.samplers is None else asked.samplers
     names = list(dict.fromkeys(map(str.strip, known)))
@@ -176,7 +176,7 @@ class Study:
         where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
         return ground_truth(plan, level, total, seed, repeats=repeats, **where)
 
-    def truths(self, settings: CampaignSettings, asked: options.Truth) -> TruthResult:
+    def truths(self, settings: CampaignSettings, asked: verbs.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
         repeats = Repeats.of(settings, asked.repeat, asked.tolerated)
         by_level = {
@@ -190,7 +190,7 @@ class Study:
         return TruthResult(settings.vut, by_level, settings.criterion, asked.tolerated)
 
     def compare(
-        self, levels: tuple[int, ...], samplers: Sequence[str], asked: options.Benchmark
+        self, levels: tuple[int, ...], samplers: Sequence[str], asked: verbs.Benchmark
     ) -> SamplerStudy:
         """Let each sampler search with the seeds 0, 1, ... beside the truth of each level.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from merge_sumo import api, options
+from merge_sumo import api, verbs
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.run import failures
@@ -14,8 +14,8 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.verdict.score import Outcome
 
 
-@verb(options.NoFailures)
-def assert_no_failures(asked: options.NoFailures) -> CampaignRun:
+@verb(verbs.NoFailures)
+def assert_no_failures(asked: verbs.NoFailures) -> CampaignRun:
     """Test a VUT in a campaign, and raise where a case fails or ends in an error."""
     __tracebackhide__ = True
     run = api.campaign(**{**asked.values(), "progress": False})

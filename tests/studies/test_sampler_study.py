@@ -16,7 +16,7 @@ import pytest
 from plans import key_of, plan_for
 from vut_contract import factory
 
-from merge_sumo import options
+from merge_sumo import verbs
 from merge_sumo.coverage.fmc import fmc
 from merge_sumo.scenario.case import from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
@@ -132,7 +132,7 @@ def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_na
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):
     study = Study(plan_for("design1"), cache=cache)
-    asked = options.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
+    asked = verbs.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
     result = study.compare((0,), ["uniform"], asked)
     found = result.samplers["uniform"]
     assert found.cases_by_batch == [20, 40, 50]
