@@ -27,7 +27,6 @@ from merge_sumo.options import (
     progress_option,
     required_option,
     seed_option,
-    tolerated_option,
     vut_again,
 )
 
@@ -517,12 +516,7 @@ class GroundTruth(Execution, Test):
     cases SUMO has run where the kinematic engine ran the others. The truth of an object of a Python
     process is not kept: its name does not tell it from another object.
 
-    Where a share of the runs is tolerated, a case fails where more than that share of its runs do;
-    it runs until that is decided with 95 % probability, up to 20 times.
-
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
-
-    Example:  merge-sumo truth --vut design2 --level 1 --cases 200 --sense noise_x_m=2 --tolerate .2
     """
 
     vut: AnyVut = field(metadata=VUT)
@@ -531,16 +525,6 @@ class GroundTruth(Execution, Test):
     cases: int | None = option(None, int, "Uniform cases of a level.", CASES, shown=TRUTH_CASES)
     seed: int = seed_option("Same seed, same cases.")
     engine: str | None = _engine()
-    repeat: int | None = option(
-        None,
-        int,
-        "Run each case until it is decided whether it fails, so often at most, with another draw "
-        "of what is random.",
-        CASES,
-        metavar="N",
-        shown="1, with --tolerate 20",
-    )
-    tolerated: float = tolerated_option()
 
 
 @dataclass(frozen=True)

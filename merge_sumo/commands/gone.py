@@ -21,8 +21,6 @@ COMMANDS: Final[Mapping[str, str]] = {
 }
 """What replaces a command, by its name."""
 OPTIONS: Final[Mapping[str, str]] = {
-    "--density": "a TOML file for --traffic states density, speeds and their source",
-    "--draws": "`merge-sumo rerun --stress` draws five times",
     "--rerun": "`merge-sumo rerun RUN --vut SPEC` runs the cases of a campaign with another VUT",
     "--no-rerun": "`merge-sumo compare` always compares the records alone",
     "--tolerance": "`merge-sumo rerun` and `merge-sumo compare` end with 1 where any case broke, "
@@ -53,6 +51,8 @@ OPTIONS: Final[Mapping[str, str]] = {
     "export commonroad": "`--format openscenario` writes the motion for other simulators",
     "export parquet": "`--format csv` writes the same table",
     "benchmark --quick": "`python tools/benchmark`, in a checkout, runs the frozen problems",
+    "truth --repeat": "`merge-sumo campaign --sampler uniform --repeat N` repeats uniform cases",
+    "truth --tolerate": "`merge-sumo campaign --sampler uniform --repeat N` takes --tolerate",
     "campaign --batch": "a sampler chooses the size of its batches; `ms.campaign(batch=20)` in "
     "Python has another",
     "repair --resume": "a repair begins anew in a folder of its own: the same seed gives the same "

@@ -94,9 +94,9 @@ class Episodes(Sequence[Episode]):
 class CasesAt(Sequence[Case]):
     """Cases by their points in the unit cube, made when they run: they travel as numbers."""
 
-    def __init__(self, pool: Pool, level: int, points: FloatArray, draw: int = 0) -> None:
-        """Take points, (n, d), of a level of a pool, and the draw of all."""
-        self.pool, self.level, self.points, self.draw = pool, level, points, draw
+    def __init__(self, pool: Pool, level: int, points: FloatArray) -> None:
+        """Take points, (n, d), of a level of a pool."""
+        self.pool, self.level, self.points = pool, level, points
 
     def __len__(self) -> int:
         return len(self.points)
@@ -107,12 +107,11 @@ class CasesAt(Sequence[Case]):
     def __getitem__(self, place: slice) -> CasesAt: ...
     def __getitem__(self, place: int | slice) -> Case | CasesAt:
         if isinstance(place, slice):
-            return CasesAt(self.pool, self.level, self.points[place], self.draw)
-        return next(iter(CasesAt(self.pool, self.level, self.points[place][None], self.draw)))
+            return CasesAt(self.pool, self.level, self.points[place])
+        return next(iter(CasesAt(self.pool, self.level, self.points[place][None])))
 
     def __iter__(self) -> Iterator[Case]:
-        cases = self.pool.cases(self.points, self.level)
-        return iter(cases if self.draw == 0 else [replace(case, draw=self.draw) for case in cases])
+        return iter(self.pool.cases(self.points, self.level))
 
 
 Keep = Callable[[Episodes], Sequence[R]]

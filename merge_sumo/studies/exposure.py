@@ -1,12 +1,13 @@
-"""The distribution of cases that somebody states: levels and coordinates, each by itself."""
+"""How often cases occur: the distribution that somebody states, each coordinate by itself."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 from msgspec import Meta
@@ -14,65 +15,88 @@ from msgspec import Meta
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import Dimension, Scenario
-from merge_sumo.system.records import Record, decode, record_type, replaced, to_plain
+from merge_sumo.system.records import Record, decode, record_type, to_plain
 
 Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[
     tuple[Weight, ...], Meta(min_length=1, description="weights, numbers of 0 or more")
 ]
 ByLevel = Annotated[dict[str, Weight], Meta(description="weights, numbers of 0 or more, by level")]
+LEAST_INSIDE: Final = 1e-9
+"""Share of a distribution that the pool has at least, or its quantiles are no numbers."""
 
 
-class Uniform(Record, frozen=True, tag_field="kind", tag="uniform"):
-    """All values from `low` to `high` alike; the bounds of the pool where none are stated."""
+class _Shape(Record, frozen=True):
+    """A distribution of a coordinate, cut off at `low` and `high`: by default the pool's bounds."""
 
     low: float | None = None
     high: float | None = None
 
-    def quantile(self, chance: FloatArray) -> FloatArray:
-        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
-        assert self.low is not None and self.high is not None, "bounded"  # noqa: S101, PT018
-        return self.low + chance * (self.high - self.low)
+    @abstractmethod
+    def law(self, low: float, high: float) -> Any:
+        """Return it as scipy has it, before it is cut off at bounds."""
+
+    def ends(self, low: float, high: float) -> FloatArray:
+        """Return the chances to be below each of two bounds, (2,)."""
+        return np.asarray(self.law(low, high).cdf([low, high]), dtype=np.float64)
+
+    def quantiles(self, d: Dimension, chances: FloatArray) -> FloatArray:
+        """Return the values, (n,), at chances, (n,), in the unit of a coordinate."""
+        low, high = self.bounds(d)
+        below, up_to = self.ends(low, high)
+        values = self.law(low, high).ppf(below + chances * (up_to - below))
+        return np.clip(np.asarray(values, dtype=np.float64), low, high)
+
+    def bounds(self, d: Dimension) -> tuple[float, float]:
+        """Return where it is cut off."""
+        return d.low if self.low is None else self.low, d.high if self.high is None else self.high
+
+    def check(self, d: Dimension) -> None:
+        """Raise `UserError` where it reaches out of the pool, or never comes to it."""
+        low, high = self.bounds(d)
+        if not d.low <= low < high <= d.high:
+            raise UserError(
+                f"{d.field}: low is {low:g} and high {high:g}: choose low < high within the pool, "
+                f"{d.low:g} to {d.high:g}"
+            )
+        below, up_to = self.ends(low, high)
+        if not up_to - below > LEAST_INSIDE:
+            raise UserError(f"{d.field}: such a distribution never comes to the pool")
 
 
-class Normal(Record, frozen=True, tag_field="kind", tag="normal"):
-    """A normal distribution, cut off at `low` and `high`, by default the bounds of the pool."""
+class Uniform(_Shape, frozen=True, tag_field="kind", tag="uniform"):
+    """All values alike."""
+
+    def law(self, low: float, high: float) -> Any:
+        """Return it as scipy has it."""
+        from scipy.stats import uniform
+
+        return uniform(low, high - low)
+
+
+class Normal(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="normal"):
+    """A normal distribution."""
 
     mean: float
     sd: Annotated[float, Meta(ge=1e-3, le=1e3)]
-    low: float | None = None
-    high: float | None = None
 
-    def check(self) -> None:
-        """Raise `UserError` for a mean that is no number."""
-        if not math.isfinite(self.mean):
-            raise UserError(f"mean is {self.mean}: it must be finite")
-
-    def within(self, low: float, high: float) -> tuple[float, Normal]:
-        """Return the share of the values from `low` to `high`, and their distribution."""
+    def law(self, low: float, high: float) -> Any:
+        """Return it as scipy has it."""
         from scipy.stats import norm
 
-        below, up_to = norm.cdf((np.array([low, high]) - self.mean) / self.sd)
-        return float(up_to - below), replaced(self, low=low, high=high)
-
-    def quantile(self, chance: FloatArray) -> FloatArray:
-        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
-        from scipy.stats import truncnorm
-
-        assert self.low is not None and self.high is not None, "bounded"  # noqa: S101, PT018
-        low, high = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
-        values = truncnorm(low, high, loc=self.mean, scale=self.sd).ppf(chance)
-        return np.asarray(values, dtype=np.float64)
+        return norm(self.mean, self.sd)
 
 
-class Histogram(Record, frozen=True, tag_field="kind", tag="histogram"):
+class Histogram(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="histogram"):
     """Weights of bins between rising edges, uniform within a bin."""
 
     edges: tuple[float, ...]
     weights: Weights
 
-    def check(self) -> None:
-        """Raise `UserError` where edges and weights make no distribution."""
+    def law(self, low: float, high: float) -> Any:
+        """Return it as scipy has it; `UserError` where edges and weights make no distribution."""
+        from scipy.stats import rv_histogram
+
         edges, weights = np.array(self.edges), self.weights
         if len(edges) != len(weights) + 1:
             raise UserError(f"{len(weights)} weights need {len(weights) + 1} edges")
@@ -80,27 +104,7 @@ class Histogram(Record, frozen=True, tag_field="kind", tag="histogram"):
             raise UserError("edges must rise, and be finite")
         if not 0.0 < sum(weights) < math.inf:
             raise UserError("weights must be not all 0, and finite")
-
-    def within(self, low: float, high: float) -> tuple[float, Histogram]:
-        """Return the share of the values from `low` to `high`, and their distribution."""
-        edges, weights = np.array(self.edges), np.array(self.weights)
-        cut = np.clip(edges, low, high)
-        inside = weights * np.diff(cut) / np.diff(edges)
-        kept = np.diff(cut) > 0.0
-        if not kept.any():
-            return 0.0, self
-        bounds = np.append(cut[:-1][kept], cut[1:][kept][-1])
-        cut_off = Histogram(edges=tuple(bounds.tolist()), weights=tuple(inside[kept].tolist()))
-        return float(inside.sum() / weights.sum()), cut_off
-
-    def quantile(self, chance: FloatArray) -> FloatArray:
-        """Return the values, (n,), at chances, (n,), in the unit of the coordinate."""
-        edges, weights = np.array(self.edges), np.array(self.weights)
-        below = np.concatenate([[0.0], np.cumsum(weights) / weights.sum()])
-        bin_ = np.clip(np.searchsorted(below, chance, side="right") - 1, 0, len(weights) - 1)
-        share = (chance - below[bin_]) / np.maximum(np.diff(below)[bin_], 1e-300)
-        values = edges[bin_] + np.clip(share, 0.0, 1.0) * np.diff(edges)[bin_]
-        return np.asarray(values, dtype=np.float64)
+        return rv_histogram((np.array(weights), edges), density=False)
 
 
 Marginal = Uniform | Normal | Histogram
@@ -125,8 +129,8 @@ class Distribution:
         """Return points of the unit cube, (n, d), at chances, (n, d): uniform ones are a sample."""
         columns = []
         for d, chance in zip(self.scenario.dimensions(level), chances.T, strict=True):
-            values = self.marginals[d.field].quantile(chance)
-            columns.append(np.clip((values - d.low) / (d.high - d.low), 0.0, 1.0))
+            values = self.marginals[d.field].quantiles(d, chance)
+            columns.append((values - d.low) / (d.high - d.low))
         return np.column_stack(columns)
 
     def record(self) -> dict[str, Any]:
@@ -145,8 +149,8 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
          "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 2},
          "svo_rad": {"kind": "histogram", "edges": [0, 0.5, 1.5], "weights": [2, 1]}}
 
-    A normal distribution is cut off at the pool's bounds. Raises `UserError` with the place in the
-    file where it is no distribution over the cases of `levels`.
+    It is cut off at the pool's bounds. Raises `UserError` with the place in the file where it is no
+    distribution over the cases of `levels`.
     """
     coordinates = scenario.dimensions(2)
     fields = [(d.field, Marginal, Uniform()) for d in coordinates]
@@ -154,7 +158,8 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
     kind = record_type("distribution", [("levels", ByLevel | None, None), *fields])
     try:
         stated = kind() if path is None else decode(path.read_bytes(), kind)
-        marginals = {d.field: _in_pool(getattr(stated, d.field), d) for d in coordinates}
+        for d in coordinates:
+            getattr(stated, d.field).check(d)
         weights = even if stated.levels is None else stated.levels
         if not weights or not weights.keys() <= even.keys():
             known = ", ".join(sorted(even))
@@ -167,27 +172,5 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
+    marginals = {d.field: getattr(stated, d.field) for d in coordinates}
     return Distribution(shares, marginals, scenario)
-
-
-def _in_pool(stated: Marginal, d: Dimension) -> Marginal:
-    """Return a distribution of a coordinate with the bounds of the pool where it has none.
-
-    Raises `UserError` where it reaches out of the pool, or never comes to it.
-    """
-    if isinstance(stated, Histogram):
-        stated.check()
-        if stated.edges[0] < d.low or stated.edges[-1] > d.high:
-            raise UserError(f"{d.field}: edges must be within the pool, {d.low:g} to {d.high:g}")
-        return stated
-    low = d.low if stated.low is None else stated.low
-    high = d.high if stated.high is None else stated.high
-    if not d.low <= low < high <= d.high:
-        raise UserError(
-            f"{d.field}: low is {low:g} and high {high:g}: choose low < high within the pool, "
-            f"{d.low:g} to {d.high:g}"
-        )
-    bounded = replaced(stated, low=low, high=high)
-    if not np.isfinite(bounded.quantile(np.array([0.01, 0.5, 0.99]))).all():
-        raise UserError(f"{d.field}: such a normal distribution never comes to the pool")
-    return bounded

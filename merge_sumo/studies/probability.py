@@ -403,7 +403,7 @@ def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]
     return PerMerge(
         traffic=traffic,
         cars=cars,
-        counted_speeds=traffic.speeds_in_pool(scenario)[0],
+        counted_speeds=traffic.share_in_pool(scenario),
         least=cars * min(found),
         most=cars * max(found),
         low=cars * low,

@@ -30,10 +30,10 @@ from importlib.util import find_spec
 from operator import attrgetter, itemgetter
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
-from msgspec import Meta, field
+from msgspec import field
 
 from merge_sumo import verbs
 from merge_sumo.campaigns.run import Run, spread_failures
@@ -43,11 +43,11 @@ from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, from_unit, to_unit
-from merge_sumo.studies.comparison import Comparison, compare_outcomes, passes
+from merge_sumo.studies.comparison import Comparison, compare_outcomes, cut, passes
 from merge_sumo.studies.run_study import OnPart, RunStudy
 from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted, quoted
-from merge_sumo.system.records import Record, replaced, to_json, to_plain
+from merge_sumo.system.records import Record, to_json, to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.summary import summarise
@@ -72,15 +72,13 @@ change: between the cases that ran are others. Chosen, not tuned."""
 NEIGHBOURS: Final = 10
 """Cases that each failure of a fresh campaign brings to the next round besides itself. Chosen, not
 tuned: without any, four failures of design2 moved a threshold by 1 %, just past these four."""
-MOST_INDICES: Final = 30
-"""Indices of cases that a sentence names."""
+LISTED: Final = 30
+"""Indices of cases that a line names, at most."""
 MOST_AGAINST: Final = 40
 """Failures of a fresh campaign that join the next round: the worst of each region, the second of
 each, and so on."""
 CONFIRMED: Final = 5
 """Most trials that run all cases, the best first."""
-
-Index = Annotated[int, Meta(ge=0)]
 
 
 class Cost(StrEnum):
@@ -106,17 +104,15 @@ class Trial(Record, frozen=True):
         broke: cases that passed with today's values and do not pass now.
         extra: by cost, its mean over the cases minus that with today's values.
         differs: whether any case ended otherwise than with today's values.
-        all_cases: whether all cases ran.
         refused: why the controller does not take the values; empty where it does.
     """
 
     round: int
     values: dict[str, float]
-    fails: tuple[Index, ...] = ()
-    broke: tuple[Index, ...] = ()
+    fails: tuple[int, ...] = ()
+    broke: tuple[int, ...] = ()
     extra: dict[str, float] = field(default_factory=dict)
     differs: bool = True
-    all_cases: bool = False
     refused: str = ""
 
     @property
@@ -124,11 +120,11 @@ class Trial(Record, frozen=True):
         """Whether it was run and broke nothing."""
         return not self.refused and not self.broke
 
-    def aims(self, cost: Cost) -> tuple[int, int]:
+    def aims(self, cost: str) -> tuple[int, int]:
         """Return what is compared before the change: failures, and steps of extra cost."""
         return len(self.fails), math.ceil(round(self.costs_more(cost) / COST_STEP, 9))
 
-    def costs_more(self, cost: Cost) -> float:
+    def costs_more(self, cost: str) -> float:
         """Return the extra cost, 0 where it costs no more than today."""
         return max(self.extra.get(cost, 0.0), 0.0)
 
@@ -183,8 +179,6 @@ class RepairResult(Result):
         trials: all trials, in their order.
     """
 
-    computed = ("repaired", "verified", "stays")
-
     folder: Path
     vut: str
     ranges: tuple[Range, ...]
@@ -230,43 +224,41 @@ class RepairResult(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `repair.json` holds, and `--json` prints."""
+        names = ("vut", "ranges", "today", "cost", "seed", "cases", "failing", "repaired")
+        record = {name: getattr(self, name) for name in (*names, "verified", "stays")}
         rounds = [one.to_record() for one in self.rounds]
-        names = ("vut", "ranges", "today", "cost", "seed", "cases", "failing", *self.computed)
-        found = {name: to_plain(getattr(self, name)) for name in names}
-        return {"folder": str(self.folder), **found, "rounds": rounds}
+        return {"folder": str(self.folder), **to_plain(record), "rounds": rounds}
 
     def lines(self) -> list[str]:
         """Return the values, what they cost, what a fresh campaign says, and the command."""
         failing = f"{counted(len(self.failing), 'case')} of {self.cases}"
-        staying = ", ".join(map(str, self.stays[:MOST_INDICES]))
-        staying += f", the first {MOST_INDICES}" if len(self.stays) > MOST_INDICES else ""
+        stays = f"still failing{cut(len(self.stays), LISTED)}: "
+        stays += ", ".join(map(str, self.stays[:LISTED]))
         if self.chosen is None:
-            return [
-                f"{self.vut}: no values in these ranges let any of the {failing} pass that do not "
-                "today, unless others fail that pass",
-                f"  these stay: {staying}",
-            ]
-        stays = f", {len(self.stays)} still do not: {staying}" if self.stays else ""
+            none = f"{self.vut}: {failing} fail, and no values in these ranges let one pass without"
+            return [f"{none} others that fail", f"  these stay, {stays}"]
+        passing = len(self.failing) - len(self.stays)
         lines = [
-            f"{self.vut}: {failing} did not pass; with other values "
-            f"{len(self.failing) - len(self.stays)} of them pass{stays}; none that passed fails"
+            f"{self.vut}: {failing} did not pass; with other values {passing} of them pass, and "
+            "none that passed fails",
+            *([f"  {stays}"] if self.stays else []),
         ]
         for name, value in self.chosen.values.items():
             changed = "" if value == self.today[name] else f" -> {value:g}"
             lines.append(f"  {name}: {self.today[name]:g}{changed}")
-        extra = (
-            f"{self.chosen.extra[cost]:+.2f} {unit} of {cost}"
-            for cost, (_, unit) in MEASURED_BY.items()
-        )
-        lines.append(f"  cost, mean of a case: {', '.join(extra)}")
-        lines += [
-            f"fresh campaign {number}, {counted(len(one.campaign.outcomes), 'case')}: with today's "
-            f"values and the new ones {one.compared.headline}"
-            for number, one in enumerate(self.rounds, start=1)
+        extra = self.chosen.extra
+        costs = (f"{extra[cost]:+.2f} {unit} of {cost}" for cost, (_, unit) in MEASURED_BY.items())
+        return [
+            *lines,
+            f"  cost, mean of a case: {', '.join(costs)}",
+            *(
+                f"fresh campaign {number}, {counted(len(one.campaign.outcomes), 'case')}: with "
+                f"today's values and the new ones {one.compared.headline}"
+                for number, one in enumerate(self.rounds, start=1)
+            ),
+            *([] if self.verified else ["not verified: cases broke"]),
+            f"the repaired controller: merge-sumo campaign --vut {quoted(self.repaired or '')}",
         ]
-        lines += [] if self.verified else ["not verified: cases broke"]
-        command = f"merge-sumo campaign --vut {quoted(self.repaired or '')}"
-        return [*lines, f"the repaired controller: {command}"]
 
 
 def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
@@ -281,16 +273,12 @@ def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
     ranges = tuple(map(Range.parsed, asked.params))
     if not ranges:
         raise UserError("name what may change: `params` NAME=LOW..HIGH")
-    cases = 1 if asked.cases is None else asked.cases
-    for name, number, least, why in (
-        *(("rounds", asked.rounds, 1, ""), ("cases", cases, 1, ""), ("seed", asked.seed, 0, "")),
-        (
-            *("trials", asked.trials, 1 + 2 * len(ranges)),
-            " for today's values and both ends of each range",
-        ),
-    ):
-        if number < least:
-            raise UserError(f"`{name}` is {number}: it must be {least} or more{why}")
+    # Today's values and both ends of each range are tried.
+    least = {"rounds": 1, "cases": 1, "seed": 0, "trials": 1 + 2 * len(ranges)}
+    for name, number in least.items():
+        given = getattr(asked, name)
+        if given is not None and given < number:
+            raise UserError(f"`{name}` is {given}: it must be {number} or more")
     return ranges
 
 
@@ -332,13 +320,13 @@ def repair(
         UserError: for values that make no search, where no case fails, and for a parameter without
             an effect.
     """
-    search = _Repair(study, asked, ranges_of(asked), folder, on_part)
+    search = _Repair(study, asked, folder, on_part)
     rounds: list[Round] = []
     for number in range(1, asked.rounds + 1):
         chosen = search.round(number, rounds[-1].chosen if rounds else None)
         if chosen is None:
             break
-        campaign = fresh(search.spec_with(chosen.values), number)
+        campaign = fresh(str(study.plan.vut.spec.with_values(chosen.values, search.today)), number)
         rounds.append(Round(chosen, campaign, search.compared(campaign)))
         untested = [outcome for outcome in campaign.outcomes if not outcome.is_tested]
         against = [*spread_failures(campaign.outcomes), *untested][:MOST_AGAINST]
@@ -363,32 +351,16 @@ def repair(
 class _Repair:
     """The search for values, with its cases and its trials."""
 
-    def __init__(
-        self,
-        study: RunStudy,
-        asked: verbs.Repair,
-        ranges: tuple[Range, ...],
-        folder: Path,
-        on_part: OnPart,
-    ) -> None:
+    def __init__(self, study: RunStudy, asked: verbs.Repair, folder: Path, on_part: OnPart) -> None:
         self._plan, self._workers, self._folder = study.plan, study.workers, folder
-        self._asked, self._cost, self._on_part = asked, Cost(asked.cost), on_part
-        self.ranges = ranges
-        self.today = study.plan.vut.values_of(ranges)
+        self._asked, self._on_part, self.ranges = asked, on_part, ranges_of(asked)
+        self.today = study.plan.vut.values_of(self.ranges)
         self.cases = [outcome.case for outcome in study.run.outcomes]
         self.failing: tuple[int, ...] = ()
         self.trials: list[Trial] = []
         self._before: list[Outcome] = []
         """Outcomes of the cases with today's values."""
         self._round = 1
-
-    def spec_with(self, values: Mapping[str, float]) -> str:
-        """Return the controller with other values, as a spec."""
-        return str(self._plan.vut.spec.with_values(values, self.today))
-
-    def change(self, values: Mapping[str, float]) -> float:
-        """Return the sum over the parameters of the change as a share of the range."""
-        return sum(abs(values[r.name] - self.today[r.name]) / (r.high - r.low) for r in self.ranges)
 
     def compared(self, campaign: Run) -> Comparison:
         """Compare a fresh campaign with today's values in the same cases."""
@@ -401,7 +373,7 @@ class _Repair:
         """Search in a round; return the best trial, with all cases, or None where none helps."""
         self._round = number
         self._before += self._run(self._plan, self.cases[len(self._before) :])
-        if number == 1:
+        if earlier is None:
             self.failing = tuple(i for i, old in enumerate(self._before) if not passes(old))
             if not self.failing:
                 raise UserError(
@@ -409,19 +381,24 @@ class _Repair:
                 )
             make_folder(self._folder)
         selected = self._selected()
-        present, *others = self._proposed(selected, earlier)
-        if earlier is None:
-            self._check_effect(others)
-        trials = (trial for trial in (present, *others) if trial.holds)
-        better = sorted(trials, key=lambda t: (*t.aims(self._cost), self.change(t.values)))
+        found = self._proposed(selected, earlier)
+        trials = (trial for trial in found if trial.holds)
+        better = sorted(trials, key=lambda t: (*t.aims(self._asked.cost), self._change(t)))
         for trial in better[:CONFIRMED]:
-            if len(trial.fails) >= len(present.fails):
+            if len(trial.fails) >= len(found[0].fails):
                 return None
             trimmed = self._trimmed(trial, selected)
-            everywhere = self._trial(trimmed.values, range(len(self.cases)), all_cases=True)
+            everywhere = self._trial(trimmed.values, range(len(self.cases)))
             if everywhere.holds:
                 return everywhere
         return None
+
+    def _change(self, trial: Trial) -> float:
+        """Return the sum over the parameters of the change as a share of the range."""
+        return sum(self._share(trial, one) for one in self.ranges)
+
+    def _share(self, trial: Trial, one: Range) -> float:
+        return abs(trial.values[one.name] - self.today[one.name]) / (one.high - one.low)
 
     def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
         ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
@@ -441,15 +418,13 @@ class _Repair:
         """Run the trials that optuna proposes: first today's values, and both ends of each range.
 
         A later round begins with today's values, and with those that the earlier one has chosen.
+        Raises `UserError` for a parameter of which both ends change nothing.
         """
         import optuna
 
-        first = [self.today]
-        if earlier is None:
-            ends = [(one.name, end) for one in self.ranges for end in (one.low, one.high)]
-            first += [{**self.today, name: end} for name, end in ends]
-        else:
-            first.append(earlier.values)
+        ends = [(one, end) for one in self.ranges for end in (one.low, one.high)]
+        others = [{**self.today, one.name: end} for one, end in ends]
+        first = [self.today, *(others if earlier is None else [earlier.values])]
         optuna.logging.set_verbosity(optuna.logging.WARNING)
         # Startup trials are drawn at random: a few for each parameter.
         startup = max(10, len(first) + 4 * len(self.ranges))
@@ -458,7 +433,16 @@ class _Repair:
         study = optuna.create_study(directions=["minimize"] * 3, sampler=sampler)
         for values in first:
             study.enqueue_trial(dict(values))
-        return [self._next(study, selected) for _ in range(self._asked.trials)]
+        found = [self._next(study, selected) for _ in range(self._asked.trials)]
+        of_ends = zip(ends, found[1:], strict=False) if earlier is None else ()
+        effect = {one.name for (one, _), trial in of_ends if trial.differs or trial.refused}
+        for one in self.ranges if earlier is None else ():
+            if one.name not in effect:
+                raise UserError(
+                    f"`params` {one.name} has no effect on any case, be it {one.low:g} or "
+                    f"{one.high:g}: leave it out, or name what the controller reads"
+                )
+        return found
 
     def _next(self, study: optuna.Study, selected: Sequence[int]) -> Trial:
         """Ask for a trial, run it and tell what became of it."""
@@ -474,79 +458,60 @@ class _Repair:
             study.tell(asked, state=optuna.trial.TrialState.FAIL)
             return trial
         asked.set_constraint("broke", float(len(trial.broke)))
-        more = trial.costs_more(self._cost)
-        study.tell(asked, [len(trial.fails), more, self.change(trial.values)])
+        more = trial.costs_more(self._asked.cost)
+        study.tell(asked, [len(trial.fails), more, self._change(trial)])
         return trial
 
-    def _trial(
-        self, values: Mapping[str, float], indices: Sequence[int], *, all_cases: bool = False
-    ) -> Trial:
+    def _trial(self, values: Mapping[str, float], indices: Sequence[int]) -> Trial:
         """Run a trial on cases and record it."""
-        trial = replaced(self._ran(dict(values), indices), all_cases=all_cases)
+        trial = self._ran(dict(values), indices)
         add_to(self._folder / TRIALS, to_json(trial), new=not self.trials)
         self.trials.append(trial)
-        done, total = sum(one.round == self._round for one in self.trials), self._asked.trials
-        title = f"round {self._round}"
-        if done > total:  # how many the search for the smallest change takes is not known before
-            title, done = f"{title}, smallest change", done - total
-            total = done
-        self._on_part(title, done, total, "trials", "")
+        # How many the search for the smallest change takes is not known before.
+        done = sum(one.round == self._round for one in self.trials)
+        total = max(done, self._asked.trials)
+        self._on_part(f"round {self._round}", done, total, "trials", "")
         return trial
 
     def _ran(self, values: dict[str, float], indices: Sequence[int]) -> Trial:
-        spec = self._plan.vut.spec.with_values(values, self.today)
+        old = [self._before[index] for index in indices]
         try:
             if values == self.today:
-                after = [self._before[index] for index in indices]
+                new = old
             else:
+                spec = self._plan.vut.spec.with_values(values, self.today)
                 vut = VutFactory(spec, self._plan.vut.options)
                 cases = [self.cases[index] for index in indices]
-                after = self._run(replace(self._plan, vut=vut), cases)
+                new = self._run(replace(self._plan, vut=vut), cases)
         except UserError as error:
             return Trial(self._round, values, refused=str(error))
-        pairs = [(i, self._before[i], now) for i, now in zip(indices, after, strict=True)]
-        both = [(old, now) for _, old, now in pairs if old.is_tested and now.is_tested]
-        extra = {
-            cost: [
-                float(now.measures.value(name) or 0.0) - float(old.measures.value(name) or 0.0)
-                for old, now in both
-            ]
-            for cost, (name, _) in MEASURED_BY.items()
-        }
+        both = [(a, b) for a, b in zip(old, new, strict=True) if a.is_tested and b.is_tested]
+        extra = {}
+        for cost, (name, _) in MEASURED_BY.items():
+            means = [[float(one.measures.value(name) or 0.0) for one in pair] for pair in both]
+            extra[cost.value] = fmean(b - a for a, b in means) if both else 0.0
+        wrong = [(i, passes(a)) for i, a, b in zip(indices, old, new, strict=True) if not passes(b)]
         return Trial(
             self._round,
             values,
-            fails=tuple(i for i, old, now in pairs if not passes(old) and not passes(now)),
-            broke=tuple(i for i, old, now in pairs if passes(old) and not passes(now)),
-            extra={cost: fmean(more) if more else 0.0 for cost, more in extra.items()},
-            differs=any(old.measures != now.measures for _, old, now in pairs),
+            fails=tuple(index for index, passed in wrong if not passed),
+            broke=tuple(index for index, passed in wrong if passed),
+            extra=extra,
+            differs=any(a.measures != b.measures for a, b in zip(old, new, strict=True)),
         )
-
-    def _check_effect(self, found: Sequence[Trial]) -> None:
-        """Raise `UserError` for a parameter of which both ends change nothing."""
-        for place, one in enumerate(self.ranges):
-            ends = found[2 * place : 2 * place + 2]
-            if not any(trial.differs or trial.refused for trial in ends):
-                raise UserError(
-                    f"`params` {one.name} has no effect on any case, be it {one.low:g} or "
-                    f"{one.high:g}: leave it out, or name what the controller reads"
-                )
 
     def _trimmed(self, best: Trial, selected: Sequence[int]) -> Trial:
         """Return a trial with values as near to today's as the choice allows, with a reserve."""
-        aims, kept = best.aims(self._cost), best
+        aims, kept = best.aims(self._asked.cost), best
 
         def as_good(name: str, value: float) -> bool:
             nonlocal kept
             trial = self._trial({**kept.values, name: value}, selected)
-            good = trial.holds and trial.aims(self._cost) <= aims
+            good = trial.holds and trial.aims(self._asked.cost) <= aims
             kept = trial if good else kept
             return good
 
-        for one in sorted(
-            self.ranges,
-            key=lambda r: -abs(best.values[r.name] - self.today[r.name]) / (r.high - r.low),
-        ):
+        for one in sorted(self.ranges, key=lambda r: -self._share(best, r)):
             bad, good = self.today[one.name], kept.values[one.name]
             if good == bad or as_good(one.name, bad):
                 continue

@@ -203,18 +203,14 @@ class Reproduction(Result):
     page: Path | None = None
 
     def to_record(self) -> dict[str, Any]:
-        """Return Table II for a program; without seconds, so that it can be compared bit by bit."""
-        columns = []
-        for one in self.columns.values():
-            record = one.study.to_record()
-            for summary in record["samplers"].values():
-                del summary["sampler_s"]
-            columns.append({**to_plain(one.column), **record})
+        """Return Table II for a program."""
         return {
             "scale": to_plain(self.scale),
             "versions": self.versions,
             "policies_sha256": self.policies_sha256,
-            "columns": columns,
+            "columns": [
+                {**to_plain(one.column), **one.study.to_record()} for one in self.columns.values()
+            ],
         }
 
     def lines(self) -> list[str]:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import accumulate, chain, islice
 from pathlib import Path
@@ -30,7 +29,6 @@ from merge_sumo.studies.run_study import OnPart
 from merge_sumo.studies.truth import (
     DENSE_CASES,
     TRUTH_CASES,
-    Repeats,
     Truth,
     TruthResult,
     ground_truth,
@@ -57,12 +55,10 @@ class SamplerRun:
     Attributes:
         outcomes: what became of every case, in order.
         fmc: failure mode coverage after each batch, summed over the levels.
-        sampler_s: seconds spent in the sampler, without simulation.
     """
 
     outcomes: list[Outcome]
     fmc: list[float]
-    sampler_s: float
 
     def failures(self, level: int) -> FloatArray:
         """Return the failing cases of a level as points, (m, d)."""
@@ -79,51 +75,44 @@ class SamplerRun:
         return np.array([(first <= number).mean() for number in numbers])
 
 
-Task = tuple[str, tuple[int, ...], int, int | None, int]
-"""A search: sampler, levels, cases, batch, seed."""
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A search of the pool of a plan's scenario.
+
+    Attributes:
+        name: the sampler.
+        levels: POV levels.
+        cases: number of cases.
+        batch: cases of a batch; None for those of the sampler, or `COMPARED_BATCH`.
+        seed: of the sampler.
+    """
+
+    name: str
+    levels: tuple[int, ...]
+    cases: int
+    batch: int | None
+    seed: int
 
 
 def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
-    """Run searches of the pool of a plan's scenario in this process."""
-    return [_search(plan, *task) for task in tasks]
-
-
-def _search(
-    plan: SimulationPlan,
-    name: str,
-    levels: tuple[int, ...],
-    cases: int,
-    batch: int | None,
-    seed: int,
-) -> SamplerRun:
-    pool, lines = Pool(levels=levels, scenario=plan.scenario), centre_lines(plan.road)
-    twin = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
-    sampler = make_sampler(name, pool, seed, twin)
-    spent_s = [0.0]
-
-    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
-        def wrapper(*arguments: Any) -> Any:
-            start_s = time.perf_counter()
-            try:
-                return function(*arguments)
-            finally:
-                spent_s[0] += time.perf_counter() - start_s
-
-        return wrapper
-
-    sampler.ask = timed(sampler.ask)  # type: ignore[method-assign]
-    sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
-    found = SamplerRun([], [], 0.0)
-    batch = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-    for group in groups_here(plan, sampler, cases, batch):
-        found.outcomes.extend(episode.outcome for episode in group)
-        found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
-    return replace(found, sampler_s=spent_s[0])
+    """Run searches in this process."""
+    found = []
+    for task in tasks:
+        pool, lines = Pool(levels=task.levels, scenario=plan.scenario), centre_lines(plan.road)
+        twin = Twin(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
+        sampler, ran = make_sampler(task.name, pool, task.seed, twin), SamplerRun([], [])
+        batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
+        for group in groups_here(plan, sampler, task.cases, batch):
+            ran.outcomes.extend(episode.outcome for episode in group)
+            ran.fmc.append(sum(fmc(ran.failures(level)) for level in task.levels))
+        found.append(ran)
+    return found
 
 
 def _lost_search(task: Task) -> SamplerRun:
-    name, *_, seed = task
-    raise UserError(f"the search of {name} with seed {seed} ended its worker process each time")
+    raise UserError(
+        f"the search of {task.name} with seed {task.seed} ended its worker process each time"
+    )
 
 
 def names_of(asked: verbs.Benchmark) -> list[str]:
@@ -160,9 +149,7 @@ class Study:
     on_part: OnPart = lambda *_: None
     engine: str | None = None
 
-    def truth(
-        self, level: int, cases: int | None = None, seed: int = 0, repeats: Repeats | None = None
-    ) -> Truth:
+    def truth(self, level: int, cases: int | None = None, seed: int = 0) -> Truth:
         """Return the truth at a level, from the cache where it is kept."""
         total, ended = TRUTH_CASES[level] if cases is None else cases, 0
         title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
@@ -174,20 +161,17 @@ class Study:
 
         plan = self.plan.at_level(level).with_engine(self.engine)
         where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
-        return ground_truth(plan, level, total, seed, repeats=repeats, **where)
+        return ground_truth(plan, level, total, seed, **where)
 
     def truths(self, settings: CampaignSettings, asked: verbs.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
-        repeats = Repeats.of(settings, asked.repeat, asked.tolerated)
-        by_level = {
-            level: self.truth(level, asked.cases, asked.seed, repeats) for level in settings.levels
-        }
+        by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
         if not self.plan.vut.kind.files_are_known and not is_here(settings.vut):
             notice(
                 "note: nobody can tell what the program behind this VUT loads; this truth is kept "
                 "for its command and the files that are named there"
             )
-        return TruthResult(settings.vut, by_level, settings.criterion, asked.tolerated)
+        return TruthResult(settings.vut, by_level, settings.criterion)
 
     def compare(
         self, levels: tuple[int, ...], samplers: Sequence[str], asked: verbs.Benchmark
@@ -211,7 +195,8 @@ class Study:
         batch: int | None,
     ) -> dict[str, list[SamplerRun]]:
         """Let each sampler search with each seed; return the searches by sampler."""
-        tasks = [(name, levels, cases, batch, seed) for name in samplers for seed in range(seeds)]
+        numbers = range(seeds)
+        tasks = [Task(name, levels, cases, batch, seed) for name in samplers for seed in numbers]
         for level in levels:
             self.plan.povs.check_level(level)
         plan = self.plan.for_cases(batch or COMPARED_BATCH)
@@ -220,7 +205,7 @@ class Study:
         with workers_or_here(self.workers) as processes:
             for place, one in processes.run(partial(search, plan), tasks, _lost_search, chunk=1):
                 by_place[place] = one
-                self.on_part(shown, len(by_place), len(tasks), "runs", tasks[place][0])
+                self.on_part(shown, len(by_place), len(tasks), "runs", tasks[place].name)
         found = iter(by_place[place] for place in range(len(tasks)))
         return {name: list(islice(found, seeds)) for name in samplers}
 
@@ -268,7 +253,6 @@ class SamplerSummary:
         regions_found: regions of the truth in which a failure was found; None where the truth
             is too small to tell regions.
         cases_to_90_percent: cases until .9 of the truth's FMC.
-        sampler_s: median seconds spent in the sampler.
         cases_by_batch: cases after each batch.
         fmc_by_batch: quartiles of FMC after each batch, at 25, 50 and 75 %.
         covered_share_by_batch: median of the covered share after each batch; None without failures.
@@ -281,12 +265,11 @@ class SamplerSummary:
     failures: Spread
     regions_found: Spread
     cases_to_90_percent: Spread
-    sampler_s: float
     cases_by_batch: list[int]
     fmc_by_batch: list[list[float]]
     covered_share_by_batch: list[float] | None
 
-    def columns(self, *, small: bool, timed: bool) -> dict[str, str]:
+    def columns(self, *, small: bool) -> dict[str, str]:
         """Return the cells of its row by heading; nothing is divided by a `small` truth."""
         of_truth = {
             "FMC / truth": self.fmc_over_truth.text(".3f"),
@@ -299,7 +282,6 @@ class SamplerSummary:
             "failures": self.failures.text(".0f"),
             "regions": self.regions_found.text(".1f"),
             "to 90 %": self.cases_to_90_percent.text(".0f"),
-            **({"sampler s": f"{self.sampler_s:.2f}"} if timed else {}),
         }
 
 
@@ -392,7 +374,6 @@ class SamplerStudy(Result):
             cases_to_90_percent=Spread.of(
                 np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
             ),
-            sampler_s=float(np.median([search.sampler_s for search in searches])),
             cases_by_batch=after,
             fmc_by_batch=np.quantile(curves, (0.25, 0.5, 0.75), axis=0).tolist(),
             covered_share_by_batch=np.median(shares, axis=0).tolist() if self.probes else None,
@@ -412,12 +393,7 @@ class SamplerStudy(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return truth and limit, and a table of the samplers."""
-        figure = [] if self.figure is None else [f"figure: {self.figure}"]
-        return [*self.found(timed=True), *figure]
-
-    def found(self, *, timed: bool) -> list[str]:
-        """Return the lines without the figure, and without seconds unless `timed`."""
+        """Return truth and limit, and a table of the samplers: medians [quartiles]."""
         failures = sum(len(truth.failures) for truth in self.truths.values())
         return [
             f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
@@ -429,15 +405,14 @@ class SamplerStudy(Result):
             ),
             f"limit: FMC {self.limit_fmc:.4f}, of all that truth and searches found"
             + (f", or of {DENSE_CASES:,} uniform cases, where that is more" if self.dense else ""),
-            *self._table(timed=timed),
+            *self._table(),
+            *([] if self.figure is None else [f"figure: {self.figure}"]),
         ]
 
-    def _table(self, *, timed: bool) -> list[str]:
-        """Return a line per sampler: medians, with the quartiles in brackets."""
-        named = self.samplers.items()
+    def _table(self) -> list[str]:
         rows = [
-            {"sampler": name, **one.columns(small=self.is_small, timed=timed)}
-            for name, one in named
+            {"sampler": name, **one.columns(small=self.is_small)}
+            for name, one in self.samplers.items()
         ]
         widths = {name: max(map(len, (name, *(row[name] for row in rows)))) for name in rows[0]}
         table = [{name: name for name in widths}, *rows]

@@ -21,7 +21,7 @@ from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import COORDINATES, DT_S, Scenario
+from merge_sumo.scenario.scenario import COORDINATES, DT_S
 from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
@@ -68,13 +68,10 @@ class Rung(Record, frozen=True):
     skipped: str = ""
 
     @property
-    def counts(self) -> tuple[int, int, int]:
+    def counts(self) -> list[int]:
         """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
-        return (
-            sum(len(run.passes) for run in self.runs),
-            sum(len(run.fails) for run in self.runs),
-            sum(len(run.without_verdict) for run in self.runs),
-        )
+        kinds = ([run.passes, run.fails, run.without_verdict] for run in self.runs)
+        return [sum(map(len, of)) for of in zip(*kinds, strict=True)]
 
     @property
     def flips(self) -> int:
@@ -116,16 +113,12 @@ class StressResult(Result, Record, frozen=True):
             return "no case failed: which passes fail on a rung is in the table"
         fragile = [index for index in self.failures if self.passes_in(index)]
         fragile.sort(key=lambda index: -self.passes_in(index))
-        text = (
+        shown = ", ".join(f"{i} ({self.passes_in(i)})" for i in fragile[:LISTED])
+        others = "; others, with the number of runs in which they do not fail"
+        return (
             f"robust, as they fail on every rung: {len(self.robust)} of "
             f"{counted(len(self.failures), 'failure')}"
-        )
-        if not fragile:
-            return text
-        shown = ", ".join(f"{i} ({self.passes_in(i)})" for i in fragile[:LISTED])
-        return (
-            f"{text}; others, with the number of runs in which they do not fail"
-            f"{cut(len(fragile), LISTED)}: {shown}"
+            + (f"{others}{cut(len(fragile), LISTED)}: {shown}" if fragile else "")
         )
 
     def passes_in(self, index: int) -> int:
@@ -148,8 +141,7 @@ class StressResult(Result, Record, frozen=True):
             if rung.skipped:
                 lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
                 continue
-            passes, fails, without = rung.counts
-            numbers = f"{passes:10d}{fails:10d}{without:12d}"
+            numbers = "{:10d}{:10d}{:12d}".format(*rung.counts)
             drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
             lines.append(f"{self.share(rung):8.1%}{numbers}  {rung.about}{drawn}")
         return [*lines, self.sentence]
@@ -172,19 +164,23 @@ DRAWS: Final = 5
 """Times that all cases run where a change is drawn at random, with the seed of the case."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Disturbance:
     """A rung before it runs.
 
     Attributes:
-        rung: its name, what is changed, and where its number is from.
+        name: short name.
+        about: what is changed, in a phrase.
+        source: where its number is from.
         plan: returns the plan of the rung by that of the campaign; raises `UserError` where it
             cannot be.
         case: returns a case of the rung by one of the campaign, and what draws at random; None for
             the same coordinates.
     """
 
-    rung: Rung
+    name: str
+    about: str
+    source: str = ""
     plan: Callable[[SimulationPlan], SimulationPlan] = lambda plan: plan
     case: Callable[[Case, np.random.Generator], Case] | None = None
 
@@ -199,15 +195,15 @@ def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
     for name in values:
         if getattr(act, name) not in (0.0, None):
             raise UserError(f"the scenario has {name} of its own")
-    return _in_scenario(plan, replace(plan.scenario, act=replace(act, **values)))
+    return _changed(plan, act=replace(act, **values))
 
 
 def _with_long_pov(plan: SimulationPlan) -> SimulationPlan:
-    length_m = plan.scenario.pov_length_m + CAR_LENGTH_M
-    return _in_scenario(plan, replace(plan.scenario, pov_length_m=length_m))
+    return _changed(plan, pov_length_m=plan.scenario.pov_length_m + CAR_LENGTH_M)
 
 
-def _in_scenario(plan: SimulationPlan, scenario: Scenario) -> SimulationPlan:
+def _changed(plan: SimulationPlan, **changes: Any) -> SimulationPlan:
+    scenario = replace(plan.scenario, **changes)
     plan.criterion.check(scenario)
     return replace(plan, scenario=scenario)
 
@@ -224,42 +220,38 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, **values)
 
 
-NOTHING: Final = Disturbance(rung=Rung("nothing", "nothing is changed"))
+NOTHING: Final = Disturbance("nothing", "nothing is changed")
 RUNGS: Final = (
     NOTHING,
     Disturbance(
-        rung=Rung("step", f"a step of {PART_S:g} s, with a command held for {DT_S:g} s"),
+        "step",
+        f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
         plan=lambda plan: replace(plan, substeps=round(DT_S / PART_S)),
     ),
     *(
         Disturbance(
-            rung=Rung(
-                f"lag-{lag_s:g}",
-                f"the acceleration of the VUT lags by {lag_s:g} s",
-                "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)",
-            ),
-            plan=partial(_with_actuator, lag_s=lag_s),
+            f"lag-{lag_s:g}",
+            f"the acceleration of the VUT lags by {lag_s:g} s",
+            "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)",
+            partial(_with_actuator, lag_s=lag_s),
         )
         for lag_s in LAGS_S
     ),
     Disturbance(
-        rung=Rung(
-            "power",
-            f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
-            "UN GTR No. 15, Annex 1: lower limit of class 3",
-        ),
-        plan=partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
+        "power",
+        f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
+        "UN GTR No. 15, Annex 1: lower limit of class 3",
+        partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
     ),
     Disturbance(
-        rung=Rung(
-            "start",
-            f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
-            "accuracy of a radar, Autoliv NB24G1V2, user's manual, 3.1",
-        ),
+        "start",
+        f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
+        "accuracy of a radar, Autoliv NB24G1V2, user's manual, 3.1",
         case=_start_off,
     ),
     Disturbance(
-        rung=Rung("long-pov", f"cars of the mainline are {CAR_LENGTH_M:g} m longer, to the rear"),
+        "long-pov",
+        f"cars of the mainline are {CAR_LENGTH_M:g} m longer, to the rear",
         plan=_with_long_pov,
     ),
 )
@@ -287,6 +279,7 @@ def stress(study: RunStudy) -> StressResult:
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     """Run all cases with a change; one that cannot be is skipped with its reason."""
     flips: list[Flips] = []
+    skipped = ""
     try:
         plan = one.plan(study.plan.for_cases(len(tested)))
         for draw in range(one.draws):
@@ -302,8 +295,8 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
         if one is NOTHING:
             raise
         study.on_cases((one.draws - len(flips)) * len(tested))
-        return Rung(one.rung.name, one.rung.about, one.rung.source, (), str(error))
-    return Rung(one.rung.name, one.rung.about, one.rung.source, tuple(flips))
+        flips, skipped = [], str(error)
+    return Rung(one.name, one.about, one.source, tuple(flips), skipped)
 
 
 def flips_of(tested: Sequence[Outcome], found: Mapping[int, CaseVerdict]) -> Flips:

@@ -20,13 +20,7 @@ from msgspec import Meta
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import Scenario, as_merge
-from merge_sumo.studies.exposure import (
-    Distribution,
-    Histogram,
-    Marginal,
-    Normal,
-    read_distribution,
-)
+from merge_sumo.studies.exposure import Distribution, Histogram, Normal, read_distribution
 from merge_sumo.system.records import Record, convert, read_toml
 from merge_sumo.system.suggestions import meant
 
@@ -52,8 +46,8 @@ class Traffic(Record, frozen=True):
     density_veh_per_km: Annotated[float, Meta(gt=0.0, le=1000.0)]
     name: str = ""
 
-    def speeds_in_pool(self, scenario: Scenario) -> tuple[float, Marginal]:
-        """Return the share of the speeds within the pool of a scenario, and their distribution.
+    def share_in_pool(self, scenario: Scenario) -> float:
+        """Return the share of the speeds within the pool of a scenario.
 
         Raises:
             UserError: where the scenario has no coordinates of a single car of the mainline, or
@@ -66,28 +60,27 @@ class Traffic(Record, frozen=True):
                 "traffic needs a scenario without them"
             )
         low, high = merge.v_pov0_mps
-        share, speeds = self.speeds.within(low, high)
-        if share < LEAST_INSIDE:
+        below, up_to = self.speeds.ends(low, high).tolist()
+        if up_to - below < LEAST_INSIDE:
             raise UserError(
                 f"less than {LEAST_INSIDE:.0%} of the speeds of {self.name} lie in the pool, "
                 f"{low:g} to {high:g} m/s: run the campaign on a scenario with other v_pov0_mps"
             )
-        return share, speeds
+        return float(up_to - below)
 
     def in_pool(self, scenario: Scenario, levels: Sequence[int]) -> Distribution:
         """Return how often the cases of a scenario occur, levels alike.
 
-        Where cars start is uniform, and so is psi. Raises `UserError` as `speeds_in_pool`.
+        Where cars start is uniform, and so is psi. Raises `UserError` as `share_in_pool`.
         """
-        _, speeds = self.speeds_in_pool(scenario)
+        self.share_in_pool(scenario)
         uniform = read_distribution(None, levels, scenario)
-        return replace(uniform, marginals={**uniform.marginals, "v_pov0_mps": speeds})
+        return replace(uniform, marginals={**uniform.marginals, "v_pov0_mps": self.speeds})
 
     def cars_in_pool(self, scenario: Scenario) -> float:
         """Return how many cars of the mainline, per merge, start in the pool of a scenario."""
-        share, _ = self.speeds_in_pool(scenario)
         low_m, high_m = as_merge(scenario).x_pov0_m
-        return self.density_veh_per_km / 1000.0 * (high_m - low_m) * share
+        return self.density_veh_per_km / 1000.0 * (high_m - low_m) * self.share_in_pool(scenario)
 
 
 def shipped_traffics() -> list[str]:
@@ -107,7 +100,7 @@ def named_traffic(name: str) -> Traffic:
     _, record = read_toml(path, "traffic")
     try:
         traffic = convert({"name": path.stem, **record}, Traffic)
-        traffic.speeds.check()
+        traffic.speeds.law(0.0, 1.0)
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     return traffic

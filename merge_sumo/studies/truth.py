@@ -14,8 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.coverage.fmc import IntArray, fmc, growth_bound, has_neighbour, radius_for, regions
+from merge_sumo.coverage.fmc import fmc, growth_bound, has_neighbour, radius_for, regions
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
@@ -30,7 +29,6 @@ from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.result import Result
 from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
-from merge_sumo.verdict.chance import MOST_RUNS, check_tolerated, is_decided
 from merge_sumo.verdict.criterion import Criterion
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
@@ -38,9 +36,7 @@ TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 DENSE_CASES: Final = 1_000_000
 """Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
 COLUMNS: Final = ("points", "margin", "in_sumo")
-"""Arrays of a truth in the cache,"""
-COUNTS: Final = ("runs", "failed_runs")
-"""and those of one whose cases ran several times."""
+"""Arrays of a truth in the cache."""
 MOST_FILES_BYTES: Final = 1 << 26
 """Of a truth, besides its numbers: names and hashes of files."""
 REAL_REGION: Final = 0.03
@@ -60,28 +56,13 @@ class Truth:
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        margin: below 0 for a failure, (n,), NaN without a verdict; of cases that ran several times
-            that of the deciding run (`RunsOfCase.deciding`).
-        in_sumo: number of runs in SUMO; by default all.
-        runs: runs with a verdict of each case, (n,), where chance was looked for.
-        failed_runs: those of them that failed, (n,).
+        margin: below 0 for a failure, (n,), NaN without a verdict.
+        in_sumo: number of cases that ran in SUMO.
     """
 
     points: FloatArray
     margin: FloatArray
-    in_sumo: int = -1
-    runs: IntArray | None = None
-    failed_runs: IntArray | None = None
-
-    def __post_init__(self) -> None:
-        """Count the cases."""
-        if self.in_sumo < 0:
-            object.__setattr__(self, "in_sumo", self.all_runs)
-
-    @property
-    def all_runs(self) -> int:
-        """Number of runs of all cases."""
-        return len(self.margin) if self.runs is None else int(self.runs.sum())
+    in_sumo: int = 0
 
     @property
     def failures(self) -> FloatArray:
@@ -141,7 +122,6 @@ class Truth:
             "fmc_growth": self.growth,
             "too_small": self.is_small,
             "in_sumo": self.in_sumo,
-            **({} if self.runs is None else {"runs": self.all_runs}),
         }
 
     def real_regions(self) -> list[FloatArray]:
@@ -150,35 +130,6 @@ class Truth:
         labels = regions(points)
         groups = [points[labels == label] for label in np.unique(labels)]
         return [group for group in groups if len(group) >= REAL_REGION * len(points)]
-
-
-@dataclass(frozen=True, slots=True)
-class Repeats:
-    """How often a case of a truth runs: until it is decided whether it fails.
-
-    Attributes:
-        most: runs of a case, at most.
-        tolerated: share of them that may fail.
-    """
-
-    most: int = MOST_RUNS
-    tolerated: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Check that the numbers mean something."""
-        check_tolerated(self.tolerated)
-        if self.most < 1:
-            raise UserError(f"`repeat` is {self.most}: it must be 1 or more")
-
-    @classmethod
-    def of(cls, settings: CampaignSettings, most: int | None, tolerated: float) -> Repeats | None:
-        """Return how often a person wants a case to run; None for once.
-
-        Where nothing is random a case runs once.
-        """
-        default = MOST_RUNS if tolerated else 1
-        repeats = cls(default if most is None else most, tolerated)
-        return repeats if repeats.most > 1 and settings.may_vary else None
 
 
 OnCases = Callable[[int], None]
@@ -191,7 +142,6 @@ def ground_truth(
     cases: int | None = None,
     seed: int = 0,
     *,
-    repeats: Repeats | None = None,
     workers: Workers | None = None,
     cache: Path | None = None,
     on_cases: OnCases = lambda _: None,
@@ -209,7 +159,6 @@ def ground_truth(
         level: POV level.
         cases: uniform cases; by default those of the paper at the level.
         seed: of their points.
-        repeats: how often a case runs; by default once.
         workers: where they run, by default in this process.
         cache: folder of truths, by default the user's.
         on_cases: told how many cases have just ended.
@@ -222,8 +171,7 @@ def ground_truth(
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"`{name}` is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
-    of_runs = {} if repeats is None else asdict(repeats)
-    kept = TruthKey({**plan.key(level), **of_runs}, level, count, seed, plan.engine)
+    kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
     known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
     if known is not None:
         return known[0]
@@ -231,14 +179,11 @@ def ground_truth(
     check_place(path.parent, CACHE)
     check_own(path)
     check_private(path.parent)
-    dims = len(plan.scenario.dimensions(level))
-    points = np.random.default_rng([seed, level]).random((count, dims))
-    if repeats is None:
-        truth, files = _run(plan, level, points, workers, on_cases)
-    else:
-        truth, files = _run_repeatedly(plan, level, points, repeats, workers, on_cases)
-    names = COLUMNS if truth.runs is None else (*COLUMNS, *COUNTS)
-    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in names}
+    points = np.random.default_rng([seed, level]).random(
+        (count, len(plan.scenario.dimensions(level)))
+    )
+    truth, files = _run(plan.at_level(level), level, points, workers, on_cases)
+    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
     np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
     if not path.parent.is_dir():
         make_place(path.parent, CACHE)
@@ -253,52 +198,17 @@ def _run(
     points: FloatArray,
     workers: Workers | None,
     on_cases: OnCases,
-    draw: int = 0,
 ) -> tuple[Truth, Files]:
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
-    margins = np.full(len(points), np.nan)
-    plan = plan.at_level(level)
+    margins, in_sumo = np.full(len(points), np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
-    cases = CasesAt(Pool(levels=(level,), scenario=plan.scenario), level, points, draw)
-    in_sumo = 0
+    cases = CasesAt(Pool(levels=(level,), scenario=plan.scenario), level, points)
     for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margins):
         margins[place] = margin
         in_sumo += by_sumo
         files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}
         on_cases(1)
     return Truth(points, margins, in_sumo), files
-
-
-def _run_repeatedly(
-    plan: SimulationPlan,
-    level: int,
-    points: FloatArray,
-    repeats: Repeats,
-    workers: Workers | None,
-    on_cases: OnCases,
-) -> tuple[Truth, Files]:
-    """Run the cases at points, (n, d), draw by draw, each until it is decided whether it fails."""
-    margins = np.full((repeats.most, len(points)), np.nan)
-    runs, failed = np.zeros((2, len(points)), dtype=np.int64)
-    open_, in_sumo, files = np.arange(len(points)), 0, Files()
-    for draw in range(repeats.most):
-        ran, loaded = _run(plan, level, points[open_], workers, lambda _: None, draw)
-        files, in_sumo = {**loaded, **files}, in_sumo + ran.in_sumo
-        margins[draw, open_] = ran.margin
-        runs[open_] += ~np.isnan(ran.margin)
-        failed[open_] += ran.margin < 0.0
-        pairs = zip(failed[open_].tolist(), runs[open_].tolist(), strict=True)
-        decided = [n > 0 and is_decided(k, n, repeats.tolerated) for k, n in pairs]
-        on_cases(sum(decided))
-        open_ = open_[~np.array(decided)]
-        if not len(open_):
-            break
-    on_cases(len(open_))
-    # NaN, of what did not run or has no verdict, comes last.
-    numbers = np.arange(1, runs.max(initial=1) + 1)
-    spared = (numbers[:, None] / np.maximum(runs, 1) <= repeats.tolerated).sum(axis=0)
-    margin = np.sort(margins, axis=0)[spared, np.arange(len(points))]
-    return Truth(points, margin, in_sumo, runs, failed), files
 
 
 def known_truth(
@@ -355,21 +265,20 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     """
     dims = len(scenario.dimensions(level))
     try:
-        numbers_bytes = 8 * cases * (dims + 1 + len(COUNTS))
+        numbers_bytes = 8 * cases * (dims + 1)
         check_private(path.parent)
         if regular(path).stat().st_size > numbers_bytes + MOST_FILES_BYTES:
             return None
         data = read_arrays(path)
         points, margin, in_sumo = (data[name] for name in COLUMNS)
-        counts = [data[name] for name in COUNTS if name in data]
         files = decode(str(data["files"]), dict[str, str | None])
         if str(data["of"]) != path.stem or changed(files):
             return None
     except (*UNREADABLE_NPZ, UserError):
         return None
-    if points.shape != (cases, dims) or {len(margin), *map(len, counts)} != {cases}:
+    if points.shape != (cases, dims) or len(margin) != cases:
         return None
-    return Truth(points, margin, int(in_sumo), *counts)
+    return Truth(points, margin, int(in_sumo))
 
 
 def _margins(results: Episodes) -> list[tuple[float, bool, Files]]:
@@ -390,19 +299,16 @@ class TruthResult(Result):
         truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
             points of the `failures`, (m, d).
         criterion: what counts as a failure.
-        tolerated: share of its runs in which a case may fail.
     """
 
     vut: str
     truths: dict[int, Truth]
     criterion: Criterion
-    tolerated: float = 0.0
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints: that of the level, or sums with a list of the levels."""
         levels = [
             {"vut": self.vut, "level": level, **truth.to_record(), "fail_when": self.criterion.text}
-            | ({} if truth.runs is None else {"tolerated": self.tolerated})
             for level, truth in self.truths.items()
         ]
         if len(levels) == 1:
@@ -424,13 +330,8 @@ class TruthResult(Result):
             if truth.tells_regions:
                 regions = counted(len(truth.real_regions()), "region")
                 line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
-            if truth.in_sumo < truth.all_runs:
+            if truth.in_sumo < len(truth.margin):
                 cases = counted(truth.in_sumo, "case")
                 line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
             lines += [line, *(f"  {remark}" for remark in truth.remarks())]
-            if truth.runs is not None:
-                said = f"more than {self.tolerated:.0%} of its runs do" if self.tolerated else ""
-                lines.append(
-                    f"  {truth.all_runs} runs; a case fails where {said or 'any of its runs does'}"
-                )
         return [*lines, f"  a case fails when {self.criterion.words}"]

@@ -59,7 +59,6 @@ class TestATinyReproduction:
             assert f"{column['limit_fmc']:.4f}" in table
             for sampler in column["samplers"].values():
                 assert sampler["fmc"]["median"] <= column["limit_fmc"]
-                assert "sampler_s" not in sampler
         assert "| gpr / truth | - (0.78) | - (0.69) | - (0.44) |" in table
         assert "| coverage / limit |" in table
         assert "| coverage / truth after " in table

@@ -145,9 +145,7 @@ def test_a_study_says_what_samplers_found_of_the_truth(cache):
     assert result.dense == {}
 
 
-def searched(
-    points_by_batch: list[list[tuple[float, float]]], sampler_s: float = 0.0
-) -> SamplerRun:
+def searched(points_by_batch: list[list[tuple[float, float]]]) -> SamplerRun:
     """Return a search at level 0 with failures at points, and one safe case in each batch."""
     outcomes: list[Outcome] = []
     curve = []
@@ -158,7 +156,7 @@ def searched(
             measures = Measures(end=end, score=score, t_end_s=8.3)
             outcomes.append(Outcome(len(outcomes), batch, case, measures))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
-    return SamplerRun(outcomes, curve, sampler_s)
+    return SamplerRun(outcomes, curve)
 
 
 def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
@@ -170,8 +168,8 @@ def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
 TWO = truth_with((0.2, 0.2), (0.8, 0.8))
 SMALL = truth_with((0.2, 0.2), (0.8, 0.8), failures=1)
 NONE = truth_with(failures=0)
-HALF = searched([[], [(0.2, 0.24)]], 1.0)  # 1 case, then 3
-MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]], 3.0)  # 2 cases, then 4
+HALF = searched([[], [(0.2, 0.24)]])  # 1 case, then 3
+MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]])  # 2 cases, then 4
 
 
 def study_of(*searches: SamplerRun, truth: Truth = TWO, **more) -> SamplerStudy:
@@ -188,7 +186,6 @@ class TestASamplerByHand:
         assert found.regions_found == Spread(1.5, 1.25, 1.75)
         assert found.failures == Spread(1.5, 1.25, 1.75)
         assert astuple(found.fmc_over_truth) == pytest.approx((0.75, 0.625, 0.875))
-        assert found.sampler_s == 2.0
         low, median, high = found.fmc_by_batch
         disc = fmc(np.zeros((1, 2)))
         assert (low[0], median[0], high[0]) == pytest.approx((disc / 4, disc / 2, disc * 3 / 4))
