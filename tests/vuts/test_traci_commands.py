@@ -157,35 +157,30 @@ def test_a_speed_that_is_no_number_is_a_fault(drive, function, value):
 
 
 @pytest.mark.parametrize(
-    ("domain", "function", "arguments", "reason"),
+    ("domain", "function", "arguments"),
     [
-        ("vehicle", "setPreviousSpeed", ("vut", 10.0), "as the scenario says"),
-        ("vehicle", "add", ("new", "route.vut"), "as the scenario says"),
-        ("vehicle", "setActionStepLength", ("vut", 1.0), "the VUT acts in every step of 0.1 s"),
-        ("vehicle", "setLength", ("vut", 1.0), "what the vehicles are is the scenario's"),
-        ("vehicle", "setTau", ("pov", 1.0), "the vehicle 'pov' is not the controller's to command"),
-        ("vehicletype", "setTau", ("pov", 1.0), "the type 'pov' is not the controller's"),
-        ("vehicletype", "copy", ("vut", "other"), "what the vehicles are is the scenario's"),
-        ("edge", "setMaxSpeed", ("ramp", 5.0), "the road is the scenario's"),
-        ("simulation", "saveState", ("x.xml",), "the campaign runs the simulation"),
-        ("calibrator", "setFlow", ("c", 0.0, 1.0, 1.0, 1.0, "t", "r"), "none of that kind here"),
+        ("vehicle", "add", ("new", "route.vut")),
+        ("vehicle", "setActionStepLength", ("vut", 1.0)),
+        ("vehicle", "setTau", ("pov", 1.0)),
+        ("vehicletype", "setTau", ("pov", 1.0)),
+        ("edge", "setMaxSpeed", ("ramp", 5.0)),
+        ("simulation", "saveState", ("x.xml",)),
     ],
 )
-def test_what_is_refused_is_named_with_its_reason(drive, domain, function, arguments, reason):
+def test_what_is_refused_is_named(drive, domain, function, arguments):
     drive.begin()
     with pytest.raises(traci.TraCIException) as error:
         getattr(getattr(drive.ours, domain), function)(*arguments)
-    assert reason in str(error.value)
-    assert "'" in reason or f"{domain}." in str(error.value)
+    assert f"{domain}.{function}" in str(error.value) or "'pov' is not" in str(error.value)
     assert drive.ours.vehicle.getSpeed("vut") == 18.0
 
 
-@pytest.mark.parametrize("key", ["has.ssm.device", "device.ssm.file", "device.toc.file"])
-@pytest.mark.parametrize("domain", ["vehicle", "vehicletype"])
-def test_devices_that_would_write_files_are_refused(drive, domain, key, tmp_path):
+def test_devices_that_would_write_files_do_not_reach_sumo(drive, tmp_path):
     drive.begin()
-    with pytest.raises(traci.TraCIException, match="gives vehicles no devices"):
-        getattr(drive.ours, domain).setParameter("vut", key, str(tmp_path / "written"))
+    drive.ours.vehicle.setParameter("vut", "device.ssm.file", str(tmp_path / "written"))
+    drive.step()
+    with pytest.raises(traci.TraCIException, match="no device of type 'ssm' exists"):
+        drive.ours.vehicle.getParameter("vut", "device.ssm.file")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -210,8 +205,8 @@ def commanded(connection, function: str) -> str | None:
 
 def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is_refused(drive):
     """No command but those on the VUT and its type reaches SUMO, and none moves the VUT away."""
-    effects = {f: effect_of(n.functions) for n in named().values() for f in n.functions}
-    functions = [f for n in named().values() if n.command not in QUESTIONS for f in n.functions]
+    effects = {f: effect_of(n) for n in named().values() for f in n}
+    functions = [f for key, n in named().items() if key[0] not in QUESTIONS for f in n]
     tried, called = 0, []
     for function in functions:
         drive.begin()

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import os
 import socket
-import struct
 import sys
 from collections.abc import Callable
 from contextlib import suppress
-from ipaddress import ip_address
 from pathlib import Path
 from time import monotonic
 from typing import Final
@@ -49,11 +47,7 @@ class Door:
                 "traci:PORT"
             ) from error
         self._note = note
-
-    @property
-    def port(self) -> int:
-        """Number of the port."""
-        return int(self._listener.getsockname()[1])
+        self.port = int(self._listener.getsockname()[1])
 
     def accept(self, peer: int | None, patience_s: float) -> socket.socket | None:
         """Return a connection that is to be served; None where none came within `patience_s`."""
@@ -69,8 +63,7 @@ class Door:
                 connection.settimeout(None)
                 return connection
             connection.close()
-            if refusal:
-                self._note(f"{refusal} connected to the port of the controller and was not served")
+            self._note(f"{refusal} connected to the port of the controller and was not served")
         return None
 
     def close(self) -> None:
@@ -79,12 +72,12 @@ class Door:
 
 
 def _refusal(connection: socket.socket, peer: int | None) -> str | None:
-    """Return whose a connection is that is not served; "" if unknown, None if it is served."""
+    """Return whose a connection is that is not served; None if it is served."""
     if not KNOWN_HERE:
         return None
     owner = owner_of(connection)
     if owner is None:
-        return ""  # it is gone already
+        return "a process that is gone"
     user, inode = owner
     if user != os.geteuid():
         return f"a process of the user {user}"
@@ -95,58 +88,40 @@ def _refusal(connection: socket.socket, peer: int | None) -> str | None:
 
 def owner_of(connection: socket.socket) -> tuple[int, int] | None:
     """Return user and inode of the other end of a local connection; None where it is unknown."""
-    ends = connection.getpeername()[:2], connection.getsockname()[:2]
-    hosts = tuple(ip_address(host) for host, _ in ends)
-    ports = tuple(f":{port:04X}" for _, port in ends)
-    for table in ("tcp", "tcp6"):
+    client, server = (
+        (f"{int.from_bytes(socket.inet_aton(host), sys.byteorder):08X}", f":{port:04X}")
+        for host, port in (connection.getpeername(), connection.getsockname())
+    )
+    for table, mapped in (("tcp", ""), ("tcp6", f"{0:016X}{socket.htonl(0xFFFF):08X}")):
+        ends = tuple(f"{mapped}{host}{port}" for host, port in (client, server))
         with suppress(OSError), Path("/proc/self/net", table).open() as lines:
             next(lines, "")
             for line in lines:
                 _, local, remote, _, _, _, _, user, _, inode, *_ = line.split()
-                # Ports first: the table may be long.
-                if (local[-5:], remote[-5:]) != ports or inode == "0":
-                    continue
-                if (_host(local), _host(remote)) == hosts:
+                if (local, remote) == ends and inode != "0":
                     return int(user), int(inode)
     return None
-
-
-def _host(text: str) -> object:
-    """Return the host of an address in the kernel's tables: words in the order of the machine."""
-    host = text.partition(":")[0]
-    words = (int(host[at : at + 8], 16) for at in range(0, len(host), 8))
-    address = ip_address(b"".join(struct.pack("=I", word) for word in words))
-    return getattr(address, "ipv4_mapped", None) or address
 
 
 def descends(inode: int, program: int) -> bool:
     """Return whether a program has a socket, or a process below it or of its session has it."""
     known: dict[int, tuple[int, int]] = {}  # parent and session
-    for entry in os.listdir("/proc"):  # noqa: PTH208 (names alone, of many)
-        if entry.isdecimal():
-            with suppress(OSError, ValueError):
-                stat = Path("/proc", entry, "stat").read_text(encoding="utf-8", errors="replace")
-                _, parent, _, session, *_ = stat.rpartition(")")[2].split()
-                known[int(entry)] = int(parent), int(session)
-
-    def is_of_program(process: int) -> bool:
+    owners: list[int] = []
+    for pid in filter(str.isdecimal, os.listdir("/proc")):  # noqa: PTH208 (names alone, of many)
+        with suppress(OSError, ValueError):
+            stat = Path("/proc", pid, "stat").read_text(encoding="utf-8", errors="replace")
+            _, parent, _, session, *_ = stat.rpartition(")")[2].split()
+            known[int(pid)] = int(parent), int(session)
+    for process in known:
+        with suppress(OSError):
+            for descriptor in Path(f"/proc/{process}/fd").iterdir():
+                with suppress(OSError):
+                    if str(descriptor.readlink()) == f"socket:[{inode}]":
+                        owners.append(process)
+    for owner in owners:
+        above = owner
         for _ in known:  # a number that was given anew could make a circle
-            if process == program:
+            if program in (above, known.get(above, (0, 0))[1]):
                 return True
-            if process not in known:
-                return False
-            parent, session = known[process]
-            process = program if session == program else parent
-        return False
-
-    return any(_has(process, inode) for process in known if is_of_program(process))
-
-
-def _has(process: int, inode: int) -> bool:
-    wanted = f"socket:[{inode}]"
-    with suppress(OSError):
-        for descriptor in Path(f"/proc/{process}/fd").iterdir():
-            with suppress(OSError):
-                if str(descriptor.readlink()) == wanted:
-                    return True
+            above, _ = known.get(above, (0, 0))
     return False

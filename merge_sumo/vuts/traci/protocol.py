@@ -24,7 +24,6 @@ GET_VEHICLE, GET_SIMULATION, SET_VEHICLE = 0xA4, 0xAB, 0xC4
 PARAMETER: Final = 0x7E
 """The variable of `getParameter` and `setParameter` in every domain."""
 
-POSITION_LON_LAT, POSITION_2D, POSITION_LON_LAT_ALT, POSITION_3D, POSITION_ROADMAP = range(5)
 TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x07, 0x08, 0x09, 0x0B
 TYPE_STRING, TYPE_STRINGLIST, TYPE_COMPOUND, TYPE_DOUBLELIST, TYPE_COLOR = 0x0C, *range(0x0E, 0x12)
 """Types of values."""
@@ -32,15 +31,12 @@ OK, NOT_IMPLEMENTED, ERROR = 0x00, 0x01, 0xFF
 """Results of commands."""
 
 _FIXED: Final = {
-    **dict.fromkeys((POSITION_LON_LAT, POSITION_2D), struct.Struct("!dd")),
-    **dict.fromkeys((POSITION_LON_LAT_ALT, POSITION_3D), struct.Struct("!ddd")),
     TYPE_UBYTE: struct.Struct("!B"),
     TYPE_BYTE: struct.Struct("!b"),
     TYPE_INTEGER: struct.Struct("!i"),
     TYPE_DOUBLE: struct.Struct("!d"),
     TYPE_COLOR: struct.Struct("!BBBB"),
 }
-POSITIONS: Final = range(POSITION_ROADMAP + 1)
 _INT, _DOUBLE = _FIXED[TYPE_INTEGER], _FIXED[TYPE_DOUBLE]
 _MAX_NESTING: Final = 4
 
@@ -99,11 +95,9 @@ class Reader:
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value with a type before it.
 
-        Lists and colours are tuples; compounds and positions are lists of what they are made of.
+        Lists and colours are tuples; compounds are lists of what they are made of.
         """
         kind = self.ubyte()
-        if kind in POSITIONS:
-            return self._position(kind)
         if kind in _FIXED:
             values = _FIXED[kind].unpack(self.raw(_FIXED[kind].size))
             return values[0] if len(values) == 1 else values
@@ -126,23 +120,11 @@ class Reader:
         return self._data[start : self._at]
 
     def arguments(self) -> list[Any]:
-        """Return the values that are left, in order; those of compounds and positions singly."""
+        """Return the values that are left, in order; those of compounds singly."""
         values: list[Any] = []
         while self.left:
             values += _flat(self.typed())
         return values
-
-    def place(self) -> tuple[int, list[Any]]:
-        """Return the type of the next value, a position, and what it is made of."""
-        kind = self.ubyte()
-        if kind not in POSITIONS:
-            raise ProtocolError(f"a position was expected, not type 0x{kind:02x}")
-        return kind, self._position(kind)
-
-    def _position(self, kind: int) -> list[Any]:
-        if kind == POSITION_ROADMAP:
-            return [self.string(), self.double(), self.ubyte()]
-        return list(_FIXED[kind].unpack(self.raw(_FIXED[kind].size)))
 
     def _count(self, smallest: int) -> int:
         """Return a number of items that can be there, each of at least `smallest` bytes."""
@@ -223,7 +205,7 @@ def pack(form: str, *values: Any) -> bytes:
     """Return typed values, one for each letter of `form`, as SUMO's own client packs them.
 
     Integer, double, string, signed and unsigned Byte, list of strings, list of floats, position in
-    the plane (o) and in space (O), colour, polygon, and place on a road.
+    the plane (o) and in space (O), colour, and polygon.
     """
     return packer()(form, *values)
 

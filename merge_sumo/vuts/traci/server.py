@@ -9,11 +9,11 @@ from __future__ import annotations
 import math
 import socket
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.child import Channel, channel_of
@@ -24,8 +24,6 @@ from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.commands import NotFiniteError
 from merge_sumo.vuts.traci.protocol import CLOSE, SIMULATION_STEP, Command, ProtocolError, Reader
 from merge_sumo.vuts.traci.session import Session
-
-T = TypeVar("T")
 
 FAREWELL_STEPS: Final = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
@@ -67,7 +65,7 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
         message = channel.receive()
         if message["do"] in ("connect", "drop") or client is None:
             if client is not None:
-                client.close()
+                client.socket.close()
                 client = None
             if message["do"] == "connect":
                 connection = channel.take()
@@ -95,7 +93,7 @@ class Client:
 
     def __init__(self, connection: socket.socket, session: Session, deadline_s: float) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._socket, self.session = connection, session
+        self.socket, self.session = connection, session
         self._deadline_s = deadline_s
         self._commands: deque[Command] = deque()
         self._reply = bytearray()
@@ -139,10 +137,6 @@ class Client:
                 self._answer_step()
                 self._serve_until_step(GRACE_S)
 
-    def close(self) -> None:
-        """Drop it."""
-        self._socket.close()
-
     def _answer_step(self) -> None:
         """Answer the step that the client waits for, unless it asked to step on further."""
         until_s = self._until_step_s
@@ -159,48 +153,47 @@ class Client:
             if not self._commands:
                 self._commands.extend(self._receive(until))
             command = self._commands.popleft()
-            if command.identifier == SIMULATION_STEP:
-                self._ask_for_step(command)
-            elif command.identifier == CLOSE:
-                self._say_goodbye()
-            else:
-                before_s = monotonic()
-                self._reply += self._checked(self.session.handle, command)
-                until += monotonic() - before_s  # it waits for us, and not we for it
+            before_s = monotonic()
+            try:
+                self._do(command)
+            except ProtocolError as error:
+                raise FaultError(
+                    f"the controller sent command 0x{command.identifier:02x} that is no TraCI: "
+                    f"{error}"
+                ) from error
+            except NotFiniteError as error:
+                raise FaultError(f"the controller commanded {error}") from error
+            until += monotonic() - before_s  # it waits for us, and not we for it
             if self._until_step_s is None:
                 self._flush()
 
-    def _ask_for_step(self, command: Command) -> None:
-        """Note up to when the client wants to step; a time of the past is answered at once."""
+    def _do(self, command: Command) -> None:
+        """Answer a command, or note up to when the client wants to step.
+
+        A step to a time of the past is answered at once. Goodbye is a fault where the VUT is on the
+        road.
+        """
         session = self.session
-        target_s = self._checked(lambda step: Reader(step.payload).double(), command)
+        if command.identifier == CLOSE:
+            self._reply += tp.status(CLOSE)
+            self._commands.clear()
+            self._flush()
+            if NAME_OF_VUT in session.sumo.at_m:
+                raise FaultError(
+                    "the controller closed the connection during the episode", gone=True
+                )
+            raise ClosedError
+        if command.identifier != SIMULATION_STEP:
+            self._reply += session.handle(command)
+            return
+        target_s = Reader(command.payload).double()
         session.answered()
         if target_s == 0.0 or target_s > session.sumo.time_s + 1e-9:
             self._until_step_s = target_s
-            return
-        if math.isnan(target_s):
+        elif math.isnan(target_s):
             raise FaultError("the controller stepped to time nan")
-        self._reply += tp.status(SIMULATION_STEP) + session.results()
-
-    def _say_goodbye(self) -> None:
-        """Answer the client's goodbye, which is a fault where the VUT is on the road."""
-        self._reply += tp.status(CLOSE)
-        self._commands.clear()
-        self._flush()
-        if NAME_OF_VUT in self.session.sumo.at_m:
-            raise FaultError("the controller closed the connection during the episode", gone=True)
-        raise ClosedError
-
-    def _checked(self, function: Callable[[Command], T], command: Command) -> T:
-        """Return what a function makes of a command."""
-        try:
-            return function(command)
-        except ProtocolError as error:
-            raise FaultError(
-                f"the controller sent command 0x{command.identifier:02x} that is no TraCI: {error}"
-            ) from error
-        except NotFiniteError as error:
-            raise FaultError(f"the controller commanded {error}") from error
+        else:
+            self._reply += tp.status(SIMULATION_STEP) + session.results()
 
     def _flush(self) -> None:
         """Send the reply once all commands of its message have been answered."""
@@ -209,8 +202,8 @@ class Client:
         content = tp.message(bytes(self._reply))
         self._reply.clear()
         try:
-            self._socket.settimeout(self._deadline_s)
-            self._socket.sendall(content)
+            self.socket.settimeout(self._deadline_s)
+            self.socket.sendall(content)
         except TimeoutError as error:
             raise FaultError(
                 f"the controller took no answer within {self._deadline_s:g} s"
@@ -219,6 +212,7 @@ class Client:
             raise FaultError("the controller closed the connection", gone=True) from error
 
     def _receive(self, until: float) -> list[Command]:
+        """Return the commands of a message that comes before a time."""
         head = self._read(4, until, begun=False)
         try:
             return tp.commands_of(self._read(tp.message_length(head), until, begun=True))
@@ -234,8 +228,8 @@ class Client:
             try:
                 if left_s <= 0.0:
                     raise TimeoutError
-                self._socket.settimeout(left_s)
-                part = self._socket.recv(count - len(parts))
+                self.socket.settimeout(left_s)
+                part = self.socket.recv(count - len(parts))
             except TimeoutError as error:
                 what = "sent half a message and no more" if half else "made no step"
                 raise FaultError(

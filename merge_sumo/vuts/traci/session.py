@@ -1,35 +1,47 @@
 """What a TraCI client sees and may do: questions and commands go to the shadow SUMO.
 
 The session has no socket and does not decide when a step is made. Time runs on over the episodes:
-in each the vehicles depart, and when it ends they arrive.
+in each the vehicles depart, and when it ends they arrive. What a client has subscribed to it gets
+with the answer to every step; SUMO's own results are those before the vehicles are put back, so
+every value is asked for anew.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Final, TypeVar
 
+from merge_sumo.scenario.scenario import VEHICLES
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, RefusedError, ShadowSumo, State
 from merge_sumo.sumo.traci_names import name_of, named
 from merge_sumo.vuts.traci import commands
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.commands import Effect
-from merge_sumo.vuts.traci.protocol import GET_SIMULATION, GET_VEHICLE, Command, Reader, pack
+from merge_sumo.vuts.traci.protocol import (
+    GET_SIMULATION,
+    GET_VEHICLE,
+    PARAMETER,
+    Command,
+    Reader,
+    pack,
+)
 from merge_sumo.vuts.traci.questions import call_of_question, packed
-from merge_sumo.vuts.traci.subscriptions import CONTEXT, RESPONSE, SUBSCRIBE, Subscriptions
 
 T = TypeVar("T")
 
 QUESTIONS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
 SET: Final = 0x20
-"""Distance from there to the identifier of a domain's commands."""
-LOAD, ADD_FILTER = 0x01, 0x7E
-REASONS: Final = {
-    LOAD: "the campaign runs the simulation",
-    ADD_FILTER: "subscribe to all that is around, and choose from it",
-}
-"""Why a command on no variable is refused."""
+SUBSCRIBE: Final = 0x30
+RESPONSE: Final = 0x10
+"""Distances from there to the identifiers of a domain's commands and of its subscriptions, and from
+questions and subscriptions to those of their answers."""
+FOR_EVER: Final = -1073741824.0
+WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE, PARAMETER)}
+"""Domain and variable of getLeader, getFollower and getParameter."""
 OWN_TYPE: Final = f"{NAME_OF_VUT}@{NAME_OF_VUT}"
 """What SUMO calls the type of a vehicle that has numbers of its own."""
 STAYED: Final = (
@@ -41,6 +53,18 @@ EXPECTED: Final = 2
 """Vehicles that are expected between two episodes."""
 
 
+@dataclass(frozen=True, slots=True)
+class Subscription:
+    """Variables of an object, sent from begin to end."""
+
+    getter: int  # identifier of the questions of the object's domain
+    object_id: str
+    begin_s: float
+    end_s: float
+    variables: tuple[tuple[int, bytes], ...]
+    """Numbers of the variables, each with its parameter as it was sent."""
+
+
 class Session:
     """The simulation as one client sees it.
 
@@ -48,11 +72,12 @@ class Session:
         notes: sentences on what a command does less than in SUMO, once each.
         expected: whether more vehicles may come.
         departed: vehicles that departed since the client was last answered; and `arrived`.
+        subscriptions: in the order in which they were made.
     """
 
     def __init__(self, sumo: ShadowSumo) -> None:
         self.sumo = sumo
-        self.subscriptions = Subscriptions(sumo, self._value)
+        self.subscriptions: list[Subscription] = []
         self.notes: list[str] = []
         self.expected = True
         self.departed: list[str] = []
@@ -89,7 +114,11 @@ class Session:
     def clear(self) -> None:
         """End the episode: all vehicles arrive, and what was subscribed of them ends."""
         self._noting_arrivals(self.sumo.clear)
-        self.subscriptions.end_of_vehicles()
+        self.subscriptions = [
+            kept
+            for kept in self.subscriptions
+            if kept.getter != GET_VEHICLE or kept.object_id not in VEHICLES
+        ]
 
     def _noting_arrivals(self, change: Callable[[], T]) -> T:
         before = list(self.sumo.at_m)
@@ -99,7 +128,14 @@ class Session:
 
     def results(self) -> bytes:
         """Return the answer to a step behind its status: the subscribed values."""
-        return self.subscriptions.results(self.sumo.time_s)
+        answers = []
+        for subscription in self.subscriptions:
+            end_s = math.inf if subscription.end_s == FOR_EVER else subscription.end_s
+            if subscription.begin_s <= self.sumo.time_s <= end_s:
+                # Of what SUMO cannot tell any more, nothing is sent.
+                with suppress(RefusedError):
+                    answers.append(self._result(subscription))
+        return tp.raw_integer(len(answers)) + b"".join(answers)
 
     def handle(self, command: Command) -> bytes:
         """Return the answer to any command but a step or a close; raises `ProtocolError`."""
@@ -107,8 +143,7 @@ class Session:
         try:
             return tp.status(identifier) + self._answer(identifier, Reader(command.payload))
         except RefusedError as refused:
-            code = tp.NOT_IMPLEMENTED if identifier in REASONS else tp.ERROR
-            return tp.status(identifier, code, str(refused))
+            return tp.status(identifier, tp.ERROR, str(refused))
 
     def _answer(self, identifier: int, reader: Reader) -> bytes:
         """Return the answer behind its status."""
@@ -121,16 +156,13 @@ class Session:
             self._set(identifier, reader)
             return b""
         if identifier - SUBSCRIBE in QUESTIONS:
-            return self.subscriptions.subscribe(identifier - SUBSCRIBE, reader)
-        if identifier - CONTEXT in QUESTIONS:
-            return self.subscriptions.subscribe_context(identifier - CONTEXT, reader)
+            return self._subscribe(identifier - SUBSCRIBE, reader)
         if identifier == tp.GET_VERSION:
             return tp.version_answer()
         if identifier == tp.SET_ORDER:
             reader.integer()
             return b""
-        reason = REASONS.get(identifier, "it is made for SUMO as a program")
-        raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}: {reason}")
+        raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
 
     def _value(self, getter: int, variable: int, object_id: str, reader: Reader) -> bytes:
         """Return the typed value of a variable; raises `RefusedError` where SUMO has none."""
@@ -139,35 +171,79 @@ class Session:
             return own(self, object_id)
         if (getter, variable) not in named():
             raise RefusedError(f"merge-sumo does not answer {name_of(getter, variable)}")
-        functions = named()[getter, variable].functions
-        function, arguments = call_of_question(functions, object_id, reader)
+        function, arguments = call_of_question(named()[getter, variable], object_id, reader)
         return packed(function, self.sumo.call(function, *arguments))
+
+    def _subscribe(self, getter: int, reader: Reader) -> bytes:
+        """Subscribe to variables of an object; return the first values.
+
+        As in SUMO it adds to one that differs in its variables alone; one without variables ends
+        all of the object.
+        """
+        begin_s, end_s, object_id = reader.double(), reader.double(), reader.string()
+        variables = []
+        for _ in range(reader.ubyte()):
+            variable = reader.ubyte()
+            with_parameter = (getter, variable) in WITH_PARAMETER
+            variables.append((variable, reader.typed_bytes() if with_parameter else b""))
+        if not variables:
+            self.subscriptions = [
+                kept
+                for kept in self.subscriptions
+                if (kept.getter, kept.object_id) != (getter, object_id)
+            ]
+            return b""
+        wanted = Subscription(getter, object_id, begin_s, end_s, tuple(variables))
+        others = []
+        for kept in self.subscriptions:
+            if replace(kept, variables=wanted.variables) == wanted:
+                both = dict.fromkeys((*kept.variables, *wanted.variables))
+                wanted = replace(wanted, variables=tuple(both))
+            else:
+                others.append(kept)
+        answer = self._result(wanted)
+        self.subscriptions = [*others, wanted]
+        return answer
+
+    def _result(self, subscription: Subscription) -> bytes:
+        getter, object_id = subscription.getter, subscription.object_id
+        if getter == GET_VEHICLE and object_id:
+            self._check_vehicle(object_id)
+        content = bytes((getter + SUBSCRIBE + RESPONSE,)) + tp.raw_string(object_id)
+        content += bytes((len(subscription.variables),))
+        for variable, parameter in subscription.variables:
+            try:
+                value, code = self._value(getter, variable, object_id, Reader(parameter)), tp.OK
+            except RefusedError as refused:
+                value, code = pack("s", refused), tp.ERROR
+            content += bytes((variable, code)) + value
+        return tp.command(content)
 
     def _set(self, command: int, reader: Reader) -> None:
         """Have a command carried out, or note that it changes nothing, or refuse it."""
         variable, object_id = reader.ubyte(), reader.string()
-        known = named().get((command, variable))
-        functions = () if known is None else known.functions
+        functions = named().get((command, variable), ())
         name, effect = name_of(command, variable), commands.effect_of(functions)
         if effect is Effect.REFUSED:
-            reason = commands.reason_against(functions)
-            raise RefusedError(f"merge-sumo does not carry out {name}: {reason}")
-        if command == tp.SET_VEHICLE and object_id not in self.sumo.at_m:
-            raise RefusedError(f"Vehicle '{object_id}' is not known.")
-        mine = object_id in (NAME_OF_VUT, OWN_TYPE)
+            raise RefusedError(
+                f"merge-sumo does not carry out {name}: the scenario and the campaign decide it"
+            )
+        if command == tp.SET_VEHICLE:
+            self._check_vehicle(object_id)
         self._knows_of_the_lane |= "Lane" in name
-        if effect is Effect.ON_A_LANE and self.sumo.has_lane:
-            effect = Effect.CARRIED_OUT
-        if effect is Effect.CARRIED_OUT and mine:
-            function, arguments = commands.call_of_command(functions, object_id, reader)
-            if function == "vehicle.changeLane":
-                self._check_lane(*arguments[:2])
-            self.sumo.call(function, *arguments)
+        if effect is Effect.NOTHING or (effect is Effect.ON_A_LANE and not self.sumo.has_lane):
+            self._note(f"{name} is accepted and changes nothing here")
             return
-        if effect is Effect.CARRIED_OUT and commands.OF_OTHERS.isdisjoint(functions):
-            what = "vehicle" if command == tp.SET_VEHICLE else "type"
-            raise RefusedError(f"the {what} '{object_id}' is not the controller's to command")
-        self._note(f"{name} is accepted and changes nothing here")
+        if object_id not in (NAME_OF_VUT, OWN_TYPE):
+            raise RefusedError(f"{object_id!r} is not the controller's to command")
+        function, arguments = commands.call_of_command(functions, object_id, reader)
+        if function == "vehicle.changeLane":
+            self._check_lane(*arguments[:2])
+        self.sumo.call(function, *arguments)
+
+    def _check_vehicle(self, name: str) -> None:
+        if name not in self.sumo.at_m:
+            raise RefusedError(f"Vehicle '{name}' is not known.")
 
     def _check_lane(self, name: str, index: object) -> None:
         """Refuse a lane that the vehicle's edge does not have, as SUMO's server does."""

@@ -146,7 +146,7 @@ class TraciVut(Driver):
     def close(self) -> None:
         """Let the client see the last arrival and end; then end it."""
         ends = True
-        if self._client is not None and self._shadow.listens:
+        if self._client is not None:
             with suppress(FaultError, VutLostError):
                 ends = "closed" in self._ask({"do": "farewell"})
         self._disconnect(grace=ends)
@@ -208,7 +208,6 @@ class TraciVut(Driver):
                 f"the SUMO that answers the controller {died}", killed=died.killed
             ) from died
         except TimeoutError as error:
-            self._shadow.close()
             raise FaultError(
                 "the SUMO that answers the controller did not come to an end with what it asked"
             ) from error
@@ -220,11 +219,6 @@ class TraciVut(Driver):
         if answer["gone"] and self._program is not None and (ended := self._program.ended(0.5)):
             text += f"; {ended}"
         raise FaultError(text)
-
-    @property
-    def _peer(self) -> int | None:
-        """The process whose connections are served; None for all of this user."""
-        return None if self._program is None else self._program.process
 
     def _connect(self) -> None:
         """Wait for a client, with a program started anew if there is a command.
@@ -266,13 +260,14 @@ class TraciVut(Driver):
         try:
             self._shadow.serve(connection, self._options.deadline_s)
         except (ChildDiedError, TimeoutError) as error:
-            self._shadow.close()
+            self._shadow.close()  # also where it did not get ready
             self._disconnect()
             raise FaultError(f"the SUMO that answers the controller failed: {error}") from error
 
     def _accept(self, door: Door, patience_s: float) -> socket.socket | None:
         """Return the connection to serve; None when none comes, or the program has ended."""
-        until, peer = monotonic() + patience_s, self._peer
+        until = monotonic() + patience_s
+        peer = None if self._program is None else self._program.process
         while True:
             # A program that ended will not connect any more, which is checked in between.
             connection = door.accept(peer, max(min(0.1, until - monotonic()), 0.001))
@@ -310,15 +305,12 @@ class TraciVut(Driver):
         if self._client is not None:
             self._client.close()
             self._client = None
-            if self._shadow.listens:
-                with suppress(ChildDiedError, TimeoutError):
-                    self._shadow.ask({"do": "drop"}, WORK_S)
-            else:
-                self._shadow.close()
+            with suppress(ChildDiedError, TimeoutError):
+                self._shadow.ask({"do": "drop"}, WORK_S)
 
 
 class Shadow:
-    """The process with the shadow SUMO that serves clients; started anew when it has died."""
+    """The process with the shadow SUMO that serves clients; started anew when it has ended."""
 
     def __init__(self, road: Corridor, scenario: Scenario) -> None:
         """Take what it shows; `start` starts it."""
@@ -326,8 +318,6 @@ class Shadow:
         self._opened = ExitStack()
         self._child: SumoChild | None = None
         self._ready = False
-        self.listens = False
-        """Whether it has answered every message: a person may stop this process before."""
 
     def start(self) -> None:
         """Start it, if it does not run; it gets ready while the controller starts."""
@@ -341,37 +331,36 @@ class Shadow:
             self._opened = opened.pop_all()
 
     def serve(self, connection: socket.socket, deadline_s: float) -> None:
-        """Hand a connection over to it.
-
-        Raises `UserError` where SUMO cannot use the net, `ChildDiedError` when the process has
-        ended, and TimeoutError when it does not answer.
-        """
-        assert self._child is not None, "started"  # noqa: S101
-        if not self._ready:
+        """Hand a connection over to it; raises `UserError` where SUMO cannot use the net."""
+        if not self._ready and self._child is not None:
             message = self._child.receive(START_S)
             if "refused" in message:
                 why = self._child.said() or message["refused"]
                 raise UserError(f"SUMO cannot use the net {self._road.path}: {why}")
             self._ready = True
-        self._child.ask({"do": "connect", "deadline_s": deadline_s}, WORK_S, connection)
-        self.listens = True
+        self.ask({"do": "connect", "deadline_s": deadline_s}, WORK_S, connection)
 
-    def ask(self, message: Mapping[str, Any], patience_s: float) -> dict[str, Any]:
-        """Return its answer; raises `ChildDiedError`, or TimeoutError where there is none."""
+    def ask(
+        self,
+        message: Mapping[str, Any],
+        patience_s: float,
+        connection: socket.socket | None = None,
+    ) -> dict[str, Any]:
+        """Return its answer; raises `ChildDiedError`, or TimeoutError where there is none.
+
+        Without an answer it is ended: a person may stop this process before.
+        """
         if self._child is None:
             raise ChildDiedError("is not there")
-        self.listens = False
         try:
-            answer = self._child.ask(message, patience_s)
-        except ChildDiedError:
+            return self._child.ask(message, patience_s, connection)
+        except BaseException:
             self.close()
             raise
-        self.listens = True
-        return answer
 
     def close(self) -> None:
         """End it."""
-        self._child, self._ready, self.listens = None, False, False
+        self._child, self._ready = None, False
         self._opened.close()
 
 
