@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -131,19 +130,3 @@ def test_one_index_is_as_good_as_a_list(run, tmp_path):
     assert len(ms.rerun(run.folder, 3).steps[0].cases) == 1
     (path,) = ms.export(run.folder, 3, out=tmp_path / "scenarios")
     assert path.is_file()
-
-
-@pytest.mark.long
-def test_the_example_of_the_tutorial_runs(tmp_path, monkeypatch):
-    page = Path(__file__).parents[2] / "docs" / "tutorials" / "python.md"
-    code = page.read_text(encoding="utf-8").split("```python", 1)[1].split("```", 1)[0]
-    assert "cases=400" in code
-    monkeypatch.chdir(tmp_path)
-    script = tmp_path / "example.py"
-    script.write_text(code.replace("cases=400", "cases=40"), encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, str(script)], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    folder = tmp_path / "runs" / "latest"
-    assert (folder / "report.html").is_file()

@@ -12,7 +12,6 @@ import re
 import shutil
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -21,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import require
 from processes import cpu_s
 
 from merge_sumo.errors import UserError
@@ -539,35 +537,3 @@ def test_what_is_read_is_bounded_in_elements_and_in_bytes(tmp_path):
     file.write_bytes(b"x" * (received.MAX_BYTES + 1))
     with pytest.raises(UserError, match="larger than 4 MiB"):
         received.read_bytes(file, "it", follow_links=False)
-
-
-TOUCHING = (
-    "openat,open,creat,connect,bind,listen,unlink,unlinkat,rename,renameat,mkdir,link,symlink"
-)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", [n for n, (*_, expected) in TEXTS.items() if expected != REFUSED])
-def test_sumo_opens_nothing_of_a_hostile_folder_or_of_the_user(scene, name):
-    """Asks the kernel: what SUMO opened to write lies in our folder, and it calls nobody."""
-    strace = shutil.which("strace")
-    require(strace is not None, "strace is not on the PATH")
-    attack(scene, name)
-    trace = scene.root.parent / f"{scene.root.name}.strace"
-    command = [str(strace), "-f", "-o", str(trace), "-e", f"trace={TOUCHING},execve"]
-    command += [sys.executable, "-m", "merge_sumo.cli", "replay", str(scene.folder)]
-    environment = {**os.environ, "TMPDIR": str(scene.root / "tmp")}
-    assert_nothing_happens(
-        scene, lambda: subprocess.run(command, env=environment, capture_output=True, check=False)
-    )
-    lines = trace.read_text(errors="replace").splitlines()
-    (start,) = (n for n, line in enumerate(lines) if re.search(r'execve\(".*/bin/sumo"', line))
-    sumo = lines[start].split()[0]
-    calls = [line.split(maxsplit=1)[1] for line in lines[start + 1 :] if line.startswith(sumo)]
-    assert any(RECORD in call for call in calls), "the trace is that of SUMO"
-    for call in calls:
-        assert not re.match("connect|bind|listen|unlink|rename|mkdir|link|symlink", call), call
-        assert str(scene.folder) not in call
-        assert str(scene.root / "home") not in call
-        if "O_WRONLY" in call or "O_RDWR" in call or "O_CREAT" in call:
-            assert f'"{replay_module.REPLAYED}"' in call, call

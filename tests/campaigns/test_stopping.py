@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from campaigning import run_campaign
 
+from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, coverage_by_level, has_converged
 from merge_sumo.coverage.fmc import fmc
@@ -55,12 +56,15 @@ class TestTheRule:
         assert coverage_by_level([]) == {}
 
 
-@pytest.mark.slow
-def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(tmp_path):
-    plan: dict[str, Any] = {"vut": "design1", "levels": (0,), "cases": 400, "scenario": US23}
+def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(stopping, "WINDOW", 20)
+    plan: dict[str, Any] = {"vut": "design1", "levels": (0,), "cases": 120, "scenario": US23}
+    plan["sampler"] = "annealing"
     whole = run_campaign(CampaignSettings(**plan), tmp_path / "whole")
     early = run_campaign(CampaignSettings(**plan, stop_when_converged=True), tmp_path / "early")
-    assert 100 < len(early.outcomes) < len(whole.outcomes) == 400
+    assert 20 < len(early.outcomes) < len(whole.outcomes) == 120
     text = (tmp_path / "whole" / "outcomes.jsonl").read_bytes()
     assert text.startswith((tmp_path / "early" / "outcomes.jsonl").read_bytes())
     assert json.loads((tmp_path / "early" / "campaign.json").read_text())["stop_when_converged"]

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import shlex
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
-from ci_snippets import PAGE, commands, main
+from ci_snippets import PAGE, commands
 
 TEXT = PAGE.read_text(encoding="utf-8")
 
@@ -21,17 +15,3 @@ def test_a_workflow_installs_runs_a_campaign_with_gates_and_the_test(kind):
     assert campaign.startswith("merge-sumo campaign --vut controller.py:Controller")
     assert "--gate failures" in campaign
     assert test == "python -m pytest test_controller.py"
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("kind", ["github", "gitlab"])
-def test_the_commands_pass_in_a_fresh_folder(kind, tmp_path, capsys):
-    folder = tmp_path / "controller"
-    main(kind, folder)
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for line in capsys.readouterr().out.splitlines()[1:]:  # the package is installed
-        done = subprocess.run(
-            shlex.split(line), cwd=folder, env={**os.environ, "PATH": path}, check=False
-        )
-        assert done.returncode == 0, line
-    assert (folder / "runs" / "ci" / "report.html").is_file()

@@ -10,7 +10,6 @@ import pytest
 from merges import HALF, SMALLER
 from plans import POVS
 
-from merge_sumo.coverage.fmc import fmc, regions
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.levelk import (
     FEATURES,
@@ -29,7 +28,7 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.scenario.case import from_unit, to_unit
+from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import World
@@ -62,15 +61,6 @@ def played(vut, cases, corridors=32):
         got = dict(rollout(world, PovLibrary(corridors, POVS), driver, cases))
     trajectories = [got[index] for index in range(len(cases))]
     return [measure(t) for t in trajectories], trajectories
-
-
-def picture(vut, level, count):
-    """Return FMC and sizes of the failure regions over uniform cases."""
-    cases = uniform_cases(level, count, seed=1)
-    measures, _ = played(vut, cases)
-    failing = (c for c, m in zip(cases, measures, strict=True) if m.is_close)
-    points = to_unit(failing, level, scenario=US23)
-    return fmc(points), np.bincount(regions(points)) if len(points) else np.array([])
 
 
 @pytest.mark.parametrize("folder", [policies_of(US23), policies_in(HUMAN)], ids=["paper", HUMAN])
@@ -258,27 +248,3 @@ class TestTheExampleRuns:
         assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
         assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"
         assert run.a_vut_mps2.min() <= -1.0
-
-
-@pytest.mark.long
-class TestThePapersPicture:
-    """Wang et al., Table II: where the designs fail, and in how many regions."""
-
-    def test_design1_fails_against_level_0_in_one_band(self):
-        found, sizes = picture("design1", 0, 10_000)
-        assert 0.10 <= found <= 0.16
-        # A lone failure at a thin end of the band may be farther than rho from its neighbour.
-        assert sizes[0] >= 0.95 * sizes.sum()
-
-    def test_design2_never_fails_against_level_0(self):
-        assert picture("design2", 0, 10_000)[0] == 0.0
-
-    def test_design2_fails_against_level_1_in_at_least_three_regions(self):
-        found, sizes = picture("design2", 1, 10_000)
-        assert 0.05 <= found <= 0.12
-        assert (sizes >= 0.03 * sizes.sum()).sum() >= 3
-
-    def test_design2_has_two_far_apart_modes_at_level_2(self):
-        found, sizes = picture("design2", 2, 20_000)
-        assert 0.003 <= found <= 0.02
-        assert len(sizes) >= 2

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from merge_sumo.scenario.scenario import US23, as_merge
 from merge_sumo.training.reward import RewardWeights
 
 ROUNDABOUT = as_merge(named_scenario("roundabout"))
-RADIUS_M = 25.0
 
 
 @pytest.fixture(scope="module")
@@ -36,10 +34,6 @@ def road():
 def uniform_cases(count: int, level: int = 0, seed: int = 0):
     points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
     return from_unit(points, level, scenario=ROUNDABOUT)
-
-
-def from_the_middle_m(at) -> float:
-    return math.hypot(at.x_m, at.y_m)
 
 
 class TestItsDrivers:

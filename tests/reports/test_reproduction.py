@@ -10,9 +10,8 @@ import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.reproduction_page import write_reproduction
-from merge_sumo.studies.reproduction import TABLE_II, Reproduction, Scale, quick, reproduce
+from merge_sumo.studies.reproduction import TABLE_II, Reproduction, Scale, reproduce
 from merge_sumo.studies.truth import Truth
-from merge_sumo.system.workers import open_workers
 
 FIGURES = {
     "cases-level0.png",
@@ -82,14 +81,3 @@ def test_the_papers_table_is_the_papers():
     for column in TABLE_II:
         order = [column.paper[name] for name in ("gpr", "subset", "annealing", "uniform")]
         assert order == sorted(order, reverse=True)
-
-
-@pytest.mark.long
-def test_a_quick_reproduction_is_the_same_twice(tmp_path, monkeypatch):
-    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
-    for name, count in (("a", 2), ("b", 1)):
-        (tmp_path / name).mkdir()
-        with open_workers(count) as workers:
-            write_reproduction(reproduce(quick(2), workers=workers), tmp_path / name)
-    for path in (tmp_path / "a").iterdir():
-        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes(), path.name

@@ -18,7 +18,6 @@ from conftest import some
 from controllers import (
     RAW_CLIENT,
     STOCK_CLIENT,
-    SUPPORT,
     assert_drives_as_level0,
     program,
     raw_client,
@@ -31,7 +30,6 @@ from merge_sumo.scenario.trajectory import End
 from merge_sumo.vuts.traci import door
 from merge_sumo.vuts.traci.door import descends, owner_of
 
-RAW = SUPPORT / "raw_traci.py"
 OURS = raw_client()
 
 
