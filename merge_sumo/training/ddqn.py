@@ -6,7 +6,7 @@ What differs from the textbook, and why:
   game is deterministic, so that does not change which action is best, and the crash term no longer
   drowns the rest.
 - The target network follows by Polyak averaging, and that average is what is kept.
-- Exploring starts (`env.exploring_starts`).
+- Exploring starts (`game.exploring_starts`).
 - psi is drawn anew for every replayed transition: the reward is stored in its three parts.
 - No discount: every game ends.
 """
@@ -25,10 +25,12 @@ from torch import Tensor, nn
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
-from merge_sumo.training.env import MergeGame, exploring_starts
+from merge_sumo.training.game import Game, exploring_starts
 from merge_sumo.training.reward import RewardParts, Role
 
 SQUASH_BELOW: Final = -2.0
+GAMES: Final = 64
+"""Games that are played at once."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -55,14 +57,23 @@ class DdqnSettings:
     last_midway: float = 0.6  # share of games that begin mid-way from then on
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class TrainingProgress:
     """The progress of training, after every thousand updates of DDQN or a round of refinement."""
 
-    done: int  # updates, or rounds
+    network: str = ""  # its name
+    stage: str = "ddqn"  # or "refine"
+    done: int  # updates or rounds done in this stage
+    total: int  # updates or rounds of this stage
     loss: float  # of DDQN's fit, or the mean loss of return that a choice of the network means
-    mean_return: float  # of the games that were played lately
-    crash_share: float | None  # share of collisions among them; None while refining
+    mean_return: float  # of the games played lately, from exploring starts
+    crash_share: float | None = None  # share of collisions among them; None while refining
+
+    @property
+    def note(self) -> str:
+        """The measurements, for a bar."""
+        crashes = "" if self.crash_share is None else f"  crashes {self.crash_share:.2%}"
+        return f"return {self.mean_return:.3f}{crashes}"
 
 
 def squash(q: Tensor) -> Tensor:
@@ -115,12 +126,12 @@ class ReplayBuffer:
 
 
 def train(
-    game: MergeGame,
+    game: Game,
     seed: int,
     settings: DdqnSettings | None = None,
     *,
     sees_svo: bool = False,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> QNetwork:
     """Train the agent of a game and return its network; same seed, same weights."""
     s = settings or DdqnSettings()
@@ -160,46 +171,53 @@ def train(
                 torch._foreach_lerp_(averages, weights, s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
-                on_progress(Progress(update, float(loss.detach()), *collector.recent()))
+                mean_return, crash_share = collector.recent()
+                on_progress(
+                    TrainingProgress(
+                        done=update,
+                        total=s.updates,
+                        loss=float(loss.detach()),
+                        mean_return=mean_return,
+                        crash_share=crash_share,
+                    )
+                )
     return export(target, game.a_min_mps2)
 
 
 class _Collector:
-    """Plays all games of a `MergeGame` and writes what happened into the replay."""
+    """Plays games and writes what happened into the replay."""
 
     def __init__(
-        self, game: MergeGame, rng: np.random.Generator, midway: float, *, sees_svo: bool
+        self, game: Game, rng: np.random.Generator, midway: float, *, sees_svo: bool
     ) -> None:
         self.game, self.rng, self.midway, self.sees_svo = game, rng, midway, sees_svo
-        self.decisions = np.zeros(game.corridors, dtype=np.int64)
-        self.svo_rad = np.zeros(game.corridors)
-        self.returns = np.zeros(game.corridors)
+        self.state = np.zeros((GAMES, 4))
+        self.decisions = np.zeros(GAMES, dtype=np.int64)
+        self.svo_rad, self.returns = np.zeros((2, GAMES))
         self.ended: list[tuple[float, bool]] = []
-        self._begin(np.arange(game.corridors))
-        self.state = game.state()
+        self._begin(np.arange(GAMES))
 
     def _begin(self, which: np.ndarray) -> None:
-        starts = exploring_starts(len(which), self.rng, self.midway, scenario=self.game.scenario)
-        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, len(which)) * self.sees_svo
-        for corridor, start in zip(which.tolist(), starts, strict=True):
-            self.game.begin(corridor, start)
+        n, scenario = len(which), self.game.scenario
+        self.state[which] = exploring_starts(n, self.rng, self.midway, scenario=scenario)
+        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, n) * self.sees_svo
         self.decisions[which] = 0
         self.returns[which] = 0.0
 
     def collect(self, online: nn.Sequential, epsilon: float, replay: ReplayBuffer) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
-        games = self.game.corridors
         before = features(*self.state.T, scenario=self.game.of_agent)
         seen = before
         if self.sees_svo:
             seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
         with torch.no_grad():
             action = online(torch.from_numpy(seen.astype(np.float32))).argmax(-1).numpy()
-        random = self.rng.integers(0, ACTIONS, games)
-        action = np.where(self.rng.random(games) < epsilon, random, action)
-        state, parts, over = self.game.decide(self.game.actions_mps2[action])
+        random = self.rng.integers(0, ACTIONS, GAMES)
+        action = np.where(self.rng.random(GAMES) < epsilon, random, action)
+        a_mps2 = self.game.actions_mps2[action]
+        self.state, parts, over = self.game.decide(self.state, self.svo_rad, a_mps2)
         in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
-        after = features(*state.T, scenario=self.game.of_agent)
+        after = features(*self.state.T, scenario=self.game.of_agent)
         replay.add(before, action, in_parts, after, ~over)
         self.returns += parts.of(self.game.role, self.svo_rad)
         self.decisions += 1
@@ -210,15 +228,11 @@ class _Collector:
                 self.returns[again].tolist(), (parts.safe[again] < -crash / 2).tolist(), strict=True
             )
             self._begin(again)
-            state[again] = self.game.state()[again]
-        self.state = state
 
     def recent(self) -> tuple[float, float]:
         """Return mean return and share of crashes of the games that ended last."""
         last = self.ended = self.ended[-2000:]
-        if not last:
-            return math.nan, math.nan
-        mean_return, crash_share = np.mean(last, axis=0).tolist()
+        mean_return, crash_share = np.mean(last, axis=0).tolist() if last else (math.nan, math.nan)
         return mean_return, crash_share
 
 

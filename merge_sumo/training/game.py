@@ -1,8 +1,8 @@
 """The merging game as a function of states: eq. (4) and a known opponent, thousands at once.
 
-SUMO follows eq. (4) to 1e-9, so what is played here is what happens there. A level-k driver knows
-its opponent, the driver of level k-1, so it can play the game out: that is what refinement
-(`refine`) and the search for a best response (`best_response`) do.
+SUMO follows eq. (4) to 1e-9, so what is played here is what happens there (`check.py` looks). A
+level-k driver knows its opponent, the driver of level k-1, so it can play the game out: that is
+what refinement (`refine`) and the search for a best response (`best_response`) do.
 
 A state is [x_POV, v_POV, x_VUT, v_VUT], in m and m/s; a decision lasts 0.5 s.
 """
@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.level0 import level0_acceleration
+from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
 from merge_sumo.drivers.levelk import (
     ACTIONS,
     DECISION_STEPS,
@@ -24,8 +24,9 @@ from merge_sumo.drivers.levelk import (
     features,
 )
 from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scale import Units
 from merge_sumo.scenario.scenario import DT_S, MergeScenario, Scenario, as_merge
-from merge_sumo.training.reward import Reward, RewardParts, Role
+from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 
 IntArray = NDArray[np.int64]
 
@@ -54,11 +55,16 @@ class Game:
         return self.reward.scenario
 
     @property
+    def of_agent(self) -> Scenario:
+        """The scenario with the agent's limit of braking."""
+        if self.a_min_mps2 is None:
+            return self.scenario
+        return replace(self.scenario, a_min_mps2=self.a_min_mps2)
+
+    @property
     def actions_mps2(self) -> FloatArray:
         """The accelerations that the agent chooses from."""
-        if self.a_min_mps2 is None:
-            return actions_mps2(self.scenario)
-        return actions_mps2(replace(self.scenario, a_min_mps2=self.a_min_mps2))
+        return actions_mps2(self.of_agent)
 
     @property
     def max_decisions(self) -> int:
@@ -69,6 +75,13 @@ class Game:
         self, state: FloatArray, svo_rad: FloatArray, a_mps2: FloatArray
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
         """Hold accelerations, (n,), for one decision; return states, rewards, and what is over."""
+        after, parts, over = self.decide(state, svo_rad, a_mps2)
+        return after, parts.of(self.role, svo_rad), over
+
+    def decide(
+        self, state: FloatArray, svo_rad: FloatArray, a_mps2: FloatArray
+    ) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
+        """Return the same with the rewards in parts; what is over stands at t1."""
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         of_pov, reward = self.role == "pov", self.reward
         profile = self.scenario.level0_a_mps2, self.scenario.level0_v_mps
@@ -97,8 +110,8 @@ class Game:
                 safe += arrived * reward.safety(x_pov - x_vut, v_pov - v_vut)
                 vut_ego += arrived * reward.vut_end(v_vut)
                 live &= ~arrived
-        gained = RewardParts(safe, pov_ego, vut_ego).of(self.role, svo_rad)
-        return np.stack([x_pov, v_pov, x_vut, v_vut], axis=1), gained, ~live
+        parts = RewardParts(safe, pov_ego, vut_ego)
+        return np.stack([x_pov, v_pov, x_vut, v_vut], axis=1), parts, ~live
 
     def play(
         self,
@@ -159,3 +172,54 @@ def inputs_of(
     psi = svo_rad if network.sees_svo else None
     x_pov, v_pov, x_vut, v_vut = state.T
     return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=network.limited(scenario))
+
+
+def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
+    """Return `n` starting states, (n, 4), uniform over the pool."""
+    merge = as_merge(scenario)
+    x_pov = rng.uniform(*merge.x_pov0_m, n)
+    v_pov = rng.uniform(*merge.v_pov0_mps, n)
+    v_vut = _starting_speeds(n, rng, scenario)
+    return np.stack([x_pov, v_pov, np.full(n, scenario.x_vut0_m), v_vut], axis=1)
+
+
+def _starting_speeds(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
+    low, high = scenario.bounds("v_vut0_mps")
+    return rng.uniform(low, high, n) if low < high else np.full(n, low)
+
+
+def exploring_starts(
+    n: int, rng: np.random.Generator, midway: float = 0.6, *, scenario: Scenario
+) -> FloatArray:
+    """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
+
+    Most of the former are states from which both would reach M together, because that is where
+    a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
+    drivers there.
+    """
+    unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
+    x_vut0, a, v_cruise = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
+    merge = as_merge(scenario)
+    (x_low, _), (v_low, v_high) = merge.x_pov0_m, merge.v_pov0_mps
+    x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
+    v_vut0 = _starting_speeds(n, rng, scenario)
+    on_profile = np.sqrt(v_vut0**2 + 2.0 * a * (x_vut - x_vut0)) + rng.normal(
+        0.0, 3.0 * unit.speed, n
+    )
+    v_vut = np.where(
+        rng.random(n) < 0.6,
+        on_profile,
+        rng.uniform(2.0 * unit.speed, scenario.v_hw_max_mps, n),
+    ).clip(unit.speed, scenario.v_hw_max_mps + unit.speed)
+    v_pov = np.where(
+        rng.random(n) < 0.7,
+        rng.uniform(v_low - 5.0 * unit.speed, v_high + 2.0 * unit.speed, n),
+        rng.uniform(v_low - 17.0 * unit.speed, v_high + 7.0 * unit.speed, n),
+    ).clip(0.0)
+    gap = wide_gap * np.where(
+        rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n)
+    )
+    x_pov = gap - v_pov * level0_time_to(-x_vut, v_vut, a, v_cruise)
+    x_pov = x_pov.clip(x_low - 80.0 * unit.length, 150.0 * unit.length)
+    states = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
+    return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng, scenario))

@@ -1,7 +1,7 @@
 """The double helix: each level-k driver is trained against level k-1 (Wang et al., Fig. 2b).
 
 The two networks of a level do not depend on each other and are trained in parallel, in a process
-each. A network is first trained by DDQN in SUMO (`ddqn`), then refined (`refine`).
+each. A network is first trained by DDQN (`ddqn`), then refined (`refine`), then checked in SUMO.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ import queue
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import closing, suppress
-from dataclasses import dataclass, field
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from safetensors.numpy import save
 
-from merge_sumo.drivers.levelk import LIMIT, LevelKDriver, QNetwork
+from merge_sumo.drivers.levelk import LIMIT, QNetwork
 from merge_sumo.drivers.policies import (
     MANIFEST,
     NETWORKS,
@@ -35,7 +34,6 @@ from merge_sumo.drivers.policies import (
     scenario_record,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.folders import (
@@ -51,8 +49,7 @@ from merge_sumo.system.records import to_json, to_plain
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
 from merge_sumo.system.workers import leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network
-from merge_sumo.training.ddqn import DdqnSettings, Progress, train
-from merge_sumo.training.env import MergeGame, make_opponent
+from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
 from merge_sumo.training.reward import Reward, RewardWeights, Role
@@ -68,8 +65,6 @@ PAIRS: Final[tuple[tuple[str, ...], ...]] = (NETWORKS[:2], NETWORKS[2:])
 """The networks of a level, which do not depend on each other."""
 LOG: Final = ".training.jsonl"
 WEIGHTS: Final = ".safetensors"
-GAMES: Final = 64
-"""Corridors in which transitions are collected."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -92,27 +87,8 @@ more games, nearly all from the pool's own starts, and more updates. Level 1 is 
 more refinement, level 2 stayed farther from its own best response (`policies/README.md`)."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrainingProgress:
-    """The progress of the training of a network: a line of its log."""
-
-    network: str  # name of the network
-    stage: str  # "ddqn" or "refine"
-    done: int  # updates or rounds done in this stage
-    total: int  # updates or rounds of this stage
-    loss: float  # of DDQN's fit, or the mean cost of a choice
-    mean_return: float  # of the games played lately, from exploring starts
-    crash_share: float | None  # share of collisions among them; None while refining
-
-    @property
-    def note(self) -> str:
-        """The measurements, for a bar."""
-        crashes = "" if self.crash_share is None else f"  crashes {self.crash_share:.2%}"
-        return f"return {self.mean_return:.3f}{crashes}"
-
-
-_Task = tuple[str, Game, Corridor, int, TrainingSettings]
-"""Name, game, road, seed and settings of a network, for the process that trains it."""
+_Task = tuple[str, Game, int, TrainingSettings]
+"""Name, game, seed and settings of a network, for the process that trains it."""
 
 
 def train_library(
@@ -144,7 +120,7 @@ def train_library(
             f"{scenario.a_min_mps2:g} to below 0, such as `a_min` {scenario.a_min_mps2 / 2:g}"
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
-    road = road_for(scenario)
+    road_for(scenario)  # on which it is checked in the end
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
@@ -165,7 +141,7 @@ def train_library(
                 role, opponent = OPPONENTS[name]
                 network = None if opponent == "level0" else load_network(opponent, folder)
                 game = Game(role, network, reward, plan.get(LIMIT))
-                tasks.append((name, game, road, seed, of_level))
+                tasks.append((name, game, seed, of_level))
             elif on_done is not None:
                 on_done(name, None)
         for trained, network, check, seconds in _train_in_parallel(folder, tasks, on_progress):
@@ -302,27 +278,15 @@ def _report_into(reports: Any) -> None:
     leave_signals_to_parent()
 
 
-def _train_one(
-    name: str, game: Game, road: Corridor, seed: int, settings: TrainingSettings
-) -> _Trained:
-    """Train a network by DDQN in SUMO, refine it, check it in SUMO."""
-    ddqn, refinement = settings.ddqn, settings.refine
+def _train_one(name: str, game: Game, seed: int, settings: TrainingSettings) -> _Trained:
+    """Train a network by DDQN, refine it, check it in SUMO."""
 
-    def report(stage: str, total: int, now: Progress) -> None:
-        values = (now.done, total, now.loss, now.mean_return, now.crash_share)
-        _reports.put(TrainingProgress(name, stage, *values))
+    def report(now: TrainingProgress) -> None:
+        _reports.put(replace(now, network=name))
 
     started = time.perf_counter()
-    if game.opponent is None:
-        opponent = make_opponent(game.role, "level0", GAMES)
-    else:
-        opponent = LevelKDriver(GAMES, game.opponent)
-    in_sumo = MergeGame(game.role, opponent, game.reward, road, game.a_min_mps2)
-    with closing(in_sumo):
-        of_ddqn = partial(report, "ddqn", ddqn.updates)
-        network = train(in_sumo, seed, ddqn, sees_svo=name == "pov2", on_progress=of_ddqn)
-    of_refinement = partial(report, "refine", refinement.rounds)
-    network = refine(game, network, seed, refinement, of_refinement)
+    network = train(game, seed, settings.ddqn, sees_svo=name == "pov2", on_progress=report)
+    network = refine(game, network, seed, settings.refine, report)
     seconds = time.perf_counter() - started
     check = check_network(name, network, game.opponent, game.reward, settings.check_cases)
     return name, network, check, seconds

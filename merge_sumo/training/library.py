@@ -12,7 +12,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.result import Result
 from merge_sumo.training.check import PolicyCheck, check_policy
-from merge_sumo.training.helix import TrainingProgress, train_library
+from merge_sumo.training.ddqn import TrainingProgress
+from merge_sumo.training.helix import train_library
 
 
 class PolicyChecks(Result, dict[str, PolicyCheck]):

@@ -33,9 +33,8 @@ from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.best_response import beam_search
-from merge_sumo.training.ddqn import Progress, as_torch, export, squash
-from merge_sumo.training.env import exploring_starts
-from merge_sumo.training.game import Game, IntArray, greedy, inputs_of
+from merge_sumo.training.ddqn import TrainingProgress, as_torch, export, squash
+from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy, inputs_of
 
 BETTER: Final = 1e-3
 """A game that was found is better than the policy's where its return is higher by more."""
@@ -49,7 +48,7 @@ class RefineSettings:
 
     rounds: int = 16  # of policy iteration
     starts: int = 1_500  # games per round
-    midway: float = 0.25  # share of them that begin mid-way (`env.exploring_starts`)
+    midway: float = 0.25  # share of them that begin mid-way (`game.exploring_starts`)
     searched: int = 300  # starts from which a better game is searched for
     hard: float = 0.5  # share of these that are near starts where the last search found most
     near: float = 0.02  # how near, in standard deviations of the starts
@@ -101,7 +100,7 @@ def refine(
     network: QNetwork,
     seed: int,
     settings: RefineSettings | None = None,
-    on_progress: Callable[[Progress], None] | None = None,
+    on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> QNetwork:
     """Return the network, refined for its game; same seed, same weights."""
     from threadpoolctl import threadpool_limits
@@ -123,7 +122,15 @@ def refine(
             cost = _fit(model, average, optimiser, rounds, rng, s, number)
             network = export(average, game.a_min_mps2)
             if on_progress is not None:
-                on_progress(Progress(number + 1, cost, tried.mean_return, None))
+                on_progress(
+                    TrainingProgress(
+                        stage="refine",
+                        done=number + 1,
+                        total=s.rounds,
+                        loss=cost,
+                        mean_return=tried.mean_return,
+                    )
+                )
     return network
 
 

@@ -20,7 +20,7 @@ from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import nearest
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criteria import CRITERIA, PAPER
-from merge_sumo.verdict.expression import Condition, Value, Vocabulary, names_of, parse_condition
+from merge_sumo.verdict.expression import Condition, Value, Vocabulary, parse_condition
 from merge_sumo.verdict.measures import MEASURES
 from merge_sumo.verdict.score import (
     FOLLOWED_UP,
@@ -68,7 +68,7 @@ class Criterion:
         if name not in CRITERIA:
             if name.isidentifier() and (near := nearest(name, CRITERIA)):
                 raise UserError(f"`fail_when` is {printable(name)!r}: did you mean {near[0]}?")
-            _, name = parse_condition(self.fail_when, vocabulary(), "`fail_when`", _conditions())
+            _, name = _parsed(self.fail_when)
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
             if name != PAPER:
@@ -88,7 +88,7 @@ class Criterion:
         if self.require is not None:
             try_formula(self.require)
             return
-        spoken = _names(self.words)
+        spoken = condition_of(self.words).names
         if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
             where = scenario.said("behind M")
             raise UserError(
@@ -109,7 +109,7 @@ class Criterion:
     @property
     def speaks_of_score(self) -> bool:
         """Whether it is a condition on the score, whose margin may be that of the score."""
-        return self.require is None and "score" in _names(self.words)
+        return self.require is None and "score" in condition_of(self.words).names
 
     @property
     def text(self) -> str:
@@ -129,7 +129,8 @@ class Criterion:
             return margin_of(measures.score)
         if self.require is not None:
             return robustness(self.require, trajectory)
-        return condition_of(self.words).margin(values_of(measures, _names(self.words)))
+        condition = condition_of(self.words)
+        return condition.margin(values_of(measures, condition.names))
 
     def outcome(
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
@@ -145,7 +146,7 @@ class Criterion:
         What takes most of the time is left out where the criterion does not speak of it: the last
         way out, and bodies before M.
         """
-        spoken = frozenset[str]() if self.require else _names(self.words)
+        spoken = frozenset[str]() if self.require else condition_of(self.words).names
         seen = lines if spoken & OF_BODIES else None
         measures = measure(
             trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
@@ -176,26 +177,21 @@ PAPER_CRITERION: Final = Criterion()
 
 
 @lru_cache
+def _parsed(text: str) -> tuple[Condition, str]:
+    """Return a condition, which may name criteria, and its text as Python would write it."""
+    named = {name: criterion.condition for name, criterion in CRITERIA.items()}
+    return parse_condition(text, vocabulary(), "`fail_when`", named)
+
+
 def condition_of(text: str) -> Condition:
     """Return the condition that a criterion states, by its words."""
-    return parse_condition(text, vocabulary(), "`fail_when`", _conditions())[0]
+    return _parsed(text)[0]
 
 
 def vocabulary() -> Vocabulary:
     """Return what a condition may speak of: None for a number, or all that a text may be."""
     numbers = (name for name, one in MEASURES.items() if one.missing is not None)
     return {**dict.fromkeys(numbers), **TEXTS}
-
-
-def _conditions() -> dict[str, str]:
-    """Return the conditions of the named criteria."""
-    return {name: criterion.condition for name, criterion in CRITERIA.items()}
-
-
-@lru_cache
-def _names(text: str) -> frozenset[str]:
-    """Return the measures that a condition speaks of, by their names or by those of others."""
-    return names_of(condition_of(text))
 
 
 def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[str, Value]:

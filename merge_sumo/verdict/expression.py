@@ -14,9 +14,8 @@ import ast
 import re
 import sys
 import warnings
-from collections.abc import Mapping, Set
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Iterable, Mapping, Set
+from typing import Any, Final, NamedTuple
 
 from merge_sumo.errors import UserError
 from merge_sumo.system.printable import printable
@@ -35,101 +34,21 @@ MOST_WRITTEN: Final = 20 * MOST_CHARACTERS
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
-NONE: Final[Mapping[str, str]] = {}
-"""No conditions that are named."""
 ALIKE_MEASURES: Final = 0.5
 """Ratio of matching characters from which on a measure may have been meant."""
 OTHER_SIGNS: Final = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
 """Signs of other languages."""
 
 
-@dataclass(frozen=True, slots=True)
-class Inequality:
-    """Whether one value is below another: left < right, or <= where `or_equal`."""
+class Condition(NamedTuple):
+    """A condition: how far values are from meeting it, and the values that it speaks of."""
 
-    left: str | float
-    right: str | float
-    or_equal: bool
-
-    def margin(self, values: Mapping[str, Value]) -> float:
-        """Return how far it is from being met."""
-        left, right = (_number(side, values) for side in (self.left, self.right))
-        met = left <= right if self.or_equal else left < right
-        fixed = [abs(side) for side in (self.left, self.right) if isinstance(side, float)]
-        away = 0.0 if left == right else (left - right) / ((fixed and fixed[0]) or 1.0)
-        size = min(max(abs(away), LEAST_MARGIN), MOST_MARGIN)
-        return -size if met else size
-
-
-@dataclass(frozen=True, slots=True)
-class Equality:
-    """Whether a value is a text."""
-
-    name: str
-    text: str
-
-    def margin(self, values: Mapping[str, Value]) -> float:
-        """Return -1 where it is, else 1."""
-        return -1.0 if values[self.name] == self.text else 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Negation:
-    """That a condition is not met."""
-
-    of: Condition
-
-    def margin(self, values: Mapping[str, Value]) -> float:
-        """Return how far it is from being met."""
-        return -self.of.margin(values)
-
-
-@dataclass(frozen=True, slots=True)
-class AllOf:
-    """That every one of some conditions is met."""
-
-    parts: tuple[Condition, ...]
-
-    def margin(self, values: Mapping[str, Value]) -> float:
-        """Return how far it is from being met."""
-        return max(part.margin(values) for part in self.parts)
-
-
-@dataclass(frozen=True, slots=True)
-class AnyOf:
-    """That at least one of some conditions is met."""
-
-    parts: tuple[Condition, ...]
-
-    def margin(self, values: Mapping[str, Value]) -> float:
-        """Return how far it is from being met."""
-        return min(part.margin(values) for part in self.parts)
-
-
-Condition = Inequality | Equality | Negation | AllOf | AnyOf
-
-
-def names_of(condition: Condition) -> frozenset[str]:
-    """Return the values that a condition speaks of."""
-    match condition:
-        case Inequality(left, right):
-            return frozenset(side for side in (left, right) if isinstance(side, str))
-        case Equality(name):
-            return frozenset({name})
-        case Negation(of):
-            return names_of(of)
-        case AllOf(parts) | AnyOf(parts):
-            return frozenset[str]().union(*map(names_of, parts))
-
-
-def _number(side: str | float, values: Mapping[str, Value]) -> float:
-    value = values[side] if isinstance(side, str) else side
-    assert isinstance(value, float), "the vocabulary says that it is a number"  # noqa: S101
-    return value
+    margin: Callable[[Mapping[str, Value]], float]
+    names: frozenset[str]
 
 
 def parse_condition(
-    text: str, vocabulary: Vocabulary, what: str, named: Mapping[str, str] = NONE
+    text: str, vocabulary: Vocabulary, what: str, named: Mapping[str, str] | None = None
 ) -> tuple[Condition, str]:
     """Return the condition that a text states, and the text as Python would write it.
 
@@ -151,7 +70,7 @@ def parse_condition(
         written = ast.unparse(tree)
         if len(text) > MOST_CHARACTERS and text != written:
             raise too_long
-        return _Parser(vocabulary, f"{what} {shown!r}", named).condition(tree), written
+        return _Parser(vocabulary, f"{what} {shown!r}", named or {}).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         sign = OTHER_SIGNS.search(text)
         hint = f": write and, or, not, == or < instead of {sign[0]}" if sign else ""
@@ -168,17 +87,13 @@ class _Parser:
     def condition(self, node: ast.expr) -> Condition:
         """Return the condition of a part of the tree."""
         match node:
-            case ast.BoolOp(op=ast.And(), values=parts):
-                return AllOf(tuple(map(self.condition, parts)))
-            case ast.BoolOp(op=ast.Or(), values=parts):
-                return AnyOf(tuple(map(self.condition, parts)))
+            case ast.BoolOp(op=sign, values=parts):
+                return _joined(map(self.condition, parts), every=isinstance(sign, ast.And))
             case ast.UnaryOp(op=ast.Not(), operand=of):
-                return Negation(self.condition(of))
+                return _negated(self.condition(of))
             case ast.Compare(left=first, ops=signs, comparators=others):
-                sides = (first, *others)
-                pairs = zip(sides, signs, sides[1:], strict=False)
-                chain = tuple(self._comparison(*pair) for pair in pairs)
-                return chain[0] if len(chain) == 1 else AllOf(chain)
+                pairs = zip((first, *others), signs, others, strict=False)
+                return _joined((self._comparison(*pair) for pair in pairs), every=True)
             case ast.Name(id=name) if name in self._named:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name in self._vocabulary:
@@ -191,25 +106,23 @@ class _Parser:
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
         left, right = self._side(first, second), self._side(second, first)
-        texts = [side for side in (left, right) if isinstance(side, _Text)]
-        names = [s for s in (left, right) if isinstance(s, str) and not isinstance(s, _Text)]
-        choices = [self._vocabulary[name] for name in names]
-        if texts or any(choices):
+        texts = [side.value for side in (left, right) if isinstance(side, ast.Constant)]
+        names = [side for side in (left, right) if isinstance(side, str)]
+        if texts or any(self._vocabulary[name] for name in names):
             return self._equality(sign, names, texts)
         if not names:
             raise self._error("a comparison of two numbers says nothing of a case")
-        match sign:
-            case ast.Lt() | ast.LtE():
-                return Inequality(left, right, isinstance(sign, ast.LtE))
-            case ast.Gt() | ast.GtE():
-                return Inequality(right, left, isinstance(sign, ast.GtE))
-        raise self._error("compare numbers with <, <=, > or >=")
+        if isinstance(sign, ast.Gt | ast.GtE):
+            left, right = right, left
+        elif not isinstance(sign, ast.Lt | ast.LtE):
+            raise self._error("compare numbers with <, <=, > or >=")
+        return _inequality(left, right, or_equal=isinstance(sign, ast.LtE | ast.GtE))
 
-    def _equality(self, sign: ast.cmpop, names: list[str], texts: list[_Text]) -> Condition:
+    def _equality(self, sign: ast.cmpop, names: list[str], texts: list[Any]) -> Condition:
         choices = self._vocabulary[names[0]] if len(texts) == len(names) == 1 else None
         if choices is None:
             raise self._error("compare a measure that is a text with a text in quotes")
-        name, text = names[0], str(texts[0])
+        name, text = names[0], texts[0]
         if not isinstance(sign, ast.Eq | ast.NotEq):
             raise self._error(f"{name} is a text: compare it with == or !=")
         if text not in choices:
@@ -217,10 +130,11 @@ class _Parser:
                 f"{name} is never {text!r}: {meant(text, sorted(choices))}it is "
                 f"{either(sorted(choices))}"
             )
-        equality = Equality(name, text)
-        return equality if isinstance(sign, ast.Eq) else Negation(equality)
+        met = Condition(lambda values: -1.0 if values[name] == text else 1.0, frozenset({name}))
+        return met if isinstance(sign, ast.Eq) else _negated(met)
 
-    def _side(self, node: ast.expr, other: ast.expr) -> Value:
+    def _side(self, node: ast.expr, other: ast.expr) -> Any:
+        """Return the name of a measure, a number, or the constant of a text."""
         match node:
             case ast.Name(id=name) if name in self._vocabulary:
                 return name
@@ -234,21 +148,19 @@ class _Parser:
                 if near := nearest(name, sorted(texts or ())):
                     raise self._error(f'a text is to be in quotes: {_shown(other)} == "{near[0]}"')
                 raise self._unknown(name)
-            case ast.Constant(value=str(text)):
-                return _Text(text)
-            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as number):
-                return -self._finite(number)
-            case ast.Constant() as number:
+            case ast.Constant(value=str()):
+                return node
+            case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
                 return self._finite(number)
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as number)):
+                return self._finite(-number)
         raise self._error(f"{_shown(node)} is neither a measure nor a number nor a text")
 
-    def _finite(self, node: ast.Constant) -> float:
-        if not isinstance(node.value, int | float) or isinstance(node.value, bool):
-            raise self._error(f"{_shown(node)} is neither a measure nor a number nor a text")
+    def _finite(self, number: float) -> float:
         # An integer may be too large for a float.
-        if abs(node.value) > sys.float_info.max:
+        if abs(number) > sys.float_info.max:
             raise self._error("a number is to be finite")
-        return float(node.value)
+        return float(number)
 
     def _unknown(self, name: str) -> UserError:
         hint = meant(name, (*self._vocabulary, *self._named), ALIKE_MEASURES)
@@ -259,10 +171,35 @@ class _Parser:
         return UserError(f"{self._what}: {why}")
 
 
-class _Text(str):
-    """A text in quotes: a plain `str` is the name of a value."""
+def _inequality(left: str | float, right: str | float, *, or_equal: bool) -> Condition:
+    """Return whether one side is below the other, or as large where `or_equal`."""
+    fixed = [abs(side) for side in (left, right) if not isinstance(side, str)]
+    unit = (fixed and fixed[0]) or 1.0
 
-    __slots__ = ()
+    def margin(values: Mapping[str, Value]) -> float:
+        low, high = (
+            float(values[side]) if isinstance(side, str) else side for side in (left, right)
+        )
+        met = low <= high if or_equal else low < high
+        away = 0.0 if low == high else (low - high) / unit
+        size = min(max(abs(away), LEAST_MARGIN), MOST_MARGIN)
+        return -size if met else size
+
+    return Condition(margin, frozenset(side for side in (left, right) if isinstance(side, str)))
+
+
+def _negated(condition: Condition) -> Condition:
+    return Condition(lambda values: -condition.margin(values), condition.names)
+
+
+def _joined(conditions: Iterable[Condition], *, every: bool) -> Condition:
+    """Return whether every one of some conditions is met, or any."""
+    parts = list(conditions)
+    worst = max if every else min
+    return Condition(
+        lambda values: worst(part.margin(values) for part in parts),
+        frozenset().union(*(part.names for part in parts)),
+    )
 
 
 def _shown(node: ast.expr) -> str:

@@ -336,20 +336,27 @@ def measure(
         avoidability: whether `last_avoidable_s` is computed, which takes most of the time.
         further: names of the further measures that are taken; all by default.
     """
-    measures: Measures
-    (measures,) = trajectory.case.scenario.measures([trajectory], lines, avoidability=avoidability)
-    values = further_of(trajectory, lines, further)
-    return replace(measures, further=values) if values else measures
+    return measure_all([trajectory], lines, avoidability=avoidability, further=further)[0]
 
 
-def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[Measures]:
-    """Return the verdict and the measures of episodes, which takes less time than one by one."""
+def measure_all(
+    trajectories: Sequence[Trajectory],
+    lines: CentreLines | None,
+    *,
+    avoidability: bool = True,
+    further: Collection[str] | None = None,
+) -> list[Measures]:
+    """Return the same of episodes of one scenario, which takes less time than one by one."""
     if not trajectories:
         return []
-    taken = trajectories[0].case.scenario.measures(trajectories, lines)
+    measured = trajectories[0].case.scenario.measures(
+        trajectories, lines, avoidability=avoidability
+    )
+    if not further_measures():
+        return list(measured)
     return [
-        replace(measures, further=further_of(trajectory, lines)) if further_measures() else measures
-        for measures, trajectory in zip(taken, trajectories, strict=True)
+        replace(measures, further=further_of(trajectory, lines, further))
+        for measures, trajectory in zip(measured, trajectories, strict=True)
     ]
 
 

@@ -33,8 +33,7 @@ from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import best_response
-from merge_sumo.training.env import pool_starts
-from merge_sumo.training.game import Game, greedy
+from merge_sumo.training.game import Game, greedy, pool_starts
 from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.factory import VutFactory

@@ -29,12 +29,13 @@ from merge_sumo.drivers.levelk import (
 from merge_sumo.drivers.policies import MANIFEST, load_network, plays_as, read_manifest, scenario_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import to_toml
-from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import play, returns_of
-from merge_sumo.training.env import MergeGame, MergeVectorEnv, pool_starts
-from merge_sumo.training.game import Game, greedy
+from merge_sumo.training.env import MergeVectorEnv
+from merge_sumo.training.game import Game, greedy, pool_starts
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
 
@@ -154,11 +155,8 @@ def test_the_tutorial_shows_the_code_that_its_commands_run():
 
 class TestDdqn:
     def train(self, seed=0):
-        game = MergeGame("pov", Level0Vut(16), REWARD)
-        try:
-            return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
-        finally:
-            game.close()
+        game = Game("pov", None, REWARD)
+        return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
 
     @pytest.mark.slow
     def test_same_seed_same_weights_and_another_seed_other_weights(self):
@@ -261,24 +259,16 @@ class TestGame:
     @pytest.mark.parametrize("role", ["pov", "vut"])
     @pytest.mark.parametrize("scenario", [US23, LIKE_A_ROUNDABOUT], ids=lambda s: s.name)
     def test_its_returns_are_those_of_the_game_in_sumo(self, role, network, scenario):
-        rng = np.random.default_rng(2)
-        policy, played = greedy(network, scenario), reward.Reward.of(scenario)
-        start = pool_starts(8, rng, scenario)
-        expected = Game(role, None, played).play(start, np.zeros(8), policy)
-        game = MergeGame(role, Level0Vut(8) if role == "pov" else Level0Pov(8), played)
-        try:
-            for corridor, state in enumerate(start):
-                game.begin(corridor, state)
-            returns, over = np.zeros(8), np.zeros(8, dtype=bool)
-            for _ in range(60):
-                actions = game.actions_mps2[policy(game.state(), np.zeros(8))]
-                _, parts, ended = game.decide(np.where(over, 0.0, actions))
-                returns += np.where(over, 0.0, parts.of(role, np.zeros(8)))
-                over |= ended
-        finally:
-            game.close()
-        assert returns[over] == pytest.approx(expected[over], abs=1e-9)
-        assert over.any()
+        points, played = np.random.default_rng(2).random((8, 2)), reward.Reward.of(scenario)
+        cases = from_unit(points, 1, scenario=scenario)
+        start = np.array([[x for at in case.starts() for x in at] for case in cases])
+        pair = (network, Level0Vut) if role == "pov" else (Level0Pov, network)
+        expected = Game(role, None, played).play(start, np.zeros(8), greedy(network, scenario))
+        trajectories = play(cases, *pair)
+        ended = [one.end is End.MERGED for one in trajectories]
+        returns = returns_of(trajectories, played).of(role, np.zeros(8))
+        assert returns[ended] == pytest.approx(expected[ended], abs=1e-9)
+        assert any(ended)
 
     def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
         torch.manual_seed(2)
