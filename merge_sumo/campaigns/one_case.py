@@ -13,7 +13,6 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, level_name
 from merge_sumo.sumo.live import Window
-from merge_sumo.sumo.replay_folder import case_line, verdict_line
 from merge_sumo.verbs import COORDINATES
 from merge_sumo.verdict.episode import Episode
 
@@ -83,14 +82,11 @@ def run_one(
         Window() if live else nullcontext() as window,
         Simulator(plan.for_cases(1), window) as simulator,
     ):
-        if window is not None:
-            window.write(case_line(case))
         running = simulator.run([case])
         _, trajectory = next(running)
         outcome = plan.criterion.outcome(0, 0, trajectory, centre_lines(plan.road))
         episode = Episode(outcome, trajectory)
         on_end(episode)
         if window is not None:
-            window.write(verdict_line(outcome))
             window.wait()  # before the corridor is made ready for the next case
     return episode

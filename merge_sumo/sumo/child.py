@@ -1,7 +1,8 @@
 """A SUMO in a process of its own, which this process alone reaches: it has no port.
 
 The two exchange JSON over a pair of sockets of their own. A message to the child may hand over a
-connection; messages of the child are read as data.
+connection; messages of the child are read as data. On Windows no descriptor passes to another
+process, and there is no such SUMO.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -25,8 +25,6 @@ from merge_sumo.system.spawning import end_with, python_command
 MESSAGES: Final = "messages"
 """In the folder of a child: what it, and SUMO, write to standard error."""
 MOST_BYTES: Final = 1 << 24
-SIGKILL: Final = -9
-"""Exit code of what SIGKILL ended; Windows has no such signal."""
 _LENGTH: Final = struct.Struct("!I")
 
 
@@ -72,19 +70,12 @@ class Channel:
             content += part
         return content
 
-    def give(self, connection: socket.socket, process: int) -> None:
+    def give(self, connection: socket.socket) -> None:
         """Hand a connection over to the process at the other end, which waits for it."""
-        if sys.platform == "win32":
-            shared = connection.share(process)
-            self.end.sendall(_LENGTH.pack(len(shared)) + shared)
-        else:
-            socket.send_fds(self.end, [b"!"], [connection.fileno()])
+        socket.send_fds(self.end, [b"!"], [connection.fileno()])
 
     def take(self) -> socket.socket:
         """Return the connection that is handed over."""
-        if sys.platform == "win32":
-            (length,) = _LENGTH.unpack(self._exactly(_LENGTH.size))
-            return socket.fromshare(self._exactly(length))
         _, (descriptor, *_), _, _ = socket.recv_fds(self.end, 1, 1)
         return socket.socket(fileno=descriptor)
 
@@ -97,18 +88,19 @@ class SumoChild:
     """
 
     def __init__(self, main: str, folder: Path, settings: Mapping[str, Any]) -> None:
+        if os.name != "posix":
+            raise UserError("a controller by TraCI and the live view need Linux or macOS")
         ours, theirs = socket.socketpair()
         self.channel = Channel(ours)
         self._folder = folder
-        unix = sys.platform != "win32"
-        lifeline, self._lifeline = os.pipe() if unix else (-1, -1)
-        descriptors = (theirs.fileno(), lifeline) if unix else ()
+        lifeline, self._lifeline = os.pipe()
+        descriptors = (theirs.fileno(), lifeline)
         settings = {**settings, "descriptors": descriptors, "folder": str(folder)}
         try:
             with (folder / MESSAGES).open("wb") as messages:
                 self.process = subprocess.Popen(  # noqa: S603 (our own code)
                     python_command(main, settings),
-                    stdin=subprocess.DEVNULL if unix else subprocess.PIPE,
+                    stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=messages,
                     pass_fds=descriptors,
@@ -119,17 +111,10 @@ class SumoChild:
                 )
         except OSError as error:
             ours.close()
-            if unix:
-                os.close(self._lifeline)
+            os.close(self._lifeline)
             raise UserError(f"cannot start a process for SUMO: {error.strerror}") from error
         finally:
-            if unix:
-                os.close(lifeline)
-                theirs.close()
-        if sys.platform == "win32":
-            assert self.process.stdin is not None, "piped"  # noqa: S101
-            self.process.stdin.write(theirs.share(self.process.pid))
-            self.process.stdin.close()
+            os.close(lifeline)
             theirs.close()
 
     def ask(
@@ -146,7 +131,7 @@ class SumoChild:
         try:
             self.channel.send(message)
             if connection is not None:
-                self.channel.give(connection, self.process.pid)
+                self.channel.give(connection)
         except OSError as error:
             raise self._death() from error
         return self.receive(patience_s)
@@ -166,9 +151,7 @@ class SumoChild:
             self.process.kill()
         self.process.wait()
         self.channel.end.close()
-        if self._lifeline >= 0:
-            os.close(self._lifeline)
-            self._lifeline = -1
+        os.close(self._lifeline)
 
     def said(self) -> str:
         """Return the first line that it, or SUMO, wrote to standard error."""
@@ -182,7 +165,9 @@ class SumoChild:
         with suppress(subprocess.TimeoutExpired):
             code = self.process.wait(2.0)
             if code < 0:
-                return ChildDiedError(f"was ended by signal {-code}", killed=code == SIGKILL)
+                return ChildDiedError(
+                    f"was ended by signal {-code}", killed=code == -signal.SIGKILL
+                )
             return ChildDiedError(f"ended with exit code {code}")
         return ChildDiedError("broke the channel")
 
@@ -190,10 +175,7 @@ class SumoChild:
 def channel_of(settings: Mapping[str, Any]) -> Channel:
     """Return the child's end of the channel; from now on the child ends with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if sys.platform == "win32":
-        end = socket.fromshare(sys.stdin.buffer.read())
-    else:
-        descriptor, lifeline = settings["descriptors"]
-        end_with(lifeline)
-        end = socket.socket(fileno=descriptor)
+    descriptor, lifeline = settings["descriptors"]
+    end_with(lifeline)
+    end = socket.socket(fileno=descriptor)
     return Channel(end)

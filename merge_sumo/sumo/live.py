@@ -23,7 +23,7 @@ from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
 from merge_sumo.sumo.replay import check_display
-from merge_sumo.sumo.replay_folder import COLOURS, TEXT, WINDOW, beside, view_settings
+from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, beside, view_settings
 from merge_sumo.system.interrupt import stopping_in_order
 
 LEAST_M: Final = 120.0
@@ -38,12 +38,6 @@ LOOK_S: Final = 0.5
 """Between two looks whether the window is still open."""
 VIEW: Final = "View #0"
 LABEL: Final = "label"
-LINE_AT: Final = 0.86
-"""Height of the first line above the middle, as a share of half of the picture's height."""
-LINE_APART: Final = 0.11
-LINE_COLOUR: Final = (26, 26, 26, 255)
-LINE_LAYER: Final = 200
-LINE_M: Final = 0.1
 OPENS_S: Final = 60.0
 """Time that the window has to open."""
 
@@ -67,11 +61,8 @@ class Window(AbstractContextManager["Window"]):
         self._opened = ExitStack()
         self._due_s: float | None = None
         self._shown = 0
-        self._lines: list[str] = []
         self._half_m = 0.0
         """Half of the width that the view shows; 0 before it follows the VUT."""
-        self._written = 0
-        """Lines that have a place in the window."""
 
     def start(self, command: list[str]) -> None:
         """Open sumo-gui on what libsumo would be started with."""
@@ -96,7 +87,6 @@ class Window(AbstractContextManager["Window"]):
         self.vehicle = _Domain("vehicle", self._call)
         self.route = _Domain("route", self._call)
         self._gui = _Domain("gui", self._call)
-        self._poi = _Domain("poi", self._call)
         self.simulation = self
 
     def _call(
@@ -115,10 +105,6 @@ class Window(AbstractContextManager["Window"]):
         if "closed" in answer:
             raise _closed()
         return answer["value"]
-
-    def write(self, line: str) -> None:
-        """Add a line to what stands at the top of the window, from the next look on."""
-        self._lines.append(line)
 
     def step(self) -> None:
         """Make a step when its time has come; real time, from the second one on."""
@@ -190,19 +176,6 @@ class Window(AbstractContextManager["Window"]):
             box = x - half_m, y - half_high_m, x + half_m, y + half_high_m
             self._gui.setBoundary(VIEW, *box)
             self._gui.trackVehicle(VIEW, vut)
-        half_m = self._half_m
-        self._put_lines(x, y, half_m * high / wide)
-
-    def _put_lines(self, x: float, y: float, half_height_m: float) -> None:
-        """Put the lines at the top of the picture, whose middle is (x, y)."""
-        for number, line in enumerate(self._lines):
-            name = f"line{number}"
-            at = x, y + half_height_m * (LINE_AT - number * LINE_APART)
-            if number >= self._written:
-                self._poi.add(name, *at, LINE_COLOUR, "", LINE_LAYER, "", LINE_M, LINE_M)
-                self._poi.setParameter(name, TEXT, line)
-                self._written = number + 1
-            self._poi.setPosition(name, *at)
 
 
 class _NeverError(Exception):

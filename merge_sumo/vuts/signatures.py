@@ -16,10 +16,6 @@ from merge_sumo.system.printable import printable
 OF_ONE: Final = {"act": ("seen",), "reset": ("seen",), "close": ()}
 OF_A_BATCH: Final = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
 """Methods of a VUT, and what each is called with; a `reset` may have a `seed` besides."""
-_VARIABLE: Final[dict[object, str]] = {
-    Parameter.VAR_POSITIONAL: "*",
-    Parameter.VAR_KEYWORD: "**",
-}
 
 
 def check_methods(vut: Any) -> None:
@@ -31,14 +27,12 @@ def check_methods(vut: Any) -> None:
     batched = callable(getattr(vut, "act_batch", None))
     for name, arguments in (OF_A_BATCH if batched else OF_ONE).items():
         method = inspect.getattr_static(vut, name, None)
-        first: tuple[str, ...] = ()
+        first: tuple[str, ...] = ("self",)
         if isinstance(method, staticmethod | classmethod):
             first = ("cls",) if isinstance(method, classmethod) else ()
             method = method.__func__
         elif not isinstance(vut, type) and name in getattr(vut, "__dict__", {}):
-            pass  # an attribute of the object is called as it is
-        else:
-            first = ("self",)
+            first = ()  # an attribute of the object is called as it is
         if inspect.isfunction(method):
             seeded = name == "reset" and takes_seed(method)
             check_call(method, (*first, *arguments), seeded=seeded)
@@ -60,15 +54,12 @@ def check_call(
     One that is `seeded` is called with `seed` besides.
     """
     known = partial(function, seed=0) if seeded else function
-    if fits(known, len(arguments)) in (True, None):
+    if fits(known, len(arguments)) is not False:
         return
-    parameters = inspect.signature(function).parameters.values()
-    name, count = printable(getattr(function, "__name__", "it")), len(parameters)
-    taken = f"{count} argument{'' if count == 1 else 's'}"
-    shown = ", ".join(map(_parameter, parameters))
-    raise UserError(
-        f"{_place(function)}{name}({shown}) takes {taken}, {name}({', '.join(arguments)}) is called"
-    )
+    name = getattr(function, "__name__", "it")
+    parameters = ", ".join(inspect.signature(function).parameters)
+    called = f"{name}({parameters}) is called as {name}({', '.join(arguments)})"
+    raise UserError(printable(f"{_place(function)}{called}"))
 
 
 def fits(function: Callable[..., Any], count: int) -> bool | None:
@@ -77,18 +68,12 @@ def fits(function: Callable[..., Any], count: int) -> bool | None:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return None
-    in_order = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
-    places = [parameter for parameter in parameters if parameter.kind in in_order]
-    needed = [p for p in parameters if p.default is p.empty and p.kind not in _VARIABLE]
-    more = any(parameter.kind is Parameter.VAR_POSITIONAL for parameter in parameters)
-    by_name = any(parameter.kind is Parameter.KEYWORD_ONLY for parameter in needed)
+    places = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+    stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
+    needed = [p for p in parameters if p.default is p.empty and p.kind not in stars]
+    by_name = any(p.kind is p.KEYWORD_ONLY for p in needed)
+    more = any(p.kind is p.VAR_POSITIONAL for p in parameters)
     return len(needed) <= count and (more or count <= len(places)) and not by_name
-
-
-def _parameter(parameter: Parameter) -> str:
-    stars = _VARIABLE.get(parameter.kind, "")
-    by_name = "=..." if parameter.kind is Parameter.KEYWORD_ONLY else ""
-    return f"{stars}{printable(parameter.name)}{by_name}"
 
 
 def _place(function: Callable[..., Any]) -> str:
@@ -98,4 +83,4 @@ def _place(function: Callable[..., Any]) -> str:
         return ""
     path = os.path.relpath(code.co_filename)
     path = code.co_filename if path.startswith(os.pardir) else path
-    return f"{printable(path)}:{code.co_firstlineno}: "
+    return f"{path}:{code.co_firstlineno}: "

@@ -83,25 +83,24 @@ class TestAWrongSignature:
         [
             (
                 "class V:\n\n    def act(self):\n        return 0.0\n",
-                "my.py:3: act(self) takes 1 argument, act(self, seen) is called",
+                "my.py:3: act(self) is called as act(self, seen)",
             ),
             (
                 "class V:\n    @staticmethod\n    def act(): return 0.0\n",
-                "my.py:2: act() takes 0 arguments, act(seen) is called",
+                "my.py:2: act() is called as act(seen)",
             ),
             (
                 "class V:\n    @classmethod\n    def act(cls, a, b): return 0.0\n",
-                "my.py:2: act(cls, a, b) takes 3 arguments, act(cls, seen) is called",
+                "my.py:2: act(cls, a, b) is called as act(cls, seen)",
             ),
             (
                 "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
-                "my.py:3: reset(self, seen) takes 2 arguments, reset(self, corridor, seen) is "
-                "called",
+                "my.py:3: reset(self, seen) is called as reset(self, corridor, seen)",
             ),
-            ("def V():\n    return 0.0\n", "my.py:1: V() takes 0 arguments, V(seen) is called"),
+            ("def V():\n    return 0.0\n", "my.py:1: V() is called as V(seen)"),
             (
                 "def V(x, v, *rest, gain):\n    return 0.0\n",
-                "my.py:1: V(x, v, *rest, gain=...) takes 4 arguments, V(seen) is called",
+                "my.py:1: V(x, v, rest, gain) is called as V(seen)",
             ),
         ],
     )
@@ -120,7 +119,7 @@ class TestAWrongSignature:
         wrong: list[Any] = [Mine, Mine()]
         for vut in wrong:
             with pytest.raises(
-                UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) takes"
+                UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) is called"
             ):
                 ms.campaign(vut, cases=1)
 

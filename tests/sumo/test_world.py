@@ -12,7 +12,6 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -104,22 +103,6 @@ def test_episodes_are_the_same_in_1_and_in_32_corridors():
         assert measure(one) == measure(many)
 
 
-@pytest.mark.parametrize("model", [None, "sumo:IDM", "sumo:Krauss"])
-def test_sumo_holds_the_very_speeds_that_it_was_told(model):
-    """They are not read back: to the last bit it would give the same numbers."""
-    rng = np.random.default_rng(2)
-    vut_type = None if model is None else VutFactory.of(model).vut.vut_type
-    with World(16, vut_type=vut_type, scenario=US23) as world:
-        for case in random_cases(200):
-            world.place(int(rng.integers(16)), case.starts())
-            for _ in range(3):
-                world.step(rng.uniform(-4.0, 2.0, (2, 16)) * (rng.random(16) < 0.7))
-                told_mps, x_m = world.v_mps.tolist(), world.x_m.tolist()
-                world.read()
-                assert (world.v_mps.tolist(), world.x_m.tolist()) == (told_mps, x_m)
-    assert len({speed for row in told_mps for speed in row}) > 16, "speeds of all kinds"
-
-
 @pytest.mark.parametrize("speed_mps", [29.0, 31.0])
 def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
     with World(1, scenario=US23) as world:
@@ -147,46 +130,6 @@ def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
     assert trajectory.t_end_s == 30.0
     assert trajectory.v_pov_mps[-1] == pytest.approx(95.0)
     assert_eq4(trajectory)
-
-
-def test_a_second_open_world_is_refused_and_the_first_goes_on():
-    with World(1, scenario=US23) as world:
-        with pytest.raises(UserError, match="one simulation per process"):
-            World(1, scenario=US23)
-        world.step(np.zeros((2, 1)))
-
-
-class Broken(Driver):
-    """Drives as level 0, but does something wrong in the cases with v_POV0 above 30 m/s."""
-
-    def __init__(self, corridors, answer):
-        super().__init__(corridors)
-        self.answer = answer
-        self.bad = np.zeros(corridors, dtype=bool)
-
-    def begin(self, corridor, case):
-        self.bad[corridor] = case.v_pov0_mps > 30.0
-        if self.bad[corridor] and self.answer == "raise":
-            raise RuntimeError("no start")
-
-    def act(self, scene):
-        wrong = np.nan if self.answer == "raise" else self.answer
-        return np.where(self.bad & (scene.step == 3), wrong, 1.0)
-
-
-@pytest.mark.parametrize(("answer", "reason"), [(np.nan, "nan"), (-np.inf, "inf")])
-def test_an_answer_that_is_no_number_ends_only_its_own_case(answer, reason):
-    cases = random_cases(40)
-    with World(8, scenario=US23) as world:
-        trajectories = run_all(world, PovLibrary(8, POVS), Broken(8, answer), cases)
-    for case, trajectory in zip(cases, trajectories, strict=True):
-        if case.v_pov0_mps > 30.0:
-            assert trajectory.end is End.VUT_ERROR
-            assert reason in trajectory.error
-            assert len(trajectory.motion) == 4
-            assert measure(trajectory).score is None
-        else:
-            assert trajectory.end is End.MERGED
 
 
 @pytest.mark.parametrize("half_step", ["advance", "command"])

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.records import Record, check_fields, convert, decode, read_indexed, to_json
+from merge_sumo.system.records import Record, check_fields, convert, decode, read_indexed
 
 
 class Colour(StrEnum):
@@ -80,16 +80,6 @@ def test_a_whole_number_is_a_number_and_a_list_is_a_tuple():
 
 
 @pytest.mark.parametrize(
-    "content",
-    [b"", b"{", b"NaN", b"1e999", b"9" * 5000, b'"\\ud800"', b"\xff", b"[" * 10**5, b"{}x"],
-    ids=lambda content: str(content[:8]),
-)
-def test_what_is_no_json_is_refused(content):
-    with pytest.raises(UserError):
-        decode(content)
-
-
-@pytest.mark.parametrize(
     ("record", "says"),
     [
         ({"kind": "round", "radius_m": 0}, "radius_m is 0: it must be a number above 0"),
@@ -105,13 +95,6 @@ def test_a_record_of_one_of_several_kinds_is_refused_as_one_of_its_kind(record, 
     with pytest.raises(UserError) as error:
         decode(json.dumps(record), Round | Square)
     assert says in str(error.value)
-
-
-def test_a_record_is_written_as_it_is_read():
-    """A number of numpy is one of Python; one that is not finite is refused."""
-    assert decode(to_json(Round(np.float64(2.0))), Round | Square) == Round(2.0)
-    with pytest.raises(ValueError, match="JSON"):
-        to_json(Round(math.nan))
 
 
 @given(st.floats(allow_nan=False, allow_infinity=False))

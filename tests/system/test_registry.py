@@ -37,27 +37,6 @@ def install(tmp_path, monkeypatch):
     return installed
 
 
-def test_what_this_package_brings_comes_first_in_its_order(install):
-    install("brought", "theirs = brought:Tool")
-    tools = registry()
-    assert list(tools) == ["ours", "other", "theirs"]
-    assert len(tools) == 3
-    assert tools["theirs"].__module__ == "brought"
-
-
-def test_entries_of_the_backport_of_importlib_metadata_are_loaded_too(install):
-    pytest.importorskip("importlib_metadata")  # once imported, it finds packages for all
-    install("brought_later", "theirs = brought_later:Tool")
-    assert registry()["theirs"].__module__ == "brought_later"
-
-
-def test_names_are_known_without_an_import(install):
-    install("never_imported", "theirs = never_imported:Tool", source="raise SystemExit(1)")
-    assert "theirs" in registry()
-    assert list(registry())[-1] == "theirs"
-    assert "never_imported" not in sys.modules
-
-
 @pytest.mark.parametrize(
     ("entry", "source", "sentence"),
     [
@@ -111,9 +90,3 @@ def test_an_object_may_be_registered_in_this_process():
         tools.register("ours", int)
     with pytest.raises(UserError, match="not a class"):
         tools.register("third", 3)  # type: ignore[arg-type]
-
-
-def test_an_object_that_names_itself_otherwise_is_refused(install):
-    install("odd", "speed = odd:Tool", "class Tool:\n    name = 'mean_speed'")
-    with pytest.raises(UserError, match="names itself 'mean_speed'"):
-        registry()["speed"]

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,8 +19,7 @@ from plans import plan_for
 from processes import wait_for
 
 from merge_sumo.campaigns.run import OUTCOMES
-from merge_sumo.engine.evaluate import _lost, open_simulators, run_cases
-from merge_sumo.engine.plan import versions
+from merge_sumo.engine.evaluate import _lost, run_cases
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
@@ -31,7 +29,6 @@ from merge_sumo.system.workers import (
     Workers,
     dask_workers,
     open_workers,
-    workers_or_cores,
 )
 
 SETTINGS = campaign_settings(
@@ -117,12 +114,6 @@ class TestAnyWorkers:
             list(workers.run(refuse, [5, 6], no_loss))
         assert sorted(workers.run(squares, [5, 6], no_loss)) == [(0, 25), (1, 36)]
 
-    def test_may_be_left_before_the_end(self, workers):
-        results = workers.run(squares, range(20), no_loss, chunk=1)
-        next(results)
-        results.close()
-        assert sorted(workers.run(squares, [3], no_loss)) == [(0, 9)]
-
 
 class TestAWorkerThatDies:
     def test_once_loses_nothing(self, two, tmp_path):
@@ -148,10 +139,6 @@ class TestAWorkerThatDies:
         assert "worker process died 2 times" in ran[2].outcome.measures.error
         assert ran[2].outcome.measures.score is None
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
-
-
-def asleep(_):
-    time.sleep(60.0)
 
 
 class TestLocalProcesses:
@@ -230,35 +217,6 @@ class TestWorkersThatBeginHere:
             assert not workers.here
         assert sorted(found) == [0, 1, 2, 3]
         assert os.getpid() not in found.values()
-
-    def test_stay_here_where_the_system_starts_no_more_threads(self, monkeypatch):
-        def refuses(count):
-            raise UserError("no more")
-
-        monkeypatch.setattr("merge_sumo.system.workers.check_threads", refuses)
-        with open_workers(2, here_s=1e-9) as workers:
-            found = dict(workers.run(process_ids, range(40), no_loss, chunk=5))
-        assert set(found.values()) == {os.getpid()}
-
-
-class TestACampaign:
-    @pytest.mark.slow
-    def test_has_the_same_outcomes_where_it_goes_on_in_processes(self, expected, tmp_path):
-        with open_workers(2, here_s=1e-9) as workers:
-            run_campaign(SETTINGS, tmp_path / "run", workers=workers)
-            assert not workers.here
-        assert (tmp_path / "run" / OUTCOMES).read_bytes() == expected
-
-    def test_is_refused_by_workers_with_other_software(self):
-        other = {**versions(), "libsumo": "1.0"}
-        plan = replace(plan_for("design1", corridors=2), versions=other)
-        with open_workers(1) as workers, pytest.raises(UserError, match="a worker has libsumo"):
-            open_simulators(plan, workers)
-
-
-def test_no_workers_are_refused_in_a_sentence():
-    with pytest.raises(UserError, match="`workers` is 0"):
-        workers_or_cores(0)
 
 
 @pytest.fixture

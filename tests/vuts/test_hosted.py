@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,18 +17,14 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from misbehaviours import STUBBORN
 from processes import none_left, wait_for
-from vut_contract import LEVEL0_CLASS
 
 from merge_sumo.drivers.base import Scene, VutLostError
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23, as_merge, lane_of
-from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
-from merge_sumo.vuts.host.hosted import Host, HostedVut
-from merge_sumo.vuts.host.wire import About, Said, WireError
-from merge_sumo.vuts.output import KEPT_BYTES, MOST_BYTES, append
+from merge_sumo.vuts.host.hosted import HostedVut
+from merge_sumo.vuts.output import append
 from merge_sumo.vuts.spec import parse
 
 OPTIONS = VutOptions(deadline_s=0.3)
@@ -84,17 +79,6 @@ def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
     assert parent.returncode == 130
     assert b"Traceback" not in said
     assert b"go on with" in said
-
-
-def test_once_killed_its_descriptors_are_nobodys_business(spec, tmp_path):
-    host = Host(parse(spec(LEVEL0_CLASS.replace("Level0", "Vut"))), OPTIONS)
-    host.kill()
-    with (tmp_path / "others").open("wb") as others:
-        # This file has the number that was the channel's or the lifeline's.
-        host.kill()
-        host.close()
-        others.write(b"mine")
-    assert (tmp_path / "others").read_bytes() == b"mine"
 
 
 def scene(corridors: int) -> Scene:
@@ -166,12 +150,6 @@ def Vut(seen):
     assert not file.parent.parent.exists()
 
 
-def test_a_host_that_cannot_start_is_a_sentence(spec, monkeypatch):
-    monkeypatch.setattr(sys, "executable", "/no/such/python")
-    with pytest.raises(UserError, match="cannot start a process for the VUT: No such file"):
-        Host(parse(spec(LEVEL0_CLASS)), OPTIONS)
-
-
 def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
     vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
     run = run_campaign(
@@ -181,25 +159,6 @@ def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
     log = (run.folder / "controller.log").read_bytes()
     assert log.startswith(b"loading \x1b[31m\nacting\n")
     assert capfd.readouterr().out == ""
-
-
-def test_several_write_a_log_and_it_loses_its_older_part_only(tmp_path):
-    log = tmp_path / "controller.log"
-
-    def write(who: int) -> None:
-        for _ in range(700):
-            append(log, f"{who} {'x' * 4000}\n".encode())
-
-    writers = [threading.Thread(target=write, args=(who,)) for who in range(2)]
-    for writer in writers:
-        writer.start()
-    for writer in writers:
-        writer.join()
-    assert KEPT_BYTES < log.stat().st_size <= MOST_BYTES
-    first, torn, *lines = log.read_text().splitlines()
-    assert first == "[what was printed before is gone]"
-    assert len(torn) <= 4002
-    assert {line[1:] for line in lines} == {f" {'x' * 4000}"}
 
 
 def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path):
@@ -212,49 +171,7 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
     append(tmp_path / "pipe", b"x")
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("a\nb\t\0", r"a\nb\t\x00"),
-        ("\x1b[31m", r"\x1b[31m"),
-        ("\u202ereversed", r"\u202ereversed"),
-        ("\ud800", r"\ud800"),
-        ("at 0x7fc7fadabac0>, 0x7fc7fadabac1", "at 0x...>, 0x..."),
-        ("x" * 1000, "x" * 600),
-    ],
-)
-def test_text_of_a_vut_is_one_line_that_any_terminal_can_take(text, shown):
-    assert as_reason(text) == shown
-
-
 class TestTheWire:
-    def test_frames_are_taken_as_they_were_written_however_they_come(self):
-        sent = wire.frame(7, About.ACT, b"abc") + wire.frame(8, About.CLOSE)
-        buffer, taken = bytearray(), []
-        for byte in sent:
-            buffer.append(byte)
-            while (found := wire.take(buffer)) is not None:
-                taken.append(found)
-        assert taken == [(7, About.ACT, b"abc"), (8, About.CLOSE, b"")]
-
-    def test_answers_are_unpacked_as_they_were_packed(self):
-        packed = wire.pack_answers(np.array([1.0, np.nan]), Said({1: "\ud800 no"}))
-        answers, said = wire.unpack_answers(packed, 2)
-        assert answers.tolist()[0] == 1.0
-        assert np.isnan(answers[1])
-        assert said == Said({1: "\ud800 no"})
-        packed = wire.pack_answers(np.zeros(3), Said(wishes=[-1, 0, 1]))
-        assert wire.unpack_answers(packed, 3)[1].wishes == [-1, 0, 1]
-
-    @pytest.mark.parametrize(
-        "wishes",
-        ["1", "[]", "[1]", "[1, 2]", "[1, true]", "[1, 1.0]", '[0, "yes"]', "{}", "[0, NaN]"],
-    )
-    def test_wishes_that_are_none_are_a_wire_error(self, wishes):
-        said = f'{{"reasons": {{}}, "signals": {{}}, "wishes": {wishes}}}'
-        with pytest.raises(WireError):
-            wire.unpack_answers(bytes(16) + said.encode(), 2)
-
     def test_the_lane_and_who_has_merged_travel_and_the_rest_of_the_case_does_not(self):
         lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
         cases = [

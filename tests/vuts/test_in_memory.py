@@ -6,8 +6,6 @@ import subprocess
 import sys
 import threading
 import types
-import warnings
-from importlib import import_module
 from typing import Any
 
 import pytest
@@ -56,7 +54,7 @@ class TestASpec:
     def test_of_what_is_no_vut_is_refused(self, thing):
         if thing is print:
             thing = lambda: 0.0  # noqa: E731 (a function of nothing)
-        with pytest.raises(ms.UserError, match=r"a VUT is a class|is no VUT|takes 0 arguments"):
+        with pytest.raises(ms.UserError, match=r"a VUT is a class|is no VUT|is called as"):
             spec_of(thing)
 
     def test_that_was_an_object_of_another_process_says_so(self):
@@ -65,9 +63,6 @@ class TestASpec:
 
 
 class TestWhatTravels:
-    def test_an_object_whose_class_can_be_imported_does(self):
-        assert travels(parse(spec_of(Batched(1.0))))
-
     def test_a_lambda_an_object_with_a_lock_and_what_is_of_the_main_module_do_not(self):
         with_lock, of_main = Batched(1.0), Batched(1.0)
         vars(with_lock).update(lock=threading.Lock())
@@ -80,17 +75,6 @@ class TestWhatTravels:
 
 
 class TestACampaign:
-    def test_of_a_class_is_that_of_its_name(self, tmp_path, monkeypatch):
-        monkeypatch.syspath_prepend(tmp_path)
-        (tmp_path / "steadily.py").write_text(
-            "class Steady:\n    def act(self, seen):\n        return 0.0\n"
-        )
-        by_class = ms.campaign(import_module("steadily").Steady, **SMALL, out=tmp_path / "class")
-        assert by_class.settings["vut"] == "steadily:Steady"
-        with pytest.warns(UserWarning, match="known to this process alone"):
-            by_lambda = ms.campaign(lambda _: 0.0, **SMALL, out=tmp_path / "lambda")
-        assert list(by_class.cases) == list(by_lambda.cases)
-
     def test_asks_the_very_object_that_it_was_given(self, tmp_path):
         vut = Batched(1.0)
         with pytest.warns(UserWarning, match=r"Batched\S* is an object, so it drives in this"):
@@ -122,15 +106,3 @@ def test_workers_need_no_main_guard_and_no_file(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "<campaign run: 0 failures in 4 cases>\n"
-
-
-class TestTheOtherFunctions:
-    def test_the_truth_of_an_object_is_not_kept(self, tmp_path, monkeypatch):
-        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = ms.truth(lambda _: 0.0, 0, cases=20).truths[0]
-        assert found.points.shape == (20, 2)
-        assert [*tmp_path.glob("*.npz")] == []
-        ms.truth("level0", 0, cases=20)
-        assert len([*tmp_path.glob("*.npz")]) == 1

@@ -72,14 +72,6 @@ def test_a_python_controller_takes_keywords_and_attributes(file, named, expected
     assert parameters(f"{file}:{named}") == expected
 
 
-def test_a_hosted_controller_tells_the_same(file):
-    assert parameters(f"{file}:Vut?shift=5", in_process=False) == {
-        "gain": 2.0,
-        "late_m": 10.0,
-        "shift": 5,
-    }
-
-
 @pytest.mark.parametrize(
     ("spec", "said"),
     [

@@ -52,12 +52,6 @@ def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
     assert np.abs(ours.x_vut_m[1:] - x_m).max() <= gained + 0.05
 
 
-def test_options_reach_sumo():
-    slow, fast = (run_cases(factory(f"sumo:IDM?maxSpeed={v}"), [FREE])[0] for v in (19, 30))
-    assert slow.v_vut_mps.max() <= 19.0 + 1e-9
-    assert fast.v_vut_mps.max() > 22.0
-
-
 @pytest.mark.parametrize(
     ("spec", "said"),
     [

@@ -105,20 +105,6 @@ def test_numbers_that_cannot_be_are_refused_as_by_sumo(drive, function, value):
     assert drive.speeds() == pytest.approx((18.1, 18.1))
 
 
-class TestWhatWasSet:
-    def test_is_gone_with_the_vehicle_and_that_of_its_type_stays(self, drive):
-        drive.begin()
-        c = drive.ours
-        c.vehicle.setAccel("vut", 0.5)
-        c.vehicletype.setMaxSpeed("vut", 18.1)
-        drive.again()
-        assert c.vehicle.getAccel("vut") == 2.0
-        assert c.vehicle.getMaxSpeed("vut") == 18.1
-        c.vehicle.setSpeed("vut", 30.0)
-        drive.step()
-        assert drive.speeds()[0] == pytest.approx(18.1)
-
-
 class TestWhatSumoDecides:
     """What the emulation of commands could not do: SUMO's own models drive the VUT."""
 

@@ -17,7 +17,6 @@ import pytest
 from conftest import some
 from controllers import (
     RAW_CLIENT,
-    STOCK_CLIENT,
     assert_drives_as_level0,
     program,
     raw_client,
@@ -99,20 +98,6 @@ class TestAProgram:
             assert trajectory.end is End.VUT_ERROR
             assert "ended with exit code 0, and its connection goes on" in trajectory.error
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize("campaign", ["that ends", "that is late"])
-    def test_that_we_end_leaves_no_traceback(self, campaign, tmp_path):
-        log = tmp_path / "controller.log"
-        late = "    if 'vut' in traci.vehicle.getIDList(): time.sleep(600)\n"
-        for_ever = "print('begun', flush=True)\nwhile True:\n    traci.simulationStep()\n"
-        source = STOCK_CLIENT + for_ever + (late if campaign == "that is late" else "")
-        command = program(tmp_path, source)
-        vut = factory("traci:" + command, log=log, deadline_s=1.0)
-        (trajectory,) = run_cases(vut, cases_of(1))
-        assert (trajectory.error is None) == (campaign == "that ends")
-        assert "begun" in log.read_text()
-        assert "Traceback" not in log.read_text()
-
 
 @pytest.mark.skipif(not door.KNOWN_HERE, reason="needs /proc/net/tcp")
 class TestWhoseAConnectionIs:
@@ -152,13 +137,6 @@ class TestWhoseAConnectionIs:
         finally:
             entrance.close()
         assert notes[0].startswith(f"a process of the user {os.geteuid() + 1} connected")
-
-    def test_is_unknown_when_it_is_gone(self):
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            with socket.create_connection(listener.getsockname()):
-                connection = listener.accept()[0]
-            with connection:
-                assert owner_of(connection) is None
 
 
 def shadows() -> list[int]:

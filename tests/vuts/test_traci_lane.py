@@ -9,13 +9,11 @@ from pathlib import Path
 
 import pytest
 from controllers import STOCK_CLIENT, program
-from traci_pair import ToSession, close_shadow, shadow
 from vut_contract import factory, run_on
 
-from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.vuts.traci.session import STAYED, Session
+from merge_sumo.vuts.traci.session import STAYED
 
 LANE = named_scenario("us23-lane")
 DRIVES = """
@@ -75,44 +73,3 @@ def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(tmp_path)
     assert trajectory.x_vut_m[-1] >= 130.0
     assert trajectory.clipped_steps == 0
     assert log.read_text().splitlines() == [f"note: {STAYED}"]
-
-
-class TestTheShadow:
-    """The SUMO that decides, step by step."""
-
-    @pytest.fixture
-    def session(self, tmp_path):
-        yield Session(shadow(tmp_path, LANE, road_for(LANE)))
-        close_shadow()
-
-    @staticmethod
-    def states(x_m, v_mps=20.0):
-        return {"pov": (x_m - 100.0, 30.0, 0.0), "vut": (x_m, v_mps, 0.0)}
-
-    def test_a_wish_that_is_not_granted_leaves_it_on_its_lane(self, session):
-        client = ToSession(session)
-        session.enter(self.states(-40.0))
-        client.vehicle.changeLane("vut", 1, 10.0)
-        session.step()
-        assert session.sumo.wants_to_merge
-        session.put(self.states(-38.0))
-        assert client.vehicle.getLaneID("vut") == "lane_0"
-        session.step()
-        assert session.sumo.wants_to_merge, "the command lasts"
-        session.put(self.states(-36.0), merged=True)
-        assert client.vehicle.getLaneID("vut") == "lane_1"
-        assert client.vehicle.getPosition("vut") == pytest.approx((-36.0, 0.0), abs=1e-9)
-
-    def test_a_merge_is_final(self, session):
-        client = ToSession(session)
-        session.enter(self.states(-40.0))
-        session.step()
-        session.put(self.states(-38.0), merged=True)
-        client.vehicle.changeLane("vut", 0, 10.0)
-        session.step()
-        session.put(self.states(-36.0), merged=True)
-        assert client.vehicle.getLaneIndex("vut") == 1
-        client.vehicle.changeLane("vut", 2, 10.0)
-        session.step()
-        session.put(self.states(-34.0), merged=True)
-        assert client.vehicle.getLaneIndex("vut") == 1

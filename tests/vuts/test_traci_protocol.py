@@ -87,18 +87,3 @@ class TestTheProtocol:
         else:
             with pytest.raises(tp.ProtocolError, match=f"{announced} bytes was announced"):
                 tp.message_length(head)
-
-    @given(
-        st.recursive(
-            st.floats(allow_nan=False) | st.integers(-(2**31), 2**31 - 1) | st.text(max_size=20),
-            lambda inner: st.lists(inner, min_size=2, max_size=2),
-            max_leaves=3,
-        )
-    )
-    def test_typed_values_are_read_as_they_were_written(self, value):
-        def written(v):
-            if isinstance(v, list):
-                return tp.compound(len(v), b"".join(map(written, v)))
-            return tp.pack({float: "d", int: "i", str: "s"}[type(v)], v)
-
-        assert tp.Reader(written(value)).typed() == value
