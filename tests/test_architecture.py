@@ -241,8 +241,8 @@ REPORTS_READ = {
     "merge_sumo.drivers.reference.REFERENCES",  # names of the reference drivers
     "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
     "merge_sumo.sumo.replay_folder.write_scenario",
-    "merge_sumo.vuts.output.LOG",  # the end of what a controller printed
-    "merge_sumo.vuts.output.end_of",
+    "merge_sumo.vuts.process.LOG",  # the end of what a controller printed
+    "merge_sumo.vuts.process.end_of",
 }
 
 

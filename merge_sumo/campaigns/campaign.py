@@ -32,7 +32,7 @@ from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.output import LOG
+from merge_sumo.vuts.process import LOG
 
 EXPORTED_FAILURES: Final = 10
 SCENARIOS: Final = "scenarios"

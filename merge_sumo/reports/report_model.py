@@ -26,7 +26,7 @@ from merge_sumo.verdict.diagnosis import Diagnosis, Kind, diagnose, failure_boxe
 from merge_sumo.verdict.plausibility import doubts
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.summary import Summary, summarise
-from merge_sumo.vuts.output import LOG, end_of
+from merge_sumo.vuts.process import LOG, end_of
 
 LISTED: Final = 10
 """Cases in a list, and messages of errors and timeouts."""

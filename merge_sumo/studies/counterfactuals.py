@@ -45,7 +45,7 @@ from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.merge import brake_after_mps2
 from merge_sumo.vuts.factory import VutFactory
-from merge_sumo.vuts.output import LOG
+from merge_sumo.vuts.process import LOG
 
 CAREFUL: Final = "careful"
 """The reference driver that takes the place of a careful one."""

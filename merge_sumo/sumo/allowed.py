@@ -178,26 +178,6 @@ TYPES: Final = {
 }
 """The types of the vehicles; SUMO chooses what is not named."""
 
-SURROUNDINGS: Final = {
-    "additional": Allowed(
-        {},
-        {
-            "poly": Allowed(
-                {
-                    "id": _ID,
-                    "color": _COLOUR,
-                    "fill": _SWITCH,
-                    "layer": number(-1000, 1000),
-                    "lineWidth": number(0, 100),
-                    "shape": _SHAPE,
-                },
-                required=("id", "shape"),
-            )
-        },
-    )
-}
-"""Shapes beside the road."""
-
 _LABEL = matching(
     r"(?:[A-Za-z0-9_ ,:+\-]|(?<=[0-9])\.(?=[0-9])|(?<=m)/(?=s)){0,250}",
     "a text of letters, digits and . , : + - _",

@@ -26,7 +26,6 @@ from merge_sumo.sumo.replay_folder import (
     LABELS,
     NET,
     RECORD,
-    SURROUNDINGS,
     TYPES,
     Road,
     corridor_of_hosted,
@@ -138,16 +137,15 @@ class _Episode:
 def _received(folder: Path) -> _Episode:
     """Read net, vehicle types and record of a folder that somebody may have sent."""
     hosted = os.path.lexists(folder / HOSTED_NET)
-    net_files = (HOSTED_NET, SURROUNDINGS) if hosted else (NET,)
-    for name in (*net_files, TYPES, RECORD):
+    file = HOSTED_NET if hosted else NET
+    for name in (file, TYPES, RECORD):
         if not os.path.lexists(folder / name):
             raise UserError(f"{folder} is not a replay folder: it has no {name}")
-    path, schema, find = folder / NET, allowed.NET, corridor_of_shipped
+    path, schema, find = folder / file, allowed.NET, corridor_of_shipped
     if hosted:
-        path, schema, find = folder / HOSTED_NET, allowed.HOSTED_NET, corridor_of_hosted
+        schema, find = allowed.HOSTED_NET, corridor_of_hosted
     net = received.cleaned(_bytes(path), schema, f"the net {path}")
-    drawn = _read(folder / SURROUNDINGS, allowed.SURROUNDINGS) if hosted else None
-    road = Road(net, find(net, path), drawn)
+    road = Road(net, find(net, path), file)
     types = _checked_types(folder / TYPES)
     root, rows = _checked_record(folder / RECORD, _vehicles(types))
     # Folders of older versions have no labels.

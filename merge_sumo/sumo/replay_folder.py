@@ -3,9 +3,9 @@
 On the shipped road it is played in the shipped net. Of any other road the folder has the net that
 hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
 reader can check, and where the road goes on behind the end of the file, so does that net. A VUT on
-an acceleration lane is on the lane of the mainline from the row in which it has merged. The lanes
-beside the road are polygons. Labels stand at fixed places above the road, as points of interest
-with a text: names at the cars would lie on each other at M, where a reader looks.
+an acceleration lane is on the lane of the mainline from the row in which it has merged. Labels
+stand at fixed places above the road, as points of interest with a text: names at the cars would lie
+on each other at M, where a reader looks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
-from merge_sumo.road.netfile import NetFile, Point
+from merge_sumo.road.netfile import NetFile
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.scenario.trajectory import Trajectory
@@ -40,7 +40,6 @@ HOSTED_NET: Final = "road.net.xml"
 """The net of any other road."""
 LANE_EDGE: Final = LANE.replace(COPY, ".0")
 """Edge of that net with an acceleration lane and the mainline beside it."""
-SURROUNDINGS: Final = "surroundings.add.xml"
 TYPES: Final = "vehicles.add.xml"
 LABELS: Final = "labels.add.xml"
 RECORD: Final = "episode.fcd.xml"
@@ -71,7 +70,6 @@ LETTERS: Final = "60"
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
-MAX_SURROUNDINGS: Final = 2_000
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
 
@@ -113,6 +111,11 @@ class Picture:
     borders: bool = False
     """True for lines between lanes."""
 
+    @property
+    def viewport(self) -> tuple[str, str, str]:
+        """Zoom, x and y."""
+        return self.zoom, f"{self.x_m:g}", f"{self.y_m:g}"
+
 
 @dataclass(frozen=True, slots=True)
 class Road:
@@ -121,13 +124,8 @@ class Road:
     net: bytes
     corridor: Corridor
     """Found in that net, so that its lanes have the ids that they have there."""
-    surroundings: etree._Element | None
-    """None where the net itself has all lanes."""
-
-    @property
-    def file(self) -> str:
-        """Name of the net in the folder."""
-        return NET if self.surroundings is None else HOSTED_NET
+    file: str
+    """Name of the net in the folder."""
 
 
 def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
@@ -147,12 +145,12 @@ def _road(road: Corridor, folder: Path) -> Road:
     """Return a road as a folder has it."""
     edges, shipped = (road.mainline_edges, road.ramp_edges), road_of()
     if (road.sha256, *edges) == (shipped.sha256, MAINLINE_EDGES, RAMP_EDGES):
-        return Road(shipped.path.read_bytes(), shipped, None)
+        return Road(shipped.path.read_bytes(), shipped, NET)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     content = hosted_net(fast, 1, lane_goes_on=True)
-    drawn = _polygons(road.surroundings)
     _, lane_end_m = fast.lane_m or (0.0, 0.0)
-    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET, lane_end_m), drawn)
+    found = corridor_of_hosted(content, folder / HOSTED_NET, lane_end_m)
+    return Road(content, found, HOSTED_NET)
 
 
 def corridor_of_shipped(content: bytes, path: Path) -> Corridor:
@@ -192,9 +190,10 @@ def files_of(
     road: Road, types: etree._Element, record: etree._Element, labels: etree._Element | None
 ) -> dict[str, bytes]:
     """Return all that SUMO reads, the configuration last; without labels where there are none."""
-    additional = {TYPES: types, SURROUNDINGS: road.surroundings, LABELS: labels}
-    given = {name: root for name, root in additional.items() if root is not None}
-    view, config = _view(_picture(road, record)), _config(road, [*given], len(record))
+    given = {TYPES: types} if labels is None else {TYPES: types, LABELS: labels}
+    picture = _picture(road, record)
+    view = view_settings(picture.exaggeration, picture.viewport, borders=picture.borders)
+    config = _config(road, [*given], len(record))
     roots = {**given, RECORD: record, VIEW: view, CONFIG: config}
     return {road.file: road.net} | {name: received.serialize(r) for name, r in roots.items()}
 
@@ -247,27 +246,6 @@ def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def _polygons(shapes: tuple[tuple[Point, ...], ...]) -> etree._Element:
-    root = etree.Element("additional")
-    for number, shape in enumerate(shapes[:MAX_SURROUNDINGS]):
-        etree.SubElement(
-            root,
-            "poly",
-            id=f"lane{number}",
-            color="0.70,0.70,0.68",
-            fill="0",
-            layer="-1",
-            lineWidth="1.6",  # to either side
-            shape=" ".join(f"{x:.3f},{y:.3f}" for x, y, _ in shape),
-        )
-    return root
-
-
-def _view(picture: Picture) -> etree._Element:
-    viewport = picture.zoom, f"{picture.x_m:g}", f"{picture.y_m:g}"
-    return view_settings(picture.exaggeration, viewport, borders=picture.borders)
-
-
 def view_settings(
     exaggeration: str,
     viewport: tuple[str, str, str],
@@ -312,7 +290,7 @@ def _text(of: str, size: str, colour: str) -> dict[str, str]:
 
 def _picture(shown: Road, record: etree._Element) -> Picture:
     """Return a picture of the way of the cars; at a zoom of 100 it has the whole net."""
-    if shown.surroundings is None:
+    if shown.file == NET:
         return Picture("4", "440", -110.0, -20.0, WHOLE_WIDTH_M, WHOLE_WIDTH_M * SHAPE)
     road = shown.corridor
     paths = (road.mainline, road.ramp)

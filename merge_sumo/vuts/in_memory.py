@@ -12,7 +12,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final, Protocol, SupportsFloat
 
 from merge_sumo.errors import notice
-from merge_sumo.system.workers import AnyWorkers, workers_or_cores
+from merge_sumo.system.workers import AnyWorkers
 from merge_sumo.vuts.base import HERE, Seen, VutOptions, VutSpec
 from merge_sumo.vuts.here import object_of, objects, vut_of_object
 from merge_sumo.vuts.python import SeenBatch, is_code
@@ -87,26 +87,18 @@ def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None
 
     Says in a sentence where something drives in this process that could do it harm.
     """
-    several = isinstance(workers, str) or workers_or_cores(workers) > 1
     specs = spec_of(vut), None if pov is None else spec_of(pov)
     for spec in (parse(text) for text in specs if text is not None):
         if object_of(spec) is None:
             continue
-        name = spec.argument
-        if travels(spec):
-            process = "the processes of the workers" if several else "this process"
-            why = (
-                f"{name} is an object, so it drives in {process}, which what it does wrong may end"
-            )
-        else:
-            alone = ", and without workers," if several else ""
-            workers = 1
-            why = (
-                f"{name} is known to this process alone, so it drives here{alone} where what it "
-                "does wrong may end everything; put its class or function into a module for a "
-                "process of its own"
-            )
-        notice(why, UserWarning)
+        where = "with the cases"
+        if not travels(spec):
+            workers, where = 1, "in this process, without workers"
+        notice(
+            f"{spec.argument} is an object, so it drives {where}, which what it does wrong may "
+            "end; put its class or function into a module for a process of its own",
+            UserWarning,
+        )
     return *specs, workers
 
 

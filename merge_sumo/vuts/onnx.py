@@ -38,7 +38,7 @@ def onnx_vut(spec: VutSpec, options: VutOptions) -> Vut:
     def make(corridors: int, _world: object) -> Driver:
         return OnnxVut(corridors, network, options.deadline_s)
 
-    return Vut(make=make, files=(file, *network.weights))
+    return Vut(make=make, files=(file,))
 
 
 class Network:
@@ -46,11 +46,10 @@ class Network:
 
     def __init__(self, path: Path, period_s: str | None) -> None:
         try:
-            import onnx
             import onnxruntime as ort
         except ImportError as error:
             raise UserError(
-                "an ONNX network needs onnx and onnxruntime: run `pip install 'merge-sumo[onnx]'`"
+                "an ONNX network needs onnxruntime: run `pip install 'merge-sumo[onnx]'`"
             ) from error
         if not path.is_file():
             raise UserError(f"there is no ONNX file {path}")
@@ -64,14 +63,6 @@ class Network:
             )
         except Exception as error:  # onnxruntime has a class of its own for every failure
             raise UserError(f"{path} is no ONNX network that can be run: {error}") from error
-        tensors = onnx.external_data_helper
-        model = onnx.load(path, load_external_data=False)
-        self.weights = {
-            path.parent / tensors.ExternalDataInfo(tensor).location
-            for tensor in tensors._get_all_tensors(model)
-            if tensors.uses_external_data(tensor)
-        }
-        """Files beside it; native code opens them."""
         inputs = self._session.get_inputs()
         if len(inputs) != 1 or inputs[0].type not in _DTYPES or list(inputs[0].shape)[-1:] != [4]:
             said = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)

@@ -30,7 +30,7 @@ from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies.truth import Truth, ground_truth, read_truth
 from merge_sumo.verdict.severity import Severity
-from merge_sumo.vuts.output import LOG
+from merge_sumo.vuts.process import LOG
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.studies.surface import learn_surface
-from merge_sumo.vuts.output import LINES, LOG
+from merge_sumo.vuts.process import LINES, LOG
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
 

@@ -32,10 +32,10 @@ from lxml import etree
 from merge_sumo.cli import main
 from merge_sumo.sumo import replay_folder
 
-view, config = replay_folder._view, replay_folder._config
+view, config = replay_folder.view_settings, replay_folder._config
 
-def with_pictures(*arguments):
-    root = view(*arguments)
+def with_pictures(*arguments, **options):
+    root = view(*arguments, **options)
     root.find("delay").set("value", "0")
     for file, time in {times}.items():
         etree.SubElement(root, "snapshot", file=file, time=time)
@@ -48,7 +48,7 @@ def that_ends(*arguments):
     root.find("gui_only").remove(root.find("gui_only/breakpoints"))
     return root
 
-replay_folder._view, replay_folder._config = with_pictures, that_ends
+replay_folder.view_settings, replay_folder._config = with_pictures, that_ends
 main()
 """
 

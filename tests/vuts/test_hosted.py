@@ -24,7 +24,7 @@ from merge_sumo.scenario.scenario import US23, as_merge, lane_of
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import HostedVut
-from merge_sumo.vuts.output import append
+from merge_sumo.vuts.process import append
 from merge_sumo.vuts.spec import parse
 
 OPTIONS = VutOptions(deadline_s=0.3)

@@ -77,13 +77,13 @@ class TestWhatTravels:
 class TestACampaign:
     def test_asks_the_very_object_that_it_was_given(self, tmp_path):
         vut = Batched(1.0)
-        with pytest.warns(UserWarning, match=r"Batched\S* is an object, so it drives in this"):
+        with pytest.warns(UserWarning, match=r"Batched\S* is an object, so it drives with"):
             run = ms.campaign(vut, **SMALL, out=tmp_path / "run")
         assert vut.asked > 50
         assert run.trajectory(0).a_vut_mps2[0] == 1.0
 
     def test_of_what_cannot_travel_runs_without_workers(self, tmp_path):
-        with pytest.warns(UserWarning, match="and without workers"):
+        with pytest.warns(UserWarning, match="in this process, without workers"):
             ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
 
 

@@ -4,14 +4,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from export_policy import export_onnx
 from merges import SMALLER
 from networks import constant_network as network
-from plans import plan_for
 from vut_contract import begin, cases_of, in_process, on_lane, run_cases
 
 from merge_sumo.drivers.base import MERGE, STAY
@@ -19,7 +16,6 @@ from merge_sumo.drivers.policies import NETWORKS
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.truth import ground_truth
 
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
@@ -68,29 +64,6 @@ def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp
     begin(wrong)
     assert np.isnan(wrong.act(on_lane([-51.0])))[0]
     assert wrong.reason(0) == "WrongAnswerError: wishes inf instead of a number, to merge or not"
-
-
-def test_weights_in_other_files_are_of_the_files_of_the_network(tmp_path):
-    path = network(tmp_path / "here.onnx", answer=[0.5])
-    model = onnx.load(path)
-    onnx.save_model(
-        onnx.load_from_string(model.SerializeToString()),
-        tmp_path / "a.onnx",
-        save_as_external_data=True,
-        location="weights.bin",
-        size_threshold=0,
-    )
-    assert [Path(f).name for f in in_process(f"onnx:{path}").files] == ["here.onnx"]
-    vut = f"onnx:{tmp_path / 'a.onnx'}"
-    assert sorted(Path(f).name for f in in_process(vut).files) == ["a.onnx", "weights.bin"]
-    truth = [ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").margin]
-    weights = tmp_path / "weights.bin"
-    half, one = np.float64(0.5).tobytes(), np.float64(1.0).tobytes()
-    assert weights.read_bytes().count(half) == 1
-    weights.write_bytes(weights.read_bytes().replace(half, one))
-    truth.append(ground_truth(plan_for(vut), 0, 4, cache=tmp_path / "cache").margin)
-    before, after = truth
-    assert not np.array_equal(before, after)
 
 
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):

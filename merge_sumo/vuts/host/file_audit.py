@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import os
-import re
 import site
 import sys
 import sysconfig
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.system.resources import resource
 
 SYSTEM: Final = ("/proc", "/sys", "/dev", "/etc", "/usr/lib", "/usr/share", "/lib", "/run")
-METADATA: Final = re.compile(r"\.dist-info.(entry_points\.txt|METADATA)$")
 MOST_FILES: Final = 10_000
 """That are remembered; a VUT may open files for ever."""
 
@@ -38,14 +37,12 @@ class LoadedFiles:
         modules: list[Any] = [m for n, m in list(sys.modules.items()) if n not in self._before]
         imported = [str(getattr(module, "__file__", None) or "") for module in modules]
         sources = {os.path.realpath(file) for file in imported if file}
-        paths = sources | self._read - self._written
-        return {path for path in paths if self._theirs(path) and Path(path).is_file()}
+        return {path for path in sources | self._read - self._written if self._is_theirs(path)}
 
-    def _theirs(self, path: str) -> bool:
-        # Compiled modules stand for their sources, which are in `sys.modules`; what packages are
-        # installed is read to find the kind of the VUT.
-        no_source = path.endswith(".pyc") or METADATA.search(path) is not None
-        return not path.startswith(self._not_theirs) and not no_source
+    def _is_theirs(self, path: str) -> bool:
+        # Compiled modules stand for their sources, which are in `sys.modules`.
+        ours = path.startswith(self._not_theirs) or path.endswith(".pyc")
+        return not ours and ".dist-info" + os.sep not in path and Path(path).is_file()
 
     def _audit(self, event: str, arguments: tuple[Any, ...]) -> None:
         if len(self._read) + len(self._written) > MOST_FILES:
@@ -58,14 +55,10 @@ class LoadedFiles:
             return
         if not isinstance(path, str | bytes):
             return  # a descriptor, opened before
-        try:
-            real_path = os.path.realpath(os.fsdecode(path))
-        except (OSError, ValueError):  # the name is none; the VUT shall hear it from `open`
-            return
         reads = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) == 0
-        if isinstance(mode, str):
-            reads = not set(mode) & set("wax+")
-        (self._read if reads else self._written).add(real_path)
+        files = self._read if reads and not set(mode or "") & set("wax+") else self._written
+        with suppress(OSError, ValueError):  # the name is none; the VUT shall hear it from `open`
+            files.add(os.path.realpath(os.fsdecode(path)))
 
 
 def _not_theirs() -> set[str]:

@@ -34,7 +34,7 @@ from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, Said, WireError
-from merge_sumo.vuts.output import Output
+from merge_sumo.vuts.process import Output
 
 T = TypeVar("T")
 

@@ -33,8 +33,7 @@ from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
-from merge_sumo.vuts.output import append
-from merge_sumo.vuts.process import GRACE_S, Program, split_command
+from merge_sumo.vuts.process import GRACE_S, Program, append, split_command
 from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door
 from merge_sumo.vuts.traci.server import FaultError
