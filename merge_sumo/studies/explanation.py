@@ -2,8 +2,8 @@
 
 One thing changes, all others stay: a coordinate of the start, psi, a parameter of the VUT that is
 named, or the level of the POV. Values are whole numbers of their last digit. From the value of the
-case on values of a grid run, to both sides, until one passes or the range ends; between that and
-the value before it the middle runs, and so on. Verdicts are not monotone: a pass between two values
+case on the values of a grid run, to both sides; between the first that passes and the value before
+it the middle runs, and so on. Verdicts are not monotone: a pass between two values
 of the grid is missed, so the step of the grid is recorded.
 
 A case passes where it has a verdict and does not fail; a value that the controller refuses does not
@@ -13,8 +13,10 @@ pass. What is said of a case runs a second time, in SUMO.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated, Any, Final
 
 from msgspec import Meta
@@ -44,7 +46,7 @@ START_STEPS: Final = 160
 """Values of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
 PARAMETER_STEPS: Final = 40
 """Values of the grid over the range of a parameter, each of which is another VUT."""
-BLOCK: Final = 8
+BLOCK: Final = 16
 """Values of a side of the grid that run at a time, so that workers have something to do."""
 ROUNDED: Final = 1e-6
 """Units that a value is off at most where it is a whole number of them."""
@@ -89,46 +91,56 @@ class Axis(Record, frozen=True):
         return abs(value - self.value) / (self.high - self.low)
 
     @property
-    def _scale(self) -> float:
+    def scale(self) -> float:
         """Units of the last digit in 1."""
         return float(10.0**self.digits)
 
-    def nearer(self, value: float) -> float | None:
-        """Return the value before one, seen from the failure's; None where there is none."""
-        sign = 1 if value > self.value else -1
-        before = (round(value * self._scale) - sign) / self._scale
-        return before if (before - self.value) * sign > 0.0 else None
+    def grid(self, sign: int) -> list[int]:
+        """Return the values of one side in units, from the failure's on, which is rounded to it.
 
-    def side(self, sign: int) -> Side:
-        """Search one side of the failure's value for the first that passes."""
-        at, end = (v * self._scale for v in (self.value, self.high if sign > 0 else self.low))
-        if sign > 0:
-            first, last = math.floor(at + ROUNDED) + 1, math.floor(end + ROUNDED)
-        else:
-            first, last = math.ceil(at - ROUNDED) - 1, math.ceil(end - ROUNDED)
-        if (last - first) * sign < 0:
-            return None
-        stride = max(1, round(self.step * self._scale))
-        fails = first - sign
-        grid = [*range(fails + sign * stride, last, sign * stride), last]
-        for begin in range(0, len(grid), BLOCK):
-            block = grid[begin : begin + BLOCK]
-            for units, passes in zip(block, (yield [u / self._scale for u in block]), strict=True):
-                if passes:
-                    return (yield from self._between(fails, units))
-                fails = units
-        return None
-
-    def _between(self, fails: int, passes: int) -> Side:
-        while abs(passes - fails) > 1:
-            middle = (fails + passes) // 2
-            (passed,) = yield [middle / self._scale]
-            fails, passes = (fails, middle) if passed else (middle, passes)
-        return passes / self._scale
+        Empty where the range ends there.
+        """
+        end = self.high if sign > 0 else self.low
+        own, last = (math.floor(sign * v * self.scale + ROUNDED) for v in (self.value, end))
+        stride = max(1, round(self.step * self.scale))
+        grid = [own, *range(own + stride, last, stride), last]
+        return [sign * units for units in grid] if last > own else []
 
 
-Side = Generator[list[float], list[bool], float | None]
-"""Asks for values and is told whether each passes; returns the first that does."""
+def nearest(
+    axes: Sequence[Axis], ask: Callable[[list[tuple[int, float]]], list[bool]]
+) -> dict[tuple[int, int], tuple[float, float]]:
+    """Search both sides of each axis for the first value that passes, all at a time.
+
+    `ask` says of values, each with the place of its axis, whether they pass. Returns by place and
+    sign the value before, which does not pass, and that one; nothing for sides without.
+    """
+
+    def tried(units: Iterable[tuple[int, int]]) -> dict[tuple[int, int], bool]:
+        known = list(dict.fromkeys(units))
+        passed = ask([(place, number / axes[place].scale) for place, number in known])
+        return dict(zip(known, passed, strict=True))
+
+    sides = {(p, sign): axis.grid(sign) for p, axis in enumerate(axes) for sign in (-1, 1)}
+    found: dict[tuple[int, int], tuple[int, int]] = {}
+    for begin in range(0, max(map(len, sides.values()), default=0), BLOCK):
+        rest = {k: grid[begin : begin + BLOCK + 1] for k, grid in sides.items() if k not in found}
+        passed = tried((place, units) for (place, _), grid in rest.items() for units in grid[1:])
+        for key, grid in rest.items():
+            pairs = (pair for pair in pairwise(grid) if passed[key[0], pair[1]])
+            if (pair := next(pairs, None)) is not None:
+                found[key] = pair
+    while wide := {
+        key: sum(pair) // 2 for key, pair in found.items() if abs(pair[1] - pair[0]) > 1
+    }:
+        passed = tried((place, middle) for (place, _), middle in wide.items())
+        for key, middle in wide.items():
+            fails, passes = found[key]
+            found[key] = (fails, middle) if passed[key[0], middle] else (middle, passes)
+    return {
+        (place, sign): (fails / axes[place].scale, passes / axes[place].scale)
+        for (place, sign), (fails, passes) in found.items()
+    }
 
 
 class Explanation(Record, frozen=True):
@@ -213,16 +225,13 @@ def note_explanation(
 ) -> None:
     """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
-    Nothing is written for drivers that need SUMO, nor where the engines differ.
+    Nothing is written for drivers that need SUMO, nor where the engines differ. `check` is called
+    after each step, and may raise to stop there.
     """
     worst = failures(run.cases)[:1]
-    if plan.needs_sumo is not None or not worst:
-        return
-    try:
-        found = _Neighbours(plan.with_engine(None), worst[0], workers=workers).found(check)
-    except UserError:
-        return
-    _write(run, found)
+    if plan.needs_sumo is None and worst:
+        with suppress(UserError):
+            _explained(run, _Neighbours(plan.with_engine(None), worst[0], (), workers, check))
 
 
 def explain(
@@ -243,16 +252,17 @@ def explain(
     outcome = failure_of(study.run, index)
     study.check_same_system()
     with workers_or_here(study.workers) as opened:
-        found = _Neighbours(study.plan, outcome, ranges, opened).found()
-    _write(study.run, found)
+        found = _explained(study.run, _Neighbours(study.plan, outcome, ranges, opened))
     study.on_cases(1)
     return ExplanationResult(study.run, found)
 
 
-def _write(run: Run, found: Explanation) -> None:
-    """Write an explanation beside those of other cases."""
+def _explained(run: Run, neighbours: _Neighbours) -> Explanation:
+    """Search, and write what is found beside the explanations of other cases."""
+    found = neighbours.found()
     known = {**EXPLANATIONS.read_lines(run), found.index: found}
     EXPLANATIONS.write_lines(run.folder, [known[index] for index in sorted(known)])
+    return found
 
 
 class _Neighbours:
@@ -262,10 +272,12 @@ class _Neighbours:
         self,
         plan: SimulationPlan,
         outcome: Outcome,
-        ranges: Sequence[Range] = (),
-        workers: Workers | None = None,
+        ranges: Sequence[Range],
+        workers: Workers | None,
+        check: Callable[[], None] = lambda: None,
     ) -> None:
         """Take the plan, the failure, the parameters that are searched, and where cases run."""
+        self._check = check
         self._plan, self._outcome, self._workers = plan, outcome, workers
         case, present = outcome.case, plan.vut.values_of(ranges)
         self._axes = [
@@ -278,43 +290,34 @@ class _Neighbours:
         ]
         self._levels = [level for level in plan.povs.levels if level != case.level]
 
-    def found(self, check: Callable[[], None] = lambda: None) -> Explanation:
-        """Search, and confirm what was found; raises `UserError` where a case ends otherwise.
-
-        `check` is called after each step, and may raise to stop there.
-        """
+    def found(self) -> Explanation:
+        """Search, and confirm what was found; raises `UserError` where a case ends otherwise."""
         itself = self._plan.vut.spec, self._outcome.case
-        fails, *at_levels = self._passes([itself, *map(self._at_level, self._levels)])
+        others = list(map(self._at_level, self._levels))
+        fails, *at_levels = self._passes([itself, *others])
         if fails:
             raise self._other_now()
-        levels = dict(zip(map(level_name, self._levels), at_levels, strict=True))
-        nearest = self._nearest(check)
+        pairs = nearest(self._axes, self._ask)
+        claims = [(itself, False), *zip(others, at_levels, strict=True)]
+        for (place, sign), (before, value) in pairs.items():
+            claims.append((self._trial(place, value), True))
+            if (before - self._axes[place].value) * sign > 0.0:
+                claims.append((self._trial(place, before), False))
+        trials, expected = zip(*claims, strict=True)
+        if self._passes(trials, Engine.SUMO) != list(expected):
+            raise self._other_now()
+        values = {key: value for key, (_, value) in pairs.items()}
         axes = tuple(
-            replaced(axis, below=nearest[place, -1], above=nearest[place, 1])
+            replaced(axis, below=values.get((place, -1)), above=values.get((place, 1)))
             for place, axis in enumerate(self._axes)
         )
-        self._confirm(axes, at_levels)
         start, parameters = axes[: self._coordinates], axes[self._coordinates :]
+        levels = dict(zip(map(level_name, self._levels), at_levels, strict=True))
         return Explanation(self._outcome.index, start, levels, parameters)
 
-    def _nearest(self, check: Callable[[], None]) -> dict[tuple[int, int], float | None]:
-        """Search both sides of each axis, all at a time; return the nearest values that pass."""
-        every = [(place, sign) for place in range(len(self._axes)) for sign in (-1, 1)]
-        sides = {(place, sign): self._axes[place].side(sign) for place, sign in every}
-        nearest: dict[tuple[int, int], float | None] = dict.fromkeys(every)
-        answers: dict[tuple[int, int], Any] = dict.fromkeys(every)
-        while answers:
-            asked: dict[tuple[int, int], list[float]] = {}
-            for key, passes in answers.items():
-                try:
-                    asked[key] = sides[key].send(passes)
-                except StopIteration as end:
-                    nearest[key] = end.value
-            trials = [self._trial(key[0], v) for key, values in asked.items() for v in values]
-            passing = iter(self._passes(trials))
-            answers = {key: [next(passing) for _ in values] for key, values in asked.items()}
-            check()
-        return nearest
+    def _ask(self, values: list[tuple[int, float]]) -> list[bool]:
+        self._check()
+        return self._passes([self._trial(place, value) for place, value in values])
 
     def _trial(self, place: int, value: float) -> Trial:
         vut, case = self._plan.vut.spec, self._outcome.case
@@ -344,20 +347,6 @@ class _Neighbours:
             for place, passed in ran:
                 passes[places[place]] = passed
         return passes
-
-    def _confirm(self, axes: Sequence[Axis], at_levels: Sequence[bool]) -> None:
-        """Run what is said a second time, in SUMO, and values that are a unit nearer."""
-        claims = [((self._plan.vut.spec, self._outcome.case), False)]
-        claims += zip(map(self._at_level, self._levels), at_levels, strict=True)
-        for place, axis in enumerate(axes):
-            for value in axis.passing:
-                claims.append((self._trial(place, value), True))
-                nearer = axis.nearer(value)
-                if nearer is not None:
-                    claims.append((self._trial(place, nearer), False))
-        trials, expected = zip(*claims, strict=True)
-        if self._passes(trials, Engine.SUMO) != list(expected):
-            raise self._other_now()
 
     def _other_now(self) -> UserError:
         return UserError(

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
-from typing import Any
 
-import numpy as np
 import pandas
 import pytest
 from handmade import write_run
@@ -35,32 +32,12 @@ class TestARun:
         assert frame["score"].is_monotonic_increasing
         assert (frame["score"] < -500).all()
 
-    def test_gives_the_rows_of_its_file(self, opened, made):
-        lines = (made.folder / "outcomes.jsonl").read_text().splitlines()
-        assert list(opened.cases) == [json.loads(line) for line in lines]
-
-    def test_writes_its_report(self, opened, made):
-        path = opened.report()
-        assert path == made.folder / "report.html"
-        assert path.is_file()
-
-    def test_gives_a_trajectory(self, opened, made):
-        assert (opened.trajectory(3).motion == made.trajectory(3).motion).all()
-
     def test_shows_its_lines_and_its_failures_as_a_table_and_names_as_text(self, opened):
         root = html.fragment_fromstring(opened._repr_html_(), create_parent="div")
         assert len(root.xpath(".//pre")) == 1
         assert root.xpath(".//b") == []
         root = html.fragment_fromstring(opened.failures._repr_html_(), create_parent="div")
         assert len(root.xpath(".//tr")) > 3
-
-    def test_shows_at_most_20_rows_and_says_how_many_there_are(self, opened):
-        shown = opened.cases._repr_html_()
-        assert shown.count("<tr>") == 21
-        assert "160 more rows" in shown
-
-    def test_has_a_line_for_a_terminal(self, opened, made):
-        assert repr(opened).startswith(f"<campaign {made.folder}: ")
 
 
 class TestACampaign:
@@ -112,21 +89,3 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
         getattr(ms, verb)("design2", **values)
     assert sentence in str(refused.value)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_numbers_of_arrays_are_numbers(tmp_path):
-    numbers: dict[str, Any] = {
-        "cases": np.int64(4),
-        "seed": np.int32(1),
-        "deadline_s": np.float32(5.0),
-    }
-    of_numpy = ms.campaign("design2", level=0, out=tmp_path / "numpy", **numbers)
-    plain = {name: number.item() for name, number in numbers.items()}
-    of_python = ms.campaign("design2", level=0, out=tmp_path / "python", **plain)
-    assert of_numpy.cases == of_python.cases
-
-
-def test_one_index_is_as_good_as_a_list(run, tmp_path):
-    assert len(ms.rerun(run.folder, 3).steps[0].cases) == 1
-    (path,) = ms.export(run.folder, 3, out=tmp_path / "scenarios")
-    assert path.is_file()

@@ -10,11 +10,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigning import resume_campaign, run_campaign
+from campaigning import run_campaign
 
 from merge_sumo import api
 from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
-from merge_sumo.campaigns.repeats import read_repeats
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import make_sampler
@@ -190,27 +189,6 @@ class TestACampaign:
         known = {"levels": (0,), "cases": 60, "sampler": "gpr", "batch": 10, "tolerated": 0.3}
         known |= {"vut": f"{vut}:Vut", "repeat": "auto", "scenario": US23}
         return CampaignSettings(**{**known, **given})
-
-    @pytest.mark.parametrize(
-        "given", [{}, {"repeat": 3, "sampler": "uniform"}, {"batch": None, "in_flight": 6}], ids=str
-    )
-    def test_goes_on_to_the_byte(self, tmp_path, given):
-        settings, folder = self.settings(tmp_path, **given), tmp_path / "run"
-        run = run_campaign(settings, folder)
-        repeats = [outcome for outcome in run.outcomes if outcome.case.draw]
-        assert len(repeats) >= 2
-        path = folder / "outcomes.jsonl"
-        before = path.read_bytes()
-        path.write_bytes(b"".join(before.splitlines(keepends=True)[:35]))
-        resume_campaign(folder)
-        assert path.read_bytes() == before
-        assert [one for one in read_repeats(run) if not one.same] == []
-        again = api.run(settings.vut, recorded=(folder, repeats[0].index))
-        assert again.outcome.case == repeats[0].case
-        assert again.measures == repeats[0].measures
-        row = api.open_run(folder).cases[repeats[0].index]
-        as_row = api.run(settings.vut, case=row, fail_when=settings.fail_when)
-        assert as_row.outcome.case == repeats[0].case
 
     def test_counts_cases_and_not_runs_in_what_it_says(self, tmp_path):
         run_campaign(self.settings(tmp_path), tmp_path / "run")

@@ -12,10 +12,8 @@ from calling import assert_refused
 from plans import plan_for
 from processes import ports_of
 
-from merge_sumo.campaigns.one_case import case_of, run_one
+from merge_sumo.campaigns.one_case import run_one
 from merge_sumo.errors import UserError
-from merge_sumo.reports.motion import lines_of, motion_lines
-from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.live import Window
@@ -47,10 +45,6 @@ class TestTheCommand:
         assert told["score"] == was.measures.score
         assert (np.array(told["motion"]) == run.trajectory(7).motion).all()
         assert code == (1 if was.failed else 0)
-
-    def test_puts_another_vut_and_other_numbers_into_a_recorded_case(self, command_line, run):
-        _, out, _ = command_line("run", "--case", run.folder, "7", "--vut", "level0", "--v", "30")
-        assert f"x_POV0 {run.outcome(7).case.x_pov0_m:.1f} m, v_POV0 30.00 m/s" in out
 
     def test_runs_a_vut_in_this_process_for_a_debugger(self, command_line, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
@@ -87,16 +81,6 @@ class TestTheCommand:
 
 def _rows(folder: Path) -> int:
     return (folder / "episode.fcd.xml").read_text().count("<vehicle ")
-
-
-def test_in_traffic_the_table_has_all_cars():
-    where = named_scenario("us23-traffic")
-    values = {"x_pov0_m": -300, "v_pov0_mps": 30, "headway_ahead_s": 2, "headway_behind_s": 2}
-    case = case_of(where, 0, values)
-    ended = run_one(plan_for("design2", scenario=where), case)
-    head = motion_lines(ended.trajectory)[0]
-    assert all(name in head for name in ("x POV", "x VUT", "x AHEAD", "x BEHIND"))
-    assert lines_of(ended.outcome, ended.trajectory)[0].endswith("headway behind 2.00 s")
 
 
 class TestInSumoGui:

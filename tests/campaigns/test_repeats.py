@@ -36,8 +36,6 @@ SHY = """
         return -2.0 if {remembered} and seen.v_vut_mps > 10.0 else 1.0
 """
 OWN = SHY.format(remember="self.shy = True", remembered="self.shy")
-WITHOUT_RESET = "class Vut:\n    def __init__(self):\n        self.shy = False\n" + OWN
-WITH_RESET = "class Vut:\n    def reset(self, seen):\n        self.shy = False\n" + OWN
 FORGETS = "class Vut:\n    shy = False\n    def reset(self, seen):\n        pass\n" + OWN
 IN_ITS_CLASS = "class Vut:\n    shy = False\n" + SHY.format(
     remember="Vut.shy = True", remembered="Vut.shy"
@@ -76,34 +74,6 @@ def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
 
 
 @pytest.mark.slow
-def test_a_class_without_reset_drives_as_one_with_it(vut, tmp_path):
-    lines = []
-    for number, (source, workers) in enumerate([(WITH_RESET, 1), (WITHOUT_RESET, 2)]):
-        run = campaign(vut(source), tmp_path / f"run{number}", workers)
-        lines.append((run.folder / "outcomes.jsonl").read_bytes())
-        repeats = read_repeats(run)
-        assert len(repeats) == 8
-        assert all(one.same for one in repeats)
-    assert lines[0] == lines[1]
-
-
-@pytest.mark.filterwarnings("ignore:.*drives:UserWarning")
-def test_a_callable_object_of_python_begins_every_episode_as_it_was_given(tmp_path):
-    class Counts:
-        asked = 0
-
-        def __call__(self, _seen):
-            self.asked += 1
-            return 0.001 * self.asked
-
-    vut = Counts()
-    run = ms.campaign(vut, level=0, cases=40, batch=20, out=tmp_path / "run")
-    assert vut.asked == 0
-    assert {run.trajectory(k).a_vut_mps2[0] for k in range(40)} == {0.001}
-    assert all(one.same for one in run.repeats)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("name", some(REMEMBERING, "module"))
 def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
     spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
@@ -139,15 +109,6 @@ def test_where_cases_repeat_chance_is_expected_and_memory_is_not(vut, tmp_path, 
     said = unrepeatable(differing)
     assert (said is None) is chance
     assert chance or "The VUT keeps something from earlier episodes: " in str(said)
-
-
-def test_a_pov_that_remembers_is_found_beside_a_vut_that_does_not(vut, tmp_path):
-    run = campaign("design2", tmp_path / "run", pov=vut(IN_ITS_MODULE), levels=(0, 3), cases=80)
-    repeats = read_repeats(run)
-    assert {run.outcome(one.index).case.level for one in repeats} == {3}
-    differing = [one for one in repeats if not one.same]
-    assert {one.first for one in differing} == {"pov"}
-    assert "the POV draws random numbers" in str(unrepeatable(repeats))
 
 
 def test_drivers_of_the_package_run_once_and_a_client_that_nobody_starts_is_not_waited_for(run):

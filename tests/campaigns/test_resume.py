@@ -10,15 +10,14 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from calling import contents, invoke
+from calling import contents
 from campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.system import interrupt
@@ -174,21 +173,6 @@ class TestTwoProcessesOnOneFolder:
         assert contents(folder) == before
         resume_campaign(folder)
 
-    def test_leave_no_lock_behind_when_one_is_killed(self, folder):
-        script = (
-            "import os, sys, pathlib; from merge_sumo.campaigns.journal import Journal;"
-            "kept = Journal.reopen(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), 9)"
-        )
-        killed = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)
-        assert killed.returncode == -signal.SIGKILL
-        resume_campaign(folder)
-
-    def test_that_create_one_folder_leave_it_to_the_first(self, tmp_path):
-        Journal.create(tmp_path / "run", {"first": True})
-        with pytest.raises(UserError, match="run exists"):
-            Journal.create(tmp_path / "run", {"first": False})
-        assert read_settings(tmp_path / "run") == {"first": True}
-
 
 class TestADisk:
     def test_that_becomes_full_ends_in_a_sentence_and_loses_nothing(
@@ -235,19 +219,3 @@ class TestASignal:
             assert stopped.value.exit_code == 130
         assert said == [(interrupt.STDERR, b"\nwait\n")]
         assert signal.getsignal(signal.SIGINT) is before
-
-
-class TestTheCommand:
-    @pytest.mark.parametrize(
-        ("options", "sentence"),
-        [
-            (("--out", "elsewhere"), "leave --out away"),
-            (("--cases", "0"), "`cases` is 0"),
-        ],
-    )
-    def test_refuses_in_a_sentence(self, folder, options, sentence):
-        before = contents(folder)
-        result = invoke("campaign", "--resume", folder, *options)
-        assert isinstance(result.exception, UserError)
-        assert sentence in str(result.exception)
-        assert contents(folder) == before

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import signal
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import pytest
 from campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo.campaigns.journal import to_line
-from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, read_settings
 from merge_sumo.campaigns.scheduler import AGE, GROUPS, Scheduler
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
@@ -22,7 +21,6 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.workers import InProcess, Workers, open_workers
 from merge_sumo.testing.contracts import episode
 from merge_sumo.verdict.criterion import PAPER_CRITERION
@@ -117,10 +115,6 @@ class TestRoom:
             assert not told or pending + n > most - most // GROUPS
         assert {n for n, *_ in asked if n > 1} > {2, 24 // GROUPS}
 
-    def test_of_a_sampler_that_waits_is_for_one_group(self, monkeypatch):
-        monkeypatch.setattr(Asked, "overlaps", False)
-        assert self.asked(7, in_flight=3) == [(3, 0, 0), (3, 3, 0), (1, 6, 0)]
-
     def test_has_no_end_where_outcomes_decide_nothing(self, monkeypatch):
         monkeypatch.setattr(Asked, "learns", False)
         assert self.asked(5, batch=2) == [(2, 0, 0), (2, 0, 0), (1, 0, 0)]
@@ -151,12 +145,6 @@ def test_a_search_depends_neither_on_the_order_of_ends_nor_on_workers_nor_on_a_s
         assert of(end, 2, kept[:end]) == expected[end:]
 
 
-def test_many_in_flight_are_batches_for_a_sampler_that_waits():
-    """So the published baselines do what they do in batches of so many cases."""
-    one, other = (make_sampler("annealing", POOL, 3) for _ in range(2))
-    assert searched(one, batch=20) == searched(other, order=1, in_flight=20)
-
-
 def ends_of_groups(outcomes) -> list[int]:
     """Return the numbers of cases that are whole groups."""
     return [after.index for before, after in pairwise(outcomes) if after.batch > before.batch]
@@ -178,18 +166,6 @@ def recorded(folder: Path) -> dict[str, bytes]:
 
 def outcomes(folder: Path) -> bytes:
     return recorded(folder)[OUTCOMES]
-
-
-class StopAfter:
-    """A check that stops a campaign after some groups."""
-
-    def __init__(self, groups: int) -> None:
-        self.left = groups
-
-    def __call__(self) -> None:
-        self.left -= 1
-        if not self.left:
-            raise Stopped(signal.SIGINT)
 
 
 @pytest.fixture(scope="module")
@@ -229,14 +205,6 @@ class TestAhead:
         run_campaign(UNIFORM, tmp_path / "run", on_case=lambda one: seen.append(one.index))
         assert recorded(tmp_path / "run") == in_turn
         assert seen == list(range(90))
-
-    def test_a_stopped_campaign_goes_on_to_the_same_bytes(self, in_turn, tmp_path, monkeypatch):
-        monkeypatch.setattr("merge_sumo.campaigns.scheduler.MAX_CHUNK", 32)
-        with pytest.raises(Stopped):
-            run_campaign(UNIFORM, tmp_path / "run", check=StopAfter(1))
-        assert 0 < len(Run(tmp_path / "run").outcomes) < 90
-        resume_campaign(tmp_path / "run")
-        assert recorded(tmp_path / "run") == in_turn
 
 
 @pytest.mark.parametrize(

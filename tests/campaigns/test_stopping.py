@@ -5,14 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import pytest
 from campaigning import run_campaign
 
 from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.stopping import WINDOW, coverage_by_level, has_converged
-from merge_sumo.coverage.fmc import fmc
-from merge_sumo.scenario.case import MergeCase, to_unit
+from merge_sumo.campaigns.stopping import WINDOW, has_converged
+from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.verdict.score import Measures, Outcome
@@ -48,12 +46,6 @@ class TestTheRule:
         measures = Measures(end=End.MERGED, score=-600.0, t_end_s=8.3)
         assert has_converged(ran)
         assert not has_converged([*ran, Outcome(200, 200, late, measures)])
-
-    def test_counts_the_coverage_of_failures(self):
-        ran = outcomes(3, 40, cases=60)
-        failing = to_unit([ran[3].case, ran[40].case], 0, US23)
-        assert coverage_by_level(ran) == {0: pytest.approx(fmc(failing))}
-        assert coverage_by_level([]) == {}
 
 
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(

@@ -7,13 +7,11 @@ import re
 import signal
 import subprocess
 import sys
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from merge_sumo import cli
 from merge_sumo.commands.application import PANELS
@@ -36,14 +34,6 @@ def commands() -> dict[str, Any]:
 COMMANDS = commands()
 
 
-def help_of(name: str, columns: int) -> str:
-    done = CliRunner().invoke(
-        cli.app, [*name.split(), "--help"], env={"COLUMNS": str(columns), "TERM": "dumb"}
-    )
-    assert done.exit_code == 0
-    return done.output
-
-
 def test_seventeen_commands_stand_in_five_panels():
     application: Any = typer.main.get_command(cli.app)
     panels: dict[str | None, tuple[str, ...]] = {}
@@ -64,24 +54,6 @@ class TestOptions:
         options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
         groups = [p.rich_help_panel for p in options if p.name != "help"]
         assert groups == sorted(groups, key=GROUPS.index)
-
-
-class TestHelp:
-    @pytest.mark.parametrize("columns", [80, 100])
-    @pytest.mark.parametrize("name", ["", "scenario", *COMMANDS])
-    def test_wraps_no_paragraph_twice(self, name, columns):
-        shown = help_of(name, columns)
-        above = shown.split("╭")[0].splitlines()
-        assert max(map(len, shown.splitlines())) <= columns
-        for line, below in pairwise(above):
-            if line.strip() and below.strip():  # a line in the middle of a paragraph is full
-                assert len(line.rstrip()) + 1 + len(below.split()[0]) > columns - 2
-
-    def test_shows_defaults_that_are_said_in_words(self):
-        shown = " ".join(help_of("campaign", 100).replace("│", " ").split())
-        assert "[default: (runs/VUT-DATE)]" in shown
-        assert "[default: (one a core)]" in shown
-        assert "[default: (kinematic where" in " ".join(help_of("probability", 200).split())
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")

@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import re
 from functools import partial
-from typing import Any
 
 import pytest
 
-import merge_sumo as ms
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.system.suggestions import either, meant, nearest
+from merge_sumo.system.suggestions import either, meant
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.signatures import check_call, check_methods
 
 
 class TestNearestNames:
-    def test_are_those_that_share_most_characters(self):
-        assert nearest("desgin2", ["design1", "design2", "level0"]) == ["design2", "design1"]
-        assert nearest("11x", ["10", "11", "12", "13"], 0.5)[0] == "11"
-        assert nearest("nothing", ["design1", "level0"]) == []
-
-    def test_are_one_where_only_its_letters_are_of_another_size(self):
-        assert nearest("TTC_s", ["pet_s", "ttc_s", "after_ttc_s"]) == ["ttc_s"]
-
     def test_are_said_in_words(self):
         assert either(["a"]) == "a"
         assert either(["a", "b", "c"]) == "a, b or c"
@@ -51,13 +41,6 @@ class TestNearestNames:
 def test_a_condition_is_refused_with_what_was_meant(text, said):
     with pytest.raises(UserError, match=re.escape(said)):
         Criterion(text)
-
-
-def test_a_formula_is_refused_with_the_place_of_the_mistake():
-    with pytest.raises(UserError, match="at character 9: there is no signal 'v_vut': did you mean"):
-        Criterion(require="always (v_vut > 2)")
-    with pytest.raises(UserError, match="at character 19: '!'"):
-        Criterion(require="always (v_vut_mps ! 2)")
 
 
 @pytest.mark.parametrize(
@@ -110,18 +93,6 @@ class TestAWrongSignature:
         code, out, err = command_line("campaign", "--vut", "my.py:V", "--out", "run")
         assert (code, out, err) == (2, "", f"merge-sumo: {said}\n")
         assert not (tmp_path / "run").exists()
-
-    def test_of_an_object_is_told_from_python(self):
-        class Mine:
-            def act(self, seen, gain):
-                return 0.0
-
-        wrong: list[Any] = [Mine, Mine()]
-        for vut in wrong:
-            with pytest.raises(
-                UserError, match=r"test_errors\.py:\d+: act\(self, seen, gain\) is called"
-            ):
-                ms.campaign(vut, cases=1)
 
     @pytest.mark.parametrize(
         "source",

@@ -12,18 +12,13 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from campaigning import campaign_settings, run_campaign
-from conftest import require, some
-from foreign_nets import corridor_of
+from conftest import require
 from handmade import write_run
 
 from merge_sumo.campaigns.run import Run, failures, spread_failures
-from merge_sumo.reports import report, report_model
-from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
+from merge_sumo.reports import report
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
-from merge_sumo.verdict import diagnosis
 
 LONG = partial(pytest.param, marks=pytest.mark.long)
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
@@ -47,17 +42,6 @@ def made(tmp_path_factory) -> Run:
     run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
     report.write_report(run)
     return run
-
-
-INSIDE = """() => {
-    const all = byId("road").getBoundingClientRect();
-    return Object.values(view.cars).map(({ group }) => {
-        const car = group.getBoundingClientRect();
-        return car.left >= all.left && car.right <= all.right
-            && car.top >= all.top && car.bottom <= all.bottom;
-    });
-}"""
-"""Whether each car is in the picture."""
 
 
 @contextmanager
@@ -148,18 +132,6 @@ def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
         assert page.locator(".levels").is_visible()
 
 
-def in_sight(page, part: str) -> bool:
-    """Return whether a part of the page is in the window and nothing lies over its middle."""
-    return page.locator(part).evaluate(
-        """(part) => {
-            const { top, bottom, left, right } = part.getBoundingClientRect();
-            const over = document.elementFromPoint((left + right) / 2, (top + bottom) / 2);
-            return top >= 0 && bottom <= innerHeight && left >= 0 && right <= innerWidth
-                && (part === over || part.contains(over));
-        }"""
-    )
-
-
 def click(page, part: str) -> None:
     """Click where something is drawn, once it has come into the window."""
     found = page.locator(part)
@@ -169,33 +141,6 @@ def click(page, part: str) -> None:
 
 
 WIDE, PHONE = (1280, 900), (390, 800)
-WINDOWS = pytest.mark.parametrize("size", [WIDE, LONG(PHONE)], ids=["wide", "phone"])
-BOTH = pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
-"""Where the layout itself is what the test looks at."""
-
-
-@BOTH
-def test_a_click_on_a_mark_shows_its_case_and_the_mark_without_scrolling(browser, made, size):
-    viewport = {"width": size[0], "height": size[1]}
-    level = failures(made.outcomes)[0].case.level
-    lowest = min(
-        (o for o in made.outcomes if o.failed and o.case.level == level),
-        key=lambda o: o.case.v_pov0_mps,
-    )
-    mark = f".map [data-case='{lowest.index}'].mark"
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        click(page, mark)
-        assert chosen(page) == lowest.index
-        for part in ("#case-title", "#road", "#play"):
-            assert in_sight(page, part), part
-        box, panel = (page.locator(part).bounding_box() for part in (mark, "#case"))
-        assert box["y"] >= 0.0
-        assert box["y"] + box["height"] <= panel["y"]
-        assert page.evaluate(INSIDE) == [True, True]
-        assert page.evaluate("location.hash") == f"#case-{lowest.index}"
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-        page.keyboard.press("Escape")
-        assert not in_sight(page, "#case-title")
 
 
 def rows(page) -> list[int]:
@@ -207,102 +152,6 @@ def column(page, name: str) -> list[str]:
     names = [text.strip() for text in page.locator("#table th").all_inner_texts()]
     cells = page.locator(f"#table td:nth-child({names.index(name) + 1})")
     return cells.all_inner_texts()
-
-
-def bright(page) -> list[int]:
-    """Return the cases that are drawn and not faint; maps with a slider show all values."""
-    for check in page.locator(".map input[type=checkbox]").all():
-        check.check()
-    found = page.locator(".map .mark:not(.faint)").evaluate_all(
-        "all => all.map((m) => m.dataset.case)"
-    )
-    return sorted(map(int, found))
-
-
-def all_rows(page) -> list[int]:
-    """Return the cases of the whole table."""
-    while page.locator("#more").is_visible():
-        page.locator("#more").click()
-    return sorted(rows(page))
-
-
-@WINDOWS
-def test_a_click_on_a_region_in_words_shows_its_cases_in_maps_and_table(browser, made, size):
-    viewport = {"width": size[0], "height": size[1]}
-    found = failures(made.outcomes)
-    near = [o for o in made.outcomes if o.is_tested and not o.failed]
-    boxes = [b for n in (0, 1, 2) for b in diagnosis.failure_boxes(found + near, n)]
-    with shown(browser, made.folder / report.REPORT, viewport=viewport) as page:
-        sentences = page.locator(".sentences button")
-        assert sentences.all_inner_texts() == [
-            f"POV level {box.level}, {box.where}: {box.failures} of {box.cases} cases fail."
-            for box in boxes
-        ]
-        for number in (0, len(boxes) - 1):
-            sentences.nth(number).click()
-            inside = sorted(boxes[number].indices)
-            assert len(inside) == boxes[number].cases
-            assert all_rows(page) == inside
-            assert bright(page) == inside
-            assert sentences.nth(number).get_attribute("aria-pressed") == "true"
-            assert page.inner_text("#filtered-number").startswith(f"{len(inside)} of 180 cases")
-        sentences.nth(len(boxes) - 1).click()
-        assert len(bright(page)) == 180
-        assert not page.locator("#filtered").is_visible()
-        kind = page.locator("[data-filter=kind]").first
-        kind.click()
-        assert set(column(page, "kind")) == {kind.get_attribute("data-value")}
-        page.locator("#filtered .reset").click()
-        assert len(all_rows(page)) == 180
-        assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
-
-
-def test_the_address_keeps_the_filters_through_reload_back_and_forward(browser, made):
-    found = failures(made.outcomes)
-    of_level = sorted(o.index for o in found if o.case.level == 1)
-    with shown(browser, made.folder / report.REPORT) as page:
-        filters = page.locator("#filters")
-        filters.locator("[name=verdict]").select_option("failure")
-        filters.locator("[name=level]").select_option("1")
-        page.evaluate(f"openCase(place.get({of_level[0]}))")
-        address = page.evaluate("location.hash")
-        assert address == f"#case-{of_level[0]}&level=1&verdict=failure"
-        assert page.get_attribute("#case-link", "href") == address
-        page.reload()
-        assert (all_rows(page), chosen(page)) == (of_level, of_level[0])
-        page.go_back()
-        page.locator("#matching:not(:text-is(''))").wait_for()
-        assert all_rows(page) == sorted(o.index for o in found)
-        page.go_back()
-        assert len(all_rows(page)) == 180
-        page.go_forward()
-        page.go_forward()
-        assert all_rows(page) == bright(page) == of_level
-        filters.locator("[name=measure]").select_option(label="margin")
-        filters.locator("[name=to]").press_sequentially("-12")
-        assert "measure=margin&to=-12" in page.evaluate("location.hash")
-        page.go_back()  # one step back is the whole number
-        assert all_rows(page) == of_level
-
-
-ADDRESSES = [
-    "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
-    "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
-    "#&&&===&verdict&%00&x=" + "y" * 10_000,
-    "#case-0x1&verdict=failure%0A&kind=" + EVIL,
-]
-
-
-@pytest.mark.slow
-def test_what_an_address_says_wrongly_is_left_out(browser, made):
-    with shown(browser, made.folder / report.REPORT) as page:
-        for address in ADDRESSES:
-            page.evaluate("(address) => { location.hash = address; }", address)
-            page.wait_for_timeout(100)
-            assert len(all_rows(page)) == 180, address
-            page.reload()
-            assert len(all_rows(page)) == 180, address
-            assert page.locator(".map .mark").count() == 180, address
 
 
 def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(browser, tmp_path):
@@ -329,36 +178,6 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
             assert sorted(rows(page)) == expected
         verdict.select_option(label="boom (2)")
         assert set(column(page, "verdict")) == {"VUT_ERROR: boom"}
-
-
-@pytest.mark.parametrize("name", some([None, "curved"], None, "curved"))
-def test_both_cars_are_in_the_picture_on_any_road(browser, tmp_path, monkeypatch, name):
-    if name is not None:
-        corridor = corridor_of(name, tmp_path)
-        monkeypatch.setattr(report_model, "road_for", lambda _scenario: corridor)
-    run = write_run(tmp_path / "run", per_level=3, error=None)
-    with shown(browser, report.write_report(run)) as page:
-        for step in ("0", "0.5 * moving.rows", "moving.rows - 1"):
-            page.evaluate(f"at({step})")
-            assert page.evaluate(INSIDE) == [True, True]
-
-
-def test_failures_are_told_apart_by_who_avoids_them(browser, tmp_path):
-    run = write_run(tmp_path / "run", error=None)
-    found = failures(run.outcomes)
-    first, others = found[0].index, [o.index for o in found[1:]]
-    lines = [Avoidance(first, ("careful", "rss"), 3.0, pov_careful=True)]
-    lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
-    AVOIDANCE.write_lines(run.folder, lines)
-    with shown(browser, report.write_report(run)) as page:
-        assert "In the VUT's place careful, rss would have avoided it." in page.inner_text("#case")
-        page.locator(".map input[type=checkbox]").first.check()
-        bright = page.locator(".map .mark.fail:not(.faint)")
-        for value, wanted in (("careful", 1), ("pov", 1), ("fsm", 0), ("", len(found))):
-            page.select_option("#avoided-by", value)
-            assert bright.count() == wanted
-        page.select_option("#avoided-by", "none")
-        assert bright.count() == len(others)
 
 
 def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
@@ -407,38 +226,32 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         assert not page.locator("#why").is_visible()
 
 
-LEAVES = """
-class Vut:
-    def act(self, seen):
-        late = seen.x_vut_m > -90.0
-        self.signals = {"mode <b>": "late" if late else "early", "level": 2.0 if late else -1.0}
-        return 1.0
-"""
-
-
-def test_signals_are_drawn_beside_the_motion_and_follow_its_slider(browser, tmp_path):
-    (tmp_path / "my_vut.py").write_text(LEAVES, encoding="utf-8")
-    vut = f"{tmp_path / 'my_vut.py'}:Vut"
-    settings = campaign_settings(vut=vut, cases=24, batch=24, sampler="uniform")
-    run = run_campaign(settings, tmp_path / "run")
-    with shown(browser, report.write_report(run)) as page:
-        page.evaluate(f"location.hash = '#case-{ReportModel(run).shown[0].index}'")
-        figures = page.locator("#signals figure")
-        figures.nth(1).wait_for()
-        assert figures.count() == 2
-        assert page.locator("#signals figcaption").all_text_contents() == [
-            "signal mode <b>",
-            "signal level",
-        ]
-        words = figures.nth(0).locator("svg text").all_text_contents()
-        assert {"early", "late"} <= set(words)
-        early, late = (box["x"] for box in map(_box, figures.nth(0).locator("rect.word").all()))
-        assert early < late
-        page.evaluate("at(0)")
-        before = _box(figures.nth(1).locator(".now"))["x"]
-        page.evaluate("at(final)")
-        assert _box(figures.nth(1).locator(".now"))["x"] > before + 50
-
-
 def _box(locator):
     return locator.bounding_box()
+
+
+def all_rows(page) -> list[int]:
+    """Return the cases of the whole table."""
+    while page.locator("#more").is_visible():
+        page.locator("#more").click()
+    return sorted(rows(page))
+
+
+ADDRESSES = [
+    "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
+    "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
+    "#&&&===&verdict&%00&x=" + "y" * 10_000,
+    "#case-0x1&verdict=failure%0A&kind=" + EVIL,
+]
+
+
+@pytest.mark.slow
+def test_what_an_address_says_wrongly_is_left_out(browser, made):
+    with shown(browser, made.folder / report.REPORT) as page:
+        for address in ADDRESSES:
+            page.evaluate("(address) => { location.hash = address; }", address)
+            page.wait_for_timeout(100)
+            assert len(all_rows(page)) == 180, address
+            page.reload()
+            assert len(all_rows(page)) == 180, address
+            assert page.locator(".map .mark").count() == 180, address

@@ -13,8 +13,7 @@ from matplotlib.collections import EllipseCollection
 from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
-from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
+from merge_sumo.studies.reproduction import LevelBatches, Panel
 
 
 def curves():
@@ -56,14 +55,6 @@ def test_maps_show_cases_in_the_units_of_the_pool_and_the_balls_that_fmc_counts(
     assert axes.get_title("right") == "1 of 2 fail, FMC 0.0079"
 
 
-@pytest.mark.parametrize("batches", [(1,), (1, 4, 13)])
-def test_surfaces_of_any_number_of_batches_are_drawn(batches):
-    learned = Panel(np.full((3, 2), 0.5), np.zeros(3, dtype=bool), 0.0)
-    flat = PredictedMargins(np.full((5, 5), 0.9), learned)
-    figure = figures.predicted_margins("t", dict.fromkeys(batches, flat), 1, np.zeros((0, 2)))
-    assert len(figure.axes) == len(batches) + 1
-
-
 def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_path):
     cases = {level: np.full((3, 4), 10.0) for level in (0, 1, 2)}
     margin = {level: np.full((3, 4), 0.9) for level in (0, 1, 2)}
@@ -73,11 +64,6 @@ def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_p
     assert [line.get_label() for line in above.lines] == ["0", "1", "2"]
     assert np.isnan(below.lines[0].get_ydata()).tolist() == [False, True, False, False]
     figures.save(figure, tmp_path / "allocation.png")
-
-
-def test_every_sampler_has_a_colour_of_its_own():
-    colours = [figures.colour(name) for name in [*SAMPLERS, "truth"]]
-    assert len(set(colours)) == len(colours)
 
 
 @pytest.mark.parametrize("kind", [".png", ".svg"])

@@ -13,7 +13,6 @@ from test_report import data_of, text_of
 
 from merge_sumo.api import CampaignRun
 from merge_sumo.campaigns.run import Run
-from merge_sumo.reports.motion import lines_of
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.verdict.severity import Severity, meanings
@@ -56,19 +55,6 @@ class TestSentences:
         found = meanings(LANE)
         assert found[Severity.CONTACT] == "bodies touch at the merge or within 5 s after it"
         assert found[Severity.HARSH].endswith("brake harder than 3 m/s² after the merge")
-
-    def test_speak_of_m_and_of_no_lane_without_one(self, tmp_path_factory):
-        # The page names its folder, which pytest would name after this test.
-        run = write_run(tmp_path_factory.mktemp("point") / "run", per_level=20)
-        page = report_page(run)
-        assert "front bumpers within 6 m at M (score < -500)" in text_of(page)
-        assert "lane" not in without(text_of(page), ("along the lane", "where the lanes run"))
-        assert (data_of(page)["lane"], data_of(page)["place"]) == (None, "M")
-        assert not {"x_merge_m", "lane_share", "stood_s"} & set(data_of(page)["cases"])
-        assert "place of the merge, median" not in text_of(page)
-        assert not any("merges" in line for line in CampaignRun(run).lines())
-        outcome = run.outcomes[0]
-        assert "stood" not in "\n".join(lines_of(outcome, run.trajectory(0)))
 
 
 def test_merges_are_among_the_facts_of_each_level_beside_published_figures(made, page):

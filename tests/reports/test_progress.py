@@ -12,10 +12,8 @@ from handmade import write_run
 from lxml import html
 from rich.console import Console
 
-from merge_sumo.reports import report
-from merge_sumo.reports.progress import Bars, CampaignBars, rate_text
-from merge_sumo.reports.report import EVERY_S, FIRST_S, MOST_SHARE, REPORT, RunningReport
-from merge_sumo.system.folders import GENERATOR
+from merge_sumo.reports.progress import CampaignBars, rate_text
+from merge_sumo.reports.report import EVERY_S, FIRST_S, REPORT
 
 
 @pytest.fixture(scope="module")
@@ -67,10 +65,6 @@ def test_on_a_terminal_bars_end_with_what_was_found(run, tmp_path, clock):
         assert text in shown
 
 
-def test_quiet_is_quiet(run, tmp_path, clock):
-    assert said(run, tmp_path, clock, terminal=True, shown=False) == ""
-
-
 def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated(
     run, tmp_path, clock
 ):
@@ -97,23 +91,6 @@ def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated
 )
 def test_a_rate_is_readable(count, elapsed_s, text):
     assert rate_text(count, elapsed_s, "cases") == text
-
-
-def test_a_rate_is_true_from_the_first_batch_on(run, tmp_path, clock):
-    bars, out = bars_for(tmp_path)
-    clock[0] += 40.0
-    for outcome in run.outcomes[:20]:  # they end together, as a batch does
-        bars.case_ended(outcome)
-    assert out.getvalue().endswith("  27 cases/min  0:06:00 left\n"), "of the first 18"
-
-
-def test_on_a_terminal_a_bar_says_what_time_is_left(clock):
-    drawn = io.StringIO()
-    with Bars(Console(file=drawn, force_terminal=True, width=100)) as bars:
-        clock[0] += 2.0
-        bars.counted("truth", 50, 200, "cases")
-    assert "50/200" in drawn.getvalue()
-    assert "0:00:06 left" in drawn.getvalue()
 
 
 class TestTheReportOfACampaignThatRuns:
@@ -156,20 +133,3 @@ class TestTheReportOfACampaignThatRuns:
             clock[0] += EVERY_S
             bars.case_ended(outcome)
         assert (run.folder / REPORT).read_text() == other.read_text() == "mine"
-
-    def test_takes_no_more_than_its_share_of_the_time(self, own, clock, monkeypatch):
-        run, _ = own
-        written = []
-
-        def slow(*_, **__):
-            clock[0] += 2.0
-            written.append(clock[0])
-            return GENERATOR.decode()
-
-        monkeypatch.setattr(report, "report_page", slow)
-        page = RunningReport(run.folder)
-        for _ in range(1000):
-            clock[0] += 1.0
-            page.rewrite()
-        assert 2.0 * len(written) <= MOST_SHARE * clock[0]
-        assert len(written) > 10

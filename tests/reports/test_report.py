@@ -19,7 +19,6 @@ from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
-from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.studies.surface import learn_surface
@@ -74,9 +73,6 @@ class TestThePage:
             assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
         assert root.xpath("//@style") == []
 
-    def test_is_the_same_when_written_again(self, made, page):
-        assert report_page(Run(made.folder)) == page
-
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
         run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
         page = report_page(run)
@@ -111,18 +107,6 @@ class TestThePage:
         for first, place in zip(spread, own[:different], strict=False):
             same = [f.margin for f in found if (f.case.level, region[f.index]) == place]
             assert first.margin == min(same)
-
-    def test_has_no_column_of_a_coordinate_that_no_level_of_it_has(self, tmp_path):
-        run = write_run(
-            tmp_path / "run", 20, levels=(0, 1), scenario=named_scenario("us23-traffic")
-        )
-        page = report_page(run)
-        assert "psi" not in [c["name"] for c in data_of(page)["coordinates"]]
-        assert "psi" not in root_of(page).xpath("//th/text()")
-
-    def test_says_when_a_campaign_was_interrupted(self, made, tmp_path):
-        assert "interrupted" not in text_of(report_page(made))
-        assert "interrupted" in text_of(report_page(write_run(tmp_path / "run", 10, cases=999)))
 
     def test_goes_without_trajectories_that_are_lost(self, tmp_path):
         run = write_run(tmp_path / "run", per_level=10)
@@ -173,11 +157,6 @@ class TestWhatWasNotTested:
         (run.folder / LOG).unlink()
         (run.folder / LOG).symlink_to(tmp_path / "run" / "campaign.json")
         assert "Printed by the controller" not in text_of(report_page(run))
-
-    def test_gives_no_coverage_where_nothing_was_tested(self, tmp_path):
-        page = report_page(write_run(tmp_path / "run", 10, levels=(0,), timeouts=range(10)))
-        assert "0.0000" not in text_of(page)
-        assert "Nothing was tested." in text_of(page)
 
 
 class TestTheMotion:

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from handmade import write_run
 
 from merge_sumo.reports.report_data import PAIR_NODES, map_data
 from merge_sumo.road.scenario_file import named_scenario
@@ -55,14 +54,6 @@ def test_of_three_coordinates_moves_through_one_and_of_more_has_no_balls(
 ):
     found = map_data(scenario, level, [], None)
     assert (found["radius"], found["through"]) == (radius, through)
-
-
-def test_counts_the_cases_that_are_not_shown_in_each_pair(tmp_path):
-    run = write_run(tmp_path / "run", 20, levels=(0,), error=None, scenario=TRAFFIC)
-    failing = sum(o.failed for o in run.outcomes)
-    for grid in map_data(TRAFFIC, 0, run.outcomes, None)["grids"]:
-        counted = sum(grid["counts"]["safe"]), sum(grid["counts"]["failing"])
-        assert counted == (20 - failing, failing)
 
 
 def test_a_case_is_described_by_its_coordinates():

@@ -20,7 +20,7 @@ from lxml import etree, html
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.reports import comparison_page as pages
@@ -223,14 +223,6 @@ def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run, t
     assert "Its motion is not recorded." in pages.comparison_page(compare([run, run]), [None, run])
 
 
-def test_the_page_is_written_nowhere_where_something_is(call, run, tmp_path):
-    file = tmp_path / "page.html"
-    file.write_text("mine")
-    for option in ("--out", "--junit"):
-        assert_refused(call("compare", run.folder, run.folder, option, file), "exists")
-    assert file.read_text() == "mine"
-
-
 def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
     found = rerun(
         RunStudy(run, today := settings_of(run.folder, run.settings), resolve(today)), run.outcomes
@@ -256,14 +248,6 @@ def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
     before, after = (version["levels"]["0"]["fmc"] for version in told["versions"])
     assert after < before
     assert told["source"].startswith("the cases come from the search of design1")
-
-
-def test_a_rerun_says_what_is_fixed_and_where_its_cases_come_from(command_line, run, tmp_path):
-    folder = shutil.copytree(run.folder, tmp_path / "campaign")
-    code, out, _ = command_line("rerun", folder, "--vut", "design2")
-    assert code == 0
-    assert f"0 cases broke, {len(failures(run.outcomes))} fixed" in out
-    assert "`merge-sumo campaign --vut design2 --against design1` searches there" in out
 
 
 @pytest.mark.parametrize(

@@ -196,14 +196,6 @@ class TestATraffic:
         assert cars == pytest.approx(0.0087 * 160.0 * share)
         assert counted.sum() / 20_000 == pytest.approx(cars, rel=0.02)
 
-    def test_fails_with_as_many_cars_as_are_drawn_in_it(self):
-        """Cars at 30 m/s and more fail: the formula, and the share of cases that it draws."""
-        points = traffic().in_pool(US23, [1]).points(1, np.random.default_rng(0).random((20000, 2)))
-        v_mps = 25.0 + 10.0 * points[:, 1]
-        expected = 0.0087 * 160.0 * (norm.cdf(8.0 / 2.85) - norm.cdf(3.0 / 2.85))
-        found = traffic().cars_in_pool(US23) * np.mean(v_mps > 30.0)
-        assert found == pytest.approx(expected, rel=0.03)
-
     def test_that_is_shipped_has_the_published_figures_and_their_source(self):
         published = {"exid-2": (5.7, 23.3), "exid-3": (4.9, 21.5), "exid-5": (8.7, 25.1)}
         assert shipped_traffics() == [*published]
@@ -318,9 +310,3 @@ class TestOfACampaign:
     def test_refuses_what_makes_no_sense(self, campaign, tmp_path, options, says):
         with pytest.raises(UserError, match=says):
             failure_probability(campaign, tmp_path / "p.json", **options)
-
-    def test_refuses_a_campaign_of_another_net(self, campaign, tmp_path, monkeypatch):
-        monkeypatch.setitem(campaign.settings, "net_sha256", "0" * 64)
-        with pytest.raises(UserError, match="another net"):
-            failure_probability(campaign, tmp_path / "p.json", cases=10)
-        assert not (tmp_path / "p.json").exists()

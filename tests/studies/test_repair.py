@@ -8,14 +8,10 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from merge_sumo import api
-from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase, to_unit
-from merge_sumo.scenario.scenario import US23
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies.repair import BISECTIONS, RESERVE
 from merge_sumo.vuts.factory import VutFactory
@@ -179,12 +175,6 @@ def test_too_few_trials_and_other_costs_are_refused(campaigns, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_that_is_there_is_overwritten(campaigns, tmp_path):
-    (tmp_path / "out").mkdir()
-    with pytest.raises(UserError, match="exists: choose another name with `out`"):
-        repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", **FEW)
-
-
 def test_without_failures_and_without_optuna_it_says_so(campaigns, tmp_path, monkeypatch):
     vut = f"{campaigns('Brakes').parent / 'vut.py'}:Brakes?brake=1"
     with pytest.raises(UserError, match=r"every case passes with .*: nothing is to be repaired"):
@@ -193,29 +183,3 @@ def test_without_failures_and_without_optuna_it_says_so(campaigns, tmp_path, mon
     monkeypatch.setattr(mending, "find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"needs optuna: run `pip install 'merge-sumo\[repair\]'`"):
         repair(campaigns("Brakes"), ["brake=0..4"], out=tmp_path / "out", **FEW)
-
-
-def test_a_failure_of_a_fresh_campaign_brings_cases_around_it():
-    case = MergeCase(level=2, x_pov0_m=-180.0, v_pov0_mps=30.0, svo_rad=0.7, scenario=US23)
-    found = mending.with_neighbours([case], np.random.default_rng(0))
-    assert found[0] is case
-    assert len(found) == 1 + mending.NEIGHBOURS
-    offsets = to_unit(found, 2) - to_unit([case], 2)
-    assert np.abs(offsets).max() <= RADIUS
-    assert offsets[1:].any(axis=1).all()
-    assert (offsets[:, 0] <= 0.0).all(), "the case is at the end of the pool"
-
-
-def test_the_round_with_the_least_fmc_counts(monkeypatch):
-    monkeypatch.setattr(mending.Round, "fmc", property(lambda self: self.campaign))
-
-    def best(*fmc: float) -> float | None:
-        made: Any = mending.Round
-        rounds = [made(mending.Trial(k, {}), of, None) for k, of in enumerate(fmc)]
-        found = mending.RepairResult(Path("f"), "v", (), {}, "time", 0, 1, (0,), tuple(rounds), ())
-        return None if found.chosen is None else found.chosen.round
-
-    assert best(0.4, 0.1, 0.3) == 1
-    assert best() is None
-    # Of equal ones the later, which more cases have tried.
-    assert best(0.4, 0.4) == 1

@@ -5,11 +5,7 @@
 from __future__ import annotations
 
 import json
-import shlex
-import shutil
-import sys
 from dataclasses import astuple
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,17 +113,6 @@ def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_pa
     assert truth_of(vut, tmp_path / "cache") == 0
     (tmp_path / name).write_text(content)
     assert truth_of(vut, tmp_path / "cache") == 4, "the truth of before was replaced"
-
-
-def test_a_truth_of_a_controller_behind_traci_is_of_its_command_and_the_files_named_there(tmp_path):
-    controller = tmp_path / "controller.py"
-    shutil.copy(Path(__file__).parents[1] / "support" / "raw_traci.py", controller)
-    command = f"{shlex.quote(sys.executable)} {shlex.quote(str(controller))} {{port}}"
-    assert truth_of(f"traci:{command}", tmp_path / "cache") == 4
-    assert truth_of(f"traci:{command}", tmp_path / "cache") == 0
-    assert truth_of(f"traci:{command} ", tmp_path / "cache") == 4
-    controller.write_text(controller.read_text() + "# changed")
-    assert truth_of(f"traci:{command}", tmp_path / "cache") == 4
 
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):
