@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, Protocol
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
@@ -160,7 +160,7 @@ def progress_option() -> Any:
 class Asked:
     """What a verb is asked; `given` has the names of the keywords that a person gave."""
 
-    given: frozenset[str] = frozenset()
+    given: ClassVar[frozenset[str]] = frozenset()
 
     def values(self, *records: type[Any]) -> dict[str, Any]:
         """Return the values of the fields of some records, or of its own."""

@@ -159,7 +159,7 @@ class Crosscheck:
 
 def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
     """Let HighwayEnv repeat the cases of a campaign, and fresh uniform ones up to `cases`."""
-    settings = settings_of(run.folder, run.settings)
+    settings = settings_of(run.folder, run.record)
     plan = resolve(settings)
     if plan.needs_sumo is not None:
         raise UserError(f"{plan.needs_sumo}: name a campaign of a VUT of this package")

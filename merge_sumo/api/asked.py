@@ -73,7 +73,7 @@ def opened_study(
 def today(run: Run, asked: Recorded) -> tuple[CampaignSettings, SimulationPlan, Execution]:
     """Return how and where cases of a campaign run today: settings, their plan, and the place."""
     fields, where = stated_again(asked, asked.vut, {"vut": run.vut})
-    settings = settings_of(run.folder, run.settings, fields)
+    settings = settings_of(run.folder, run.record, fields)
     return settings, resolve(settings), where
 
 

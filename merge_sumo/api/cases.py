@@ -30,7 +30,7 @@ def recorded_case(asked: verbs.RunCase) -> tuple[CampaignSettings, Case]:
     if asked.level is not None:
         policies, own = policies_folder(asked.policies, run.scenario), bool(fields.get("pov"))
         level = one_level(str(asked.level), policies, run.scenario.levels, own=own)
-    settings = settings_of(run.folder, run.settings, {**fields, **ONE, "levels": (level,)})
+    settings = settings_of(run.folder, run.record, {**fields, **ONE, "levels": (level,)})
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(level)))
     kept = {name: getattr(before, name) for name in names}
     case = case_of(settings.scenario, level, {**kept, **_coordinates(asked)})

@@ -87,7 +87,7 @@ class CampaignRun(Result):
 
     def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
         self._run = folder if isinstance(folder, Run) else Run(Path(folder))
-        self._gates = parse_gates(gates, against=self._run.settings.get(AGAINST) is not None)
+        self._gates = parse_gates(gates, against=self._run.settings.against is not None)
         _ = self._run.levels  # A folder without levels is no campaign's.
 
     @property
@@ -103,7 +103,7 @@ class CampaignRun(Result):
     @property
     def settings(self) -> dict[str, Any]:
         """What `campaign.json` holds."""
-        return self._run.settings
+        return self._run.record
 
     @property
     def cases(self) -> Table:
@@ -171,7 +171,7 @@ class CampaignRun(Result):
     @property
     def converged(self) -> bool:
         """Whether the search ended before its number of cases, as little new was found."""
-        return self._run.may_converge and len(self._run.outcomes) < self.settings["cases"]
+        return self._run.may_converge and len(self._run.outcomes) < self._run.settings.cases
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
@@ -231,7 +231,7 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        earlier = printable(str(self.settings[AGAINST])[:NAME_CHARACTERS])
+        earlier = printable(str(self._run.settings.against)[:NAME_CHARACTERS])
         return [
             f"against {earlier}: {self.against.headline}",
             *self.against.steps[0].table_lines(),
@@ -250,8 +250,8 @@ class CampaignRun(Result):
 
     def _converged_line(self) -> str:
         return (
-            f"stopped after {len(self._run.outcomes)} of {self.settings['cases']} cases: the last "
-            f"{WINDOW} added less than {LITTLE:.0%} to the coverage of each level with failures "
+            f"stopped after {len(self._run.outcomes)} of {self._run.settings.cases} cases: the "
+            f"last {WINDOW} added less than {LITTLE:.0%} to the coverage of all levels together "
             "(this says nothing of regions that no case has come near)"
         )
 

@@ -188,7 +188,7 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
     no campaign.
     """
     settings = version.settings
-    recorded = {k: v for k, v in before.settings.items() if k != RAN_AGAIN}
+    recorded = {k: v for k, v in before.record.items() if k != RAN_AGAIN}
     record = record_of(settings, version.plan)
     # Where policies are decides nothing: what is in them does.
     moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]

@@ -85,7 +85,7 @@ class Journal:
                 outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
                 journal = cls(folder, opened.enter_context(outcomes), {})
                 run = Run(folder)
-                journal.settings = run.settings
+                journal.settings = run.record
                 dropped = len(run.outcomes) - run.whole_batches() + run.torn
                 if dropped:
                     journal.keep(run, run.whole_batches())

@@ -18,17 +18,19 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from merge_sumo.coverage.fmc import regions
 from merge_sumo.errors import UserError
+from merge_sumo.options import Search
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, US23, Scenario
@@ -63,16 +65,22 @@ class LostError(UserError):
     """A trajectory that is gone, or in a file that cannot be read any more."""
 
 
-class Stated(Struct, frozen=True):
+@dataclass(frozen=True, kw_only=True)
+class RecordedSettings(Search):
     """What a reader needs of `campaign.json`; a campaign that does not say had the default."""
 
-    levels: list[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))]] = []
+    vut: str = "None"
+    pov: str | None = None
+    against: str | None = None
+    levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
     tolerated: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
     cases: int = 0
-    stop_when_converged: bool = False
     ran_again: Annotated[int, Meta(ge=0)] = 0
+    net_sha256: str | None = None
+    vut_files: dict[str, str] | None = None
+    pov_files: dict[str, str] | None = None
 
 
 class Run:
@@ -80,7 +88,8 @@ class Run:
 
     Attributes:
         folder: the folder.
-        settings: what `campaign.json` says.
+        record: what `campaign.json` says, with all that a later run compares.
+        settings: the same, as far as a reader needs it.
         scenario: the scenario.
         criterion: what counts as a failure.
         outcomes: the outcomes, in order.
@@ -93,23 +102,25 @@ class Run:
     def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
         """Read settings and outcomes, where the writer of the folder has none in memory."""
         self.folder = folder
-        self.settings = read_settings(folder)
-        self.scenario = scenario_of(self.settings, folder / SETTINGS)
+        self.record = read_settings(folder)
+        self.scenario = scenario_of(self.record, folder / SETTINGS)
         self._batches: dict[int, dict[int, FloatArray]] = {}
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
         try:
-            self._stated = convert(self.settings, Stated)
+            names = {field.name for field in fields(RecordedSettings)}
+            known = {name: value for name, value in self.record.items() if name in names}
+            self.settings = convert(known, RecordedSettings)
         except UserError as error:
             raise UserError(f"{folder / SETTINGS} is no campaign's: {error}") from error
         try:
-            self.criterion = Criterion(self._stated.fail_when, self._stated.require)
+            self.criterion = Criterion(self.settings.fail_when, self.settings.require)
             if outcomes is None:
                 self._read()
             else:
                 self.outcomes, self.torn = outcomes, False
         except UserError as error:
-            if absent := _absent_packages(self.settings):
+            if absent := _absent_packages(self.record):
                 raise UserError(
                     f"{folder} was recorded with {absent}, which is not installed here, and cannot "
                     "be read without it"
@@ -135,12 +146,12 @@ class Run:
     @property
     def levels(self) -> list[int]:
         """The POV levels that the settings name, or else those of the cases."""
-        return self._stated.levels or sorted({one.case.level for one in self.outcomes})
+        return list(self.settings.levels) or sorted({one.case.level for one in self.outcomes})
 
     @property
     def tolerated(self) -> float:
         """The share of its runs in which a case may fail."""
-        return self._stated.tolerated
+        return self.settings.tolerated
 
     @property
     def cases(self) -> list[Outcome]:
@@ -150,22 +161,22 @@ class Run:
     @property
     def vut(self) -> str:
         """The name of the VUT, fit to be shown anywhere: it may be a stranger's."""
-        return printable(str(self.settings.get("vut"))[:NAME_CHARACTERS])
+        return printable(self.settings.vut[:NAME_CHARACTERS])
 
     @property
     def pov(self) -> str:
         """The name of a POV of the tester's own, fit to be shown anywhere."""
-        return printable(str(self.settings.get("pov"))[:NAME_CHARACTERS])
+        return printable(str(self.settings.pov)[:NAME_CHARACTERS])
 
     @property
     def may_converge(self) -> bool:
         """Whether the campaign may end before its number of cases."""
-        return self._stated.stop_when_converged
+        return self.settings.stop_when_converged
 
     @property
     def interruption(self) -> str:
         """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
-        fewer = len(self.outcomes) < self._stated.cases and not self.may_converge
+        fewer = len(self.outcomes) < self.settings.cases and not self.may_converge
         if not (self.torn or fewer):
             return ""
         torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
@@ -174,7 +185,7 @@ class Run:
     @property
     def ran_again(self) -> int:
         """Number of cases that ran again because a process had died or had been stopped."""
-        return self._stated.ran_again
+        return self.settings.ran_again
 
     @property
     def ran_again_in_words(self) -> str:
@@ -238,7 +249,7 @@ class Run:
         Raises `UserError` where that is missing, or has other cases. Of a campaign that was stopped
         it may have more of them.
         """
-        if self.settings.get(AGAINST) is None:
+        if self.settings.against is None:
             return None
         earlier = Run(self.folder / AGAINST)
         count = len(self.outcomes)

@@ -119,7 +119,7 @@ def _tested(run: Run) -> Iterator[Fact]:
         place = run.scenario.place
         words = f"front bumpers within {run.scenario.dx_crash_m:g} m at {place} ({words})"
     yield Fact("a case fails when", words, "", SETTINGS, key)
-    sampler = f"{settings.get('sampler')}, seed {settings.get('seed') or 0}"
+    sampler = f"{settings.sampler}, seed {settings.seed}"
     yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
 
 

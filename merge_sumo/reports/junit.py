@@ -16,7 +16,7 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run
+from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.scenario.coordinates import described
@@ -55,7 +55,7 @@ def write_junit(
     _gates(root, facts, verdict, gates)
     compared = compare_against(run)
     if compared is not None:
-        earlier = printable(str(run.settings[AGAINST])[:NAME_CHARACTERS])
+        earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
         _step(root, f"against {earlier}", compared.steps[0])
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
     shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}

@@ -157,7 +157,7 @@ class ReportModel:
     @property
     def named_again(self) -> str:
         """Options that name controllers of the user's own again, to go on."""
-        return named_again(self.run.settings, goes_on=True)
+        return named_again(self.run.record, goes_on=True)
 
     @property
     def printed(self) -> str:
@@ -166,7 +166,7 @@ class ReportModel:
 
     def settings(self) -> Iterator[tuple[str, Any]]:
         """Yield name and value of each setting, nested ones with their path."""
-        rest = list(self.run.settings.items())
+        rest = list(self.run.record.items())
         while rest:
             name, value = rest.pop(0)
             if isinstance(value, dict):

@@ -458,7 +458,7 @@ def _check_comparable(a: Run, b: Run) -> None:
         "what counts as a failure": a.criterion != b.criterion,
         "the share of its runs in which a case may fail": a.tolerated != b.tolerated,
         **{
-            f"the POV of level {level_name(level)}": not same_pov(a.settings, b.settings, level)
+            f"the POV of level {level_name(level)}": not same_pov(a.record, b.record, level)
             for level in sorted(set(a.levels) & set(b.levels))
         },
     }
@@ -472,7 +472,7 @@ def _check_comparable(a: Run, b: Run) -> None:
 def _notes(runs: Sequence[Run]) -> list[str]:
     """Return what limits the comparison of campaigns, in sentences."""
     notes = []
-    if len({str([r.settings.get(k) for k in ("sampler", "cases")]) for r in runs}) > 1:
+    if len({(run.settings.sampler, run.settings.cases) for run in runs}) > 1:
         notes.append(
             "The campaigns differ in sampler or number of cases: FMC, failures and regions are "
             "what each of them found, and a longer search finds more."

@@ -196,7 +196,7 @@ class ExplanationResult(Result):
         if self.found.nearest_start is not None:
             name, value = self.found.nearest_start
             at = f"--at {name}={value!r}"
-            at += named_again(self.run.settings)
+            at += named_again(self.run.record)
             lines.append(f"look at it: merge-sumo run --case {folder} {outcome.index} {at}")
         return [*lines, f"in the report: merge-sumo report {folder}"]
 

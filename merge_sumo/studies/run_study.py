@@ -51,12 +51,12 @@ class RunStudy:
         what the study is of.
         """
         run, road, today = self.run, self.plan.road, self.record()
-        if run.settings.get("net_sha256", road.sha256) != road.sha256:
+        if run.settings.net_sha256 not in (None, road.sha256):
             raise UserError(
                 f"{run.folder} was run on another net than {road.path} is now: put that back"
             )
         for level in self.settings.levels if levels is None else levels:
-            if not same_pov(run.settings, today, level):
+            if not same_pov(run.record, today, level):
                 raise UserError(
                     f"{run.folder} was run against another POV of level {level_name(level)} than "
                     "today's: give its `policies`"
@@ -71,8 +71,8 @@ def notice_changes(run: Run, plan: SimulationPlan) -> None:
     specs = str(plan.vut.spec), None if pov is None else str(pov.spec)
     loaded = plan.vut.files or {}, plan.povs.files or {}
     for name, setting, spec, files in zip(FILES, ("vut", "pov"), specs, loaded, strict=True):
-        known = run.settings.get(name)
-        if spec is None or spec != run.settings.get(setting) or not isinstance(known, dict):
+        known = getattr(run.settings, name)
+        if spec is None or spec != getattr(run.settings, setting) or known is None:
             continue
         now = files_now(known, files)
         if differing := [file for file, sha256 in known.items() if now[file] != sha256]:

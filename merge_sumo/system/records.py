@@ -21,6 +21,7 @@ from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
+    ClassVar,
     Final,
     Literal,
     TypeVar,
@@ -223,7 +224,8 @@ def in_words(hint: Any) -> str:
 
 @cache
 def _hints(kind: type) -> dict[str, Any]:
-    return get_type_hints(kind, include_extras=True)
+    hints = get_type_hints(kind, include_extras=True).items()
+    return {name: hint for name, hint in hints if get_origin(hint) is not ClassVar}
 
 
 def _unknown(name: object, kind: Any) -> str:

@@ -258,7 +258,7 @@ class VutContract:
     def test_answers_in_every_step(self) -> None:
         for run in self.runs():
             errors = {outcome.measures.error for outcome in run.outcomes}
-            assert errors == {None}, run.settings["scenario"]
+            assert errors == {None}, run.record["scenario"]
 
     def test_does_not_depend_on_other_corridors(self) -> None:
         """A case alone has the outcome that it had among others."""

@@ -70,7 +70,7 @@ class TestWhatWasChanged:
     def test_by_a_person_who_removes_the_checksum_is_taken(self, copied):
         settings = read_settings(copied) | {"seed": 3}
         (copied / SETTINGS).write_text(json.dumps(settings))
-        assert Run(copied).settings["seed"] == 3
+        assert Run(copied).settings.seed == 3
 
     @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, f"{TRAJECTORIES}/00000.npz"])
     def test_into_a_pipe_is_not_waited_for(self, command_line, copied, name):

@@ -158,7 +158,7 @@ class TestACampaign:
     def read(self, folder: Path) -> None:
         run = answer(lambda: Run(folder))
         if run is not None:
-            answer(lambda: settings_of(folder, run.settings))
+            answer(lambda: settings_of(folder, run.record))
             answer(lambda: write_report(run))
             answer(lambda: run.trajectory(0))
 

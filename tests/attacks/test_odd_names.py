@@ -66,7 +66,7 @@ class TestAVutFile:
         assert Path(json.loads(out)["report"]).is_file()
         (folder,) = (tmp_path / "runs").glob("*-*")
         assert folder.name.isascii()
-        assert Run(folder).settings["vut"] == f"{name}.py:drive"
+        assert Run(folder).settings.vut == f"{name}.py:drive"
         code, out, err = call("check-vut", f"{name}.py:drive")
         assert code == 0, out + err
 

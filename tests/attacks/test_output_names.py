@@ -308,7 +308,7 @@ class TestAReceivedFolder:
     def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received):
         (received / f".{SETTINGS}").symlink_to("../theirs/thesis")
         with Journal.reopen(received)[0] as journal:
-            journal.rewrite_settings(settings := {**Run(received).settings, "cases": 70})
+            journal.rewrite_settings(settings := {**Run(received).record, "cases": 70})
         assert (received.parent / "theirs" / "thesis").read_text() == "theirs"
         assert read_settings(received) == settings
 

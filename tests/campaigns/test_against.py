@@ -80,7 +80,7 @@ class TestFinds:
     def test_the_old_version_is_a_campaign_of_its_own(self):
         run = run_campaign(settings(cases=10), Path("run"))
         earlier = run.earlier()
-        assert earlier.settings["vut"] == "old.py:f"
+        assert earlier.settings.vut == "old.py:f"
         assert [o.case for o in earlier.outcomes] == [o.case for o in run.outcomes]
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
 

@@ -190,7 +190,7 @@ class TestAJournal:
         for batch in range(3):
             journal.append([one for one in ran if one.outcome.batch == batch])
         run = Run(tmp_path / "run")
-        assert run.settings == settings
+        assert run.record == settings
         assert run.outcomes == [one.outcome for one in ran]
         for index in (4, 0, 3, 1, 2):
             again = run.trajectory(index)

@@ -155,7 +155,7 @@ class TestAChangedController:
         assert (code, err) == (0, "")
 
     def test_is_known_by_its_files_wherever_they_are(self, mine: Path, tmp_path: Path) -> None:
-        recorded = Run(mine / "run").settings["vut_files"]
+        recorded = Run(mine / "run").record["vut_files"]
         assert set(recorded) == {"my_vut.py", "helper.py"}
         there = project(tmp_path / "there")
         loaded = {str(there / "my_vut.py"): recorded["my_vut.py"]}

@@ -222,7 +222,7 @@ class TestSettings:
             act=Actuation(lag_s=0.2),
             out=tmp_path / "run",
         )
-        recorded = run.run.settings["scenario"]
+        recorded = run.run.record["scenario"]
         assert recorded["sense"] == {"delay_s": [0.0, 0.5], "noise_x_m": 0.5}
         assert recorded["act"] == {"lag_s": 0.2}
         delays = [row["sense_delay_s"] for row in run.cases]

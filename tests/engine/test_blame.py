@@ -110,7 +110,7 @@ class TestKills:
         assert outcomes(struck) == outcomes(calm)
         bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
         assert calm.ran_again == 0
-        assert RAN_AGAIN not in calm.settings
+        assert RAN_AGAIN not in calm.record
         assert struck.ran_again == bad
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
         assert f"{bad} cases ran again, because a process was killed" in struck.ran_again_in_words

@@ -98,11 +98,11 @@ class TestACampaign:
         assert outcomes(tmp_path / "swapped") != outcomes(tmp_path / "shipped")
 
     def test_records_where_they_were_and_their_hashes(self, swapped, tmp_path):
-        recorded = run_campaign(settings(swapped), tmp_path / "run").settings
+        recorded = run_campaign(settings(swapped), tmp_path / "run").record
         assert recorded["policies"] == str(swapped)
         hashes = {name: entry["sha256"] for name, entry in networks(swapped).items()}
         assert recorded["policies_sha256"] == hashes
-        assert run_campaign(settings(None), tmp_path / "shipped").settings["policies"] is None
+        assert run_campaign(settings(None), tmp_path / "shipped").record["policies"] is None
 
 
 class TestOtherCommands:

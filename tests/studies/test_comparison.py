@@ -94,7 +94,7 @@ def changed(folder, run, **settings) -> Run:
     folder.mkdir()
     for name in ("outcomes.jsonl", "campaign.json"):
         (folder / name).write_bytes((run.folder / name).read_bytes())
-    record = {**run.settings, **settings}
+    record = {**run.record, **settings}
     (folder / "campaign.json").write_text(json.dumps(record))
     return Run(folder)
 
@@ -225,7 +225,7 @@ def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run, t
 
 def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
     found = rerun(
-        RunStudy(run, today := settings_of(run.folder, run.settings), resolve(today)), run.outcomes
+        RunStudy(run, today := settings_of(run.folder, run.record), resolve(today)), run.outcomes
     )
     assert [o.measures for o in found.versions[1].outcomes] == [o.measures for o in run.outcomes]
     assert found.steps[0].count(Change.BROKE) == found.steps[0].count(Change.FIXED) == 0
@@ -325,6 +325,6 @@ def test_campaigns_with_repeats_are_compared_case_by_case(tmp_path):
         # The same seeds: what stops below .3 stops below .4, too.
         assert one.runs_a.failures <= one.runs_b.failures
     assert step.count(Change.BROKE) == 0, "no case is told apart by ten runs"
-    today = settings_of(made[0].folder, made[0].settings, {"vut": made[0].vut})
+    today = settings_of(made[0].folder, made[0].record, {"vut": made[0].vut})
     again = rerun(RunStudy(made[0], today, resolve(today)), made[0].outcomes)
     assert {case.change for case in again.steps[0].cases} <= {Change.BOTH, Change.NEITHER}

@@ -39,7 +39,7 @@ LONG = pytest.mark.long
 
 
 def avoidance_of(run, workers=None, **other):
-    settings = settings_of(run.folder, run.settings, controllers(run.settings))
+    settings = settings_of(run.folder, run.record, controllers(run.record))
     return avoidance(run, resolve(settings), workers=workers, **other)
 
 
