@@ -194,16 +194,6 @@ class QNetwork:
         """Whether the network's input has the social value orientation."""
         return bool(self.layers[0][0].shape[1] == FEATURES + SVO_FEATURES)
 
-    @property
-    def is_finite(self) -> bool:
-        """Whether all weights and biases are finite numbers, in float32 too."""
-        with np.errstate(over="ignore"):
-            return all(
-                bool(np.isfinite(values.astype(np.float32)).all())
-                for layer in self.layers
-                for values in layer
-            )
-
     def values(self, inputs: FloatArray) -> FloatArray:
         """Return Q, (n, actions), of inputs, (n, features).
 

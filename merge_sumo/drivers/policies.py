@@ -173,7 +173,9 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
     try:
         network = QNetwork.from_tensors(load(content))
         inputs, outputs = network.layers[0][0].shape[1], network.layers[-1][0].shape[0]
-        if not network.is_finite:
+        with np.errstate(over="ignore"):
+            single = [np.asarray(x, np.float32) for layer in network.layers for x in layer]
+        if not all(np.isfinite(values).all() for values in single):
             raise ValueError("a weight is NaN, infinite or beyond float32")
         if network.a_min_mps2 is not None and not -20.0 <= network.a_min_mps2 < 0.0:
             raise ValueError("its limit of braking is not from -20 to below 0 m/s2")

@@ -73,11 +73,7 @@ class Plan(NamedTuple):
 
 
 class RampDriver(Level0Vut):
-    """Takes the level-0 profile, and gives way when a model predicts a conflict at M.
-
-    Attributes:
-        model: the model.
-    """
+    """Takes the level-0 profile, and gives way when a model predicts a conflict at M."""
 
     model: SafetyModel
 

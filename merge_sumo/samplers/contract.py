@@ -1,6 +1,6 @@
 """The contract of samplers: what a campaign relies on, as tests that a class is put through.
 
-`merge_sumo.testing.SamplerContract` is the class for pytest; `violation` runs it without.
+`merge_sumo.testing.SamplerContract` is the class for pytest.
 """
 
 from __future__ import annotations
@@ -236,23 +236,3 @@ class SamplerContract:
         before = np.random.get_state(legacy=False)  # noqa: NPY002
         assert sampler.ask(9) == proposed
         assert repr(np.random.get_state(legacy=False)) == repr(before)  # noqa: NPY002
-
-
-def violation(sampler: type[Sampler]) -> str | None:
-    """Return in a clause what a sampler does that the contract forbids; None where it keeps it.
-
-    It is a pool of three levels and some thirty cases, without SUMO. What the sampler raises is
-    raised.
-    """
-    contract = SamplerContract()
-    contract.sampler = sampler
-    for name in vars(SamplerContract):
-        if not name.startswith("test_"):
-            continue
-        try:
-            getattr(contract, name)()
-        except AssertionError as error:
-            if str(error):
-                return f"not so: {name.removeprefix('test_').replace('_', ' ')} ({error})"
-            return f"not so: {name.removeprefix('test_').replace('_', ' ')}"
-    return None

@@ -255,13 +255,11 @@ class Scenario:
         is_number = type(self.v_vut0_mps) is float
         yield "v_vut0_mps", is_number or v_vut0[0] < v_vut0[1], "low < high"
         yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
-        yield "a_max_mps2", self.a_max_mps2 > 0.0, "above 0"
+        for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
+            yield name, getattr(self, name) > 0.0, "above 0"
         yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
-        yield "v_min_mps", self.v_min_mps > 0.0, "above 0"
-        yield "ttc_min_s", self.ttc_min_s > 0.0, "above 0"
         yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
         yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
-        yield "level0_v_mps", self.level0_v_mps > 0.0, "above 0"
         known = COORDINATES.keys() & self.notation.keys()
         for name, imperfection in self._imperfections():
             fits = known.issuperset(f"{name}_{field}" for field in imperfection.ranged)

@@ -8,7 +8,6 @@ case, so that members disagree where few cases tell.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Final
 
@@ -24,44 +23,19 @@ MAX_FEATURES: Final = 0.5
 """Share of the inputs among which each node of a tree chooses."""
 
 
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """What the VUT saw and did in the steps of one case.
-
-    Attributes:
-        inputs: see `Observation`, (T, inputs); those of the present are the first `now`.
-        now: how many these are.
-        a_mps2: what it did, (T,).
-    """
-
-    inputs: Inputs
-    now: int
-    a_mps2: FloatArray
+Steps = tuple[Inputs, FloatArray]
+"""What the VUT saw in the steps of one case, (T, inputs), and what it did, (T,), in m/s2."""
 
 
-@dataclass(frozen=True, slots=True)
-class Expert:
-    """What an expert looks at.
+def learn(cases: Sequence[Steps], inputs: int, seed: int) -> Any:
+    """Return a tree that has learned from the first of so many inputs of cases."""
+    from sklearn.tree import ExtraTreeRegressor
 
-    Attributes:
-        history: at what was before, too.
-    """
-
-    history: bool
-
-    def sees(self, inputs: Inputs, now: int) -> Inputs:
-        """Return the inputs that it looks at, of all, (n, inputs)."""
-        return inputs if self.history else inputs[:, :now]
-
-    def learn(self, cases: Sequence[Steps], seed: int) -> Any:
-        """Return a tree that has learned from cases."""
-        from sklearn.tree import ExtraTreeRegressor
-
-        inputs = np.concatenate([self.sees(case.inputs, case.now) for case in cases])
-        answers = np.concatenate([case.a_mps2 for case in cases])
-        tree = ExtraTreeRegressor(max_features=MAX_FEATURES, random_state=seed)
-        # Read at once: what the library wraps around it costs more than the tree does.
-        return tree.fit(inputs, answers).tree_
+    seen = np.concatenate([of_case[:, :inputs] for of_case, _ in cases])
+    answers = np.concatenate([a_mps2 for _, a_mps2 in cases])
+    tree = ExtraTreeRegressor(max_features=MAX_FEATURES, random_state=seed)
+    # Read at once: what the library wraps around it costs more than the tree does.
+    return tree.fit(seen, answers).tree_
 
 
 class Forest:

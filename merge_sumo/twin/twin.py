@@ -12,14 +12,15 @@ from merge_sumo.engine.povs import Povs
 from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.scenario import VUT
-from merge_sumo.twin.experts import GROUPS, Expert, Forest, Steps
+from merge_sumo.twin.experts import GROUPS, Forest, Steps, learn
 from merge_sumo.twin.observation import HISTORY, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.verdict.score import Outcome
 
-EXPERTS: Final = (Expert(history=False), Expert(history=True))
+EXPERTS: Final = 2
+"""One that looks at the present, and one that looks at what was before, too."""
 FEWEST: Final = 4
 """Cases that it takes to play at all."""
 AT_ONCE: Final = 100
@@ -49,7 +50,9 @@ class Twin:
     ) -> None:
         """Know the pool and its POVs, what counts as a failure, and the road's centre lines."""
         self._pool, self._seed = pool, seed
-        self._now = Observation(pool.scenario, 0).now
+        now = Observation(pool.scenario, 0).now
+        self._looked_at = now, now + HISTORY
+        """How many of the inputs each expert looks at."""
         self._rollout = TwinRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._motions: dict[int, FloatArray] = {}
@@ -96,7 +99,7 @@ class Twin:
         if query.screening is not None:
             member = query.screening * GROUPS + self._last_batch() % GROUPS
             return [member], [everywhere]
-        members = list(range(len(EXPERTS) * GROUPS))
+        members = list(range(EXPERTS * GROUPS))
         if not query.held_out:
             return members, [everywhere] * len(members)
         group = np.array(query.held_out) % GROUPS
@@ -109,18 +112,18 @@ class Twin:
         if not query.held_out:
             groups = GROUPS if query.screening is None else 1
             return found_m.reshape(-1, groups, len(query.points))
-        gaps_m = np.empty((len(EXPERTS), len(query.points)))
+        gaps_m = np.empty((EXPERTS, len(query.points)))
         expert = np.repeat(np.arange(len(places)) // GROUPS, list(map(len, places)))
         gaps_m[expert, np.concatenate(places)] = found_m
         return gaps_m
 
     def _forest(self) -> Forest:
         """Return the trees of all members, those of an expert together."""
-        trees = [self._member(e, g) for e in range(len(EXPERTS)) for g in range(GROUPS)]
+        trees = [self._member(e, g) for e in range(EXPERTS) for g in range(GROUPS)]
         if self._asks is None or any(
             one is not other for one, other in zip(self._asks[0], trees, strict=True)
         ):
-            self._asks = trees, Forest(trees, self._now + HISTORY)
+            self._asks = trees, Forest(trees, max(self._looked_at))
         return self._asks[1]
 
     def _last_batch(self) -> int:
@@ -134,8 +137,8 @@ class Twin:
         known = self._members.get((expert, group))
         if known is None or known[0] != indices:
             cases = self._steps_of(indices)
-            seed = (self._seed * len(EXPERTS) + expert) * GROUPS + group
-            known = indices, EXPERTS[expert].learn(cases, seed % 2**32)
+            seed = (self._seed * EXPERTS + expert) * GROUPS + group
+            known = indices, learn(cases, self._looked_at[expert], seed % 2**32)
             self._members[expert, group] = known
         return known[1]
 
@@ -177,10 +180,6 @@ class Twin:
             last = x_v_a[VUT, 2]
         inputs = np.array(seen)
         return [
-            Steps(
-                np.ascontiguousarray(inputs[: len(motion) - 1, place]),
-                observation.now,
-                motion[:-1, VUT, 2],
-            )
+            (np.ascontiguousarray(inputs[: len(motion) - 1, place]), motion[:-1, VUT, 2])
             for place, motion in enumerate(motions)
         ]

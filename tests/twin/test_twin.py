@@ -23,7 +23,7 @@ from merge_sumo.scenario.case import MergeCase, Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.records import decode, to_plain
-from merge_sumo.twin.experts import Expert, Forest, Steps
+from merge_sumo.twin.experts import Forest, learn
 from merge_sumo.twin.observation import NOW, Observation
 from merge_sumo.twin.rollout import Starts, TwinRollout
 from merge_sumo.twin.twin import Twin
@@ -134,16 +134,13 @@ class TestForest:
     @pytest.mark.parametrize("count", [1, 2, 5, 8])
     def test_answers_as_each_of_its_trees(self, count):
         rng = np.random.default_rng(count)
-        cases = [
-            Steps(rng.random((30, 6)).astype(np.float32), 4, rng.random(30)) for index in range(2)
-        ]
-        experts = [Expert(history=bool(k % 2)) for k in range(count)]
-        trees = [expert.learn(cases, seed) for seed, expert in enumerate(experts)]
+        cases = [(rng.random((30, 6)).astype(np.float32), rng.random(30)) for _ in range(2)]
+        trees = [learn(cases, 4 + 2 * (k % 2), seed=k) for k in range(count)]
         forest = Forest(trees, 6)
         inputs = rng.random((50, 7)).astype(np.float32)
-        for number, (expert, tree) in enumerate(zip(experts, trees, strict=True)):
+        for number, tree in enumerate(trees):
             inputs[:, 6] = number
-            alone = tree.predict(expert.sees(inputs[:, :6], 4))[:, 0]
+            alone = tree.predict(inputs[:, : 4 + 2 * (number % 2)])[:, 0]
             assert forest.answer(inputs).tolist() == alone.tolist()
 
 

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.contract import violation
+from merge_sumo.samplers.contract import SamplerContract
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import Case, FloatArray, Pool
 from merge_sumo.studies.sampler_study import COMPARED_BATCH
@@ -249,3 +249,22 @@ class WatchedSampler(Sampler):
 
 def _in_short(answer: object) -> str:
     return f"{len(answer)}" if isinstance(answer, list) else type(answer).__name__
+
+
+def violation(sampler: type[Sampler]) -> str | None:
+    """Return in a clause what a sampler does that the contract forbids; None where it keeps it.
+
+    It is a pool of three levels and some thirty cases, without SUMO. What the sampler raises is
+    raised.
+    """
+    contract = SamplerContract()
+    contract.sampler = sampler
+    for name in vars(SamplerContract):
+        if not name.startswith("test_"):
+            continue
+        try:
+            getattr(contract, name)()
+        except AssertionError as error:
+            said = f" ({error})" if str(error) else ""
+            return f"not so: {name.removeprefix('test_').replace('_', ' ')}{said}"
+    return None
