@@ -147,12 +147,6 @@ class TestAPov:
         cases = cases_of(20)
         assert same(run(pov(KEEPS), own(cases)), run(None, cases))
 
-    def test_may_be_the_very_file_that_is_the_vut(self):
-        spec = pov(YIELDS)
-        hosted = run(spec, own(cases_of(6)), vut=spec, hosted=True)
-        assert same(hosted, run(spec, own(cases_of(6)), vut=spec))
-        assert any(trajectory.a_pov_mps2.min() == -1.0 for trajectory in hosted)
-
     @pytest.mark.parametrize("spec", ["my_pov.py:Pov", "sumo:IDM"])
     def test_changes_nothing_at_the_other_levels(self, spec):
         pov(YIELDS)
@@ -207,15 +201,6 @@ class TestWhatItDoesWrong:
 
 
 class TestACampaign:
-    def test_whose_pov_errs_is_not_the_vuts_but_an_error_all_the_same(self, call):
-        pov("def Pov(seen):\n    raise ValueError('no idea')\n")
-        given = ("--vut", "design2", "--pov", "my_pov.py:Pov", "--level", "own", *FEW)
-        code, out, err = call("campaign", *given, "-q", "--gate", "failures", "--gate", "errors")
-        assert code == 1
-        assert "8 SIM_ERROR, the first in case 0: the POV: ValueError: no idea" in out
-        assert "nothing was tested" in err
-        assert "failures is not met" in err or "failures" in err
-
     @pytest.mark.parametrize(
         ("arguments", "said"),
         [

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import numpy as np
 import pytest
 
 from merge_sumo.drivers.policies import (
@@ -19,21 +18,10 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
-from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23, as_merge
 from merge_sumo.training.reward import RewardWeights
 
 ROUNDABOUT = as_merge(named_scenario("roundabout"))
-
-
-@pytest.fixture(scope="module")
-def road():
-    return road_for(ROUNDABOUT)
-
-
-def uniform_cases(count: int, level: int = 0, seed: int = 0):
-    points = np.random.default_rng(seed).random((count, 3 if level == 2 else 2))
-    return from_unit(points, level, scenario=ROUNDABOUT)
 
 
 class TestItsDrivers:

@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase, from_unit
-from merge_sumo.scenario.scenario import BEHIND, DT_S, POV, US23, VUT
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.verdict.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.verdict.score import Outcome, measure
@@ -182,18 +180,3 @@ class TestRegions:
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):
         (box,) = failure_boxes(over_the_pool(lambda x, v: True), 1)
         assert (box.where, box.failures) == ("anywhere", box.cases)
-
-
-def test_regions_in_traffic_speak_of_when_other_cars_are_due():
-    scenario = named_scenario("us23-traffic")
-    rng = np.random.default_rng(0)
-    outcomes = []
-    for index, case in enumerate(from_unit(rng.random((400, 4)), 0, scenario=scenario)):
-        x_m, v_mps = case.starts()[BEHIND]
-        fails = 11.0 < -x_m / v_mps < 11.7
-        score = -900.0 if fails else -10.0
-        trajectory = Trajectory(case, np.zeros((2, 4, 3)), End.MERGED)
-        outcomes.append(Outcome(index, 0, case, replace(measure(trajectory), score=score)))
-    first, *_ = failure_boxes(outcomes, 0)
-    assert first.where == "car behind due at M (at constant speed) between 10.99 and 11.70 s"
-    assert first.failures > 0.8 * sum(o.failed for o in outcomes)
