@@ -85,6 +85,12 @@ _CONNECTION: Final = Allowed(
         "state": matching("[a-zA-Z=-]", "a letter, = or -"),
     }
 )
+
+
+def _connection(**more: Values) -> Allowed:
+    return Allowed({**_CONNECTION.attributes, **more})
+
+
 _VERSION = matching(r"[0-9]{1,4}(?:\.[0-9]{1,4}){0,3}", "a version")
 NET: Final = {
     "net": Allowed(
@@ -124,7 +130,7 @@ HOSTED_NET: Final = {
         {
             "edge": _EDGE,
             "junction": _JUNCTION,
-            "connection": Allowed({**_CONNECTION.attributes, "via": _ID}),
+            "connection": _connection(via=_ID),
         },
     )
 }
@@ -141,9 +147,7 @@ ROAD_NET: Final = {
         NET["net"].attributes,
         {
             **NET["net"].children,
-            "connection": Allowed(
-                {**_CONNECTION.attributes, "via": _ID, "tl": _ID, "linkIndex": _COUNT}
-            ),
+            "connection": _connection(via=_ID, tl=_ID, linkIndex=_COUNT),
             "roundabout": Allowed({"nodes": _IDS, "edges": _IDS}),
             "tlLogic": Allowed(
                 {"id": _ID, "type": _WORD, "programID": _ID, "offset": number(-1e6, 1e6)},

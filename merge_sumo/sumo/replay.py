@@ -128,11 +128,6 @@ class _Episode:
     rows: Rows
     places: Places
 
-    @property
-    def vehicles(self) -> tuple[str, ...]:
-        """Names of the vehicles."""
-        return _vehicles(self.types)
-
 
 def _received(folder: Path) -> _Episode:
     """Read net, vehicle types and record of a folder that somebody may have sent."""
@@ -146,11 +141,16 @@ def _received(folder: Path) -> _Episode:
         schema, find = allowed.HOSTED_NET, corridor_of_hosted
     net = received.cleaned(_bytes(path), schema, f"the net {path}")
     road = Road(net, find(net, path), file)
-    types = _checked_types(folder / TYPES)
+    types = _read(folder / TYPES, allowed.TYPES)
+    if sorted(_vehicles(types)) not in map(sorted, (VEHICLES[:2], VEHICLES)):
+        raise UserError(
+            f"the file {folder / TYPES} must have one vType pov and one vType vut, and in traffic "
+            "one ahead and one behind"
+        )
     root, rows = _checked_record(folder / RECORD, _vehicles(types))
-    # Folders of older versions have no labels.
-    has_labels = os.path.lexists(folder / LABELS)
-    labels = _read(folder / LABELS, allowed.LABELS) if has_labels else None
+    labels = None  # in folders of older versions
+    if os.path.lexists(folder / LABELS):
+        labels = _read(folder / LABELS, allowed.LABELS)
     return _Episode(road, types, root, labels, rows, _places(root, road.corridor))
 
 
@@ -162,22 +162,12 @@ def _read(path: Path, schema: Mapping[str, Allowed]) -> etree._Element:
     return received.parse(_bytes(path), schema, f"the file {path}")
 
 
-def _checked_types(path: Path) -> etree._Element:
-    root = _read(path, allowed.TYPES)
-    if sorted(_vehicles(root)) not in map(sorted, (VEHICLES[:2], VEHICLES)):
-        raise UserError(
-            f"the file {path} must have one vType pov and one vType vut, and in traffic one ahead "
-            "and one behind"
-        )
-    return root
-
-
 def _vehicles(types: etree._Element) -> tuple[str, ...]:
     return tuple(str(vtype.get("id")) for vtype in types)
 
 
 def _checked_record(path: Path, vehicles: Sequence[str]) -> tuple[etree._Element, Rows]:
-    root = received.parse(_bytes(path), allowed.RECORD, f"the record {path}")
+    root = _read(path, allowed.RECORD)
     if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
         raise UserError(
             f"the record {path} must have from {MIN_TIMESTEPS} to {MAX_TIMESTEPS} timesteps"
@@ -236,7 +226,7 @@ def _fault_of_record(episode: _Episode) -> tuple[float, str] | None:
     times = sorted({time for time, _ in rows})
     moving = set(times[: -HOLD_STEPS - 1])
     for time, after in zip(times, [*times[1:], None], strict=True):
-        for who in episode.vehicles:
+        for who in _vehicles(episode.types):
             x, y, _, speed = rows[time, who]
             place = episode.places[time, who]
             if place is None or not place.is_at(x, y):

@@ -349,10 +349,6 @@ class World:
         """Return a value of SUMO for all vehicles, (A, corridors)."""
         return np.fromiter(map(get, self._ids), float, len(self._ids)).reshape(self.x_m.shape)
 
-    def acceleration_mps2(self) -> FloatArray:
-        """Return SUMO's own accelerations, (A, corridors)."""
-        return self._of_all(self._libsumo.vehicle.getAcceleration)
-
     def close(self) -> None:
         """End the simulation; the next world may start."""
         if World._open:

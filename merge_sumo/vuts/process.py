@@ -146,11 +146,8 @@ class Program:
             ) from error
         assert self._process.stdout is not None, "piped"  # noqa: S101
         self._output = Output(self._process.stdout, log)
-
-    @property
-    def process(self) -> int:
+        self.process = self._process.pid
         """Id of its process, which is that of its session."""
-        return self._process.pid
 
     def ended(self, patience_s: float) -> str:
         """Return how it ended and the last line that it printed; "" when it still runs."""
@@ -172,13 +169,10 @@ class Program:
                 self._process.wait(GRACE_S)
         finally:
             # The group, because a program may have started others that are left.
-            self._signal(signal.SIGKILL if hasattr(signal, "SIGKILL") else signal.SIGTERM)
+            self._signal(signal.SIGKILL)
             self._process.wait()
             self._output.close()
 
     def _signal(self, number: int) -> None:
         with suppress(ProcessLookupError, PermissionError):  # none may be left
-            if hasattr(os, "killpg"):
-                os.killpg(self._process.pid, number)
-            else:
-                self._process.send_signal(number)
+            os.killpg(self._process.pid, number)

@@ -7,14 +7,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lxml import etree
 from PIL import Image
-from processes import marked, none_left
 
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
@@ -112,38 +110,6 @@ def car(image: np.ndarray, who: str) -> np.ndarray:
     return np.array([labels, 0]) + places(
         image[labels:], tuple(255.0 * float(part) for part in COLOURS[who].split(","))
     )
-
-
-NEVER_CONNECTED = """
-import time
-from merge_sumo.cli import main
-from merge_sumo.sumo.child import Channel
-
-Channel.receive = lambda *_, **__: time.sleep(600)
-main()
-"""
-
-
-def test_no_window_is_left_of_a_command_that_is_stopped_before_it_is_connected(display, tmp_path):
-    (tmp_path / "script.py").write_text(NEVER_CONNECTED)
-    case = ("--vut", "level0", "--x", "-300", "--v", "30", "--gui")
-    with none_left() as mark:
-        command = subprocess.Popen(
-            [sys.executable, tmp_path / "script.py", "run", *case],
-            env={**os.environ, "DISPLAY": display, "TMPDIR": str(tmp_path)},
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        try:
-            while not any("merge_sumo.sumo.live" in program for program in marked(mark)):
-                assert command.poll() is None
-                time.sleep(0.05)
-            command.terminate()
-            assert command.wait(60) == 143
-        finally:
-            if command.poll() is None:
-                os.killpg(command.pid, signal.SIGKILL)
-    assert [file.name for file in tmp_path.iterdir()] == ["script.py"]
 
 
 def test_the_cars_meet(pictures):

@@ -12,7 +12,7 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
-from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import SimulationError, World
@@ -111,25 +111,6 @@ def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps
         world._set_speed("pov.0", speed_mps)
         with pytest.raises(SimulationError, match=r"0\.1.* m away from where it drives"):
             world.step(np.zeros((2, 1)))
-
-
-def test_a_pov_that_accelerates_until_the_timeout_stays_on_the_road():
-    class Fastest(Driver):
-        def act(self, scene):
-            return np.full(self.corridors, US23.a_max_mps2)
-
-    class Stop(Driver):
-        def act(self, scene):
-            return np.full(self.corridors, US23.a_min_mps2)
-
-    case = MergeCase(level=0, x_pov0_m=-180.0, v_pov0_mps=35.0, scenario=US23)
-    with World(1, scenario=US23) as world:
-        (trajectory,) = run_all(world, Fastest(1), Stop(1), [case])
-    assert trajectory.end is End.TIMEOUT
-    assert len(trajectory.motion) == US23.max_steps + 1
-    assert trajectory.t_end_s == 30.0
-    assert trajectory.v_pov_mps[-1] == pytest.approx(95.0)
-    assert_eq4(trajectory)
 
 
 @pytest.mark.parametrize("half_step", ["advance", "command"])

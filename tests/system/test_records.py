@@ -79,24 +79,6 @@ def test_a_whole_number_is_a_number_and_a_list_is_a_tuple():
     assert (type(car.index), type(car.speed_mps), car.range_m) == (int, float, (1.0, 2.0))
 
 
-@pytest.mark.parametrize(
-    ("record", "says"),
-    [
-        ({"kind": "round", "radius_m": 0}, "radius_m is 0: it must be a number above 0"),
-        ({"kind": "square", "width_m": "1"}, "width_m is '1': it must be a number"),
-        ({"kind": "oval"}, "kind is 'oval': it must be one of round, square"),
-        ({"kind": "square", "width_m": 1, "w": 2}, "square has no 'w'"),
-        ({}, "it has no kind"),
-        (3, "it is 3: it must be a table of names and values"),
-    ],
-    ids=str,
-)
-def test_a_record_of_one_of_several_kinds_is_refused_as_one_of_its_kind(record, says):
-    with pytest.raises(UserError) as error:
-        decode(json.dumps(record), Round | Square)
-    assert says in str(error.value)
-
-
 @given(st.floats(allow_nan=False, allow_infinity=False))
 def test_a_number_keeps_its_last_bit(number):
     found = decode(json.dumps(number))

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import UserError
 from merge_sumo.system.registry import Registry
 
 GROUP = "merge_sumo.tools"
@@ -51,15 +51,6 @@ def test_what_is_no_such_object_is_one_sentence(install, monkeypatch, entry, sou
     install("broken", entry, source)
     with pytest.raises(UserError, match=sentence):
         registry()[entry.split()[0]]
-
-
-@pytest.mark.parametrize("spoilt", ["METADATA", "entry_points.txt"])
-def test_a_package_whose_metadata_is_not_utf8_is_left_out_with_a_notice(install, tmp_path, spoilt):
-    install("foreign", "theirs = foreign:Tool")
-    file = tmp_path / "foreign-1.dist-info" / spoilt
-    file.write_bytes(file.read_bytes().replace(b"foreign", b"f\xffreign"))
-    with pytest.warns(Notice, match="left out the entry points of a package in"):
-        assert list(registry()) == ["ours", "other"]
 
 
 def test_a_name_of_two_packages_names_both(install):

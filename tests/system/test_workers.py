@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from functools import partial
 from pathlib import Path
@@ -142,22 +141,6 @@ class TestAWorkerThatDies:
 
 
 class TestLocalProcesses:
-    def test_end_although_work_was_cancelled(self, monkeypatch):
-        died: list[threading.ExceptHookArgs] = []
-        monkeypatch.setattr(threading, "excepthook", died.append)
-
-        def stopped() -> None:
-            with LocalProcesses(1) as workers:
-                begun, *waiting = [workers.submit(time.sleep, 60) for _ in range(6)]
-                while not begun.running():
-                    time.sleep(0.01)
-                assert waiting[-1].cancel()
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            stopped()
-        assert died == []
-
     @pytest.mark.slow
     def test_are_replaced_after_a_number_of_chunks(self):
         with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:

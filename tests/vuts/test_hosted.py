@@ -133,23 +133,6 @@ def Vut(seen):
         vut.close()
 
 
-def test_it_has_a_temporary_folder_that_goes_with_it(spec, tmp_path):
-    source = """
-import pathlib, tempfile
-def Vut(seen):
-    file = pathlib.Path(tempfile.mkdtemp(), "x")
-    file.touch()
-    pathlib.Path(__file__).with_name("where").write_text(str(file))
-    return 1.0
-"""
-    vut = HostedVut(1, parse(spec(source)), OPTIONS)
-    vut.act(scene(1))
-    file = Path((tmp_path / "where").read_text())
-    assert file.exists()
-    vut.close()
-    assert not file.parent.parent.exists()
-
-
 def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
     vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
     run = run_campaign(
