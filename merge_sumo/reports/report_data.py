@@ -9,13 +9,12 @@ from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from merge_sumo.coverage.fmc import fmc, radius_for
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.scenario.case import FloatArray, to_unit
+from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import Coordinate
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
@@ -48,9 +47,6 @@ SPEED_UNIT_MPS: Final = 0.002
 COUNT_GRID: Final = (32, 20)
 GRID: Final[dict[int, Grid]] = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
-PAIR_NODES: Final = 41
-BLUR_NODES: Final = 1.5
-"""Nodes of the map of a pair, in each direction, and over how many of them its means are taken."""
 
 UNKNOWN: Final = Diagnosis(None, None, False, False, None)
 """Of a case whose motion is lost."""
@@ -230,8 +226,8 @@ def map_data(
     """Return the data of the map of a level.
 
     A level with two coordinates has one map; with a third, the reader moves through it. Of more, a
-    map shows a pair, and the chance to fail is a mean over all values of the others. `others` are
-    outcomes that the page counts instead of showing one by one.
+    map shows the cases in a pair, without a chance to fail. `others` are outcomes that the page
+    counts instead of showing one by one.
     """
     dims = len(scenario.dimensions(level))
     return {
@@ -241,7 +237,7 @@ def map_data(
         "radius": radius_for(dims) if dims <= 3 else None,
         "grids": [
             {
-                "chance": surface and _chance(surface, dims, axes),
+                "chance": surface and _chance(surface, dims),
                 "counts": _counts(others, scenario, level, axes) if others else None,
             }
             for axes in pairs_of(dims)
@@ -262,38 +258,12 @@ def _counts(
     return grid
 
 
-def _chance(surface: Surface, dims: int, axes: Axes) -> dict[str, Any]:
-    """Return the chance at the nodes of a map; of a pair the means around them, as shares."""
-    if dims in GRID:
-        return _grid(GRID[dims], surface.chance(nodes(GRID[dims])))
-    mean = means(*surface.pool, axes)
-    most = float(mean.max())
-    shares = mean / most if most > 0.0 else mean
-    return {"most": round(most, 3), **_grid((PAIR_NODES, PAIR_NODES, 1), shares)}
-
-
-def means(points: FloatArray, values: FloatArray, axes: Axes) -> FloatArray:
-    """Return the means of values, (n,), at points, (n, d), around the nodes of two coordinates."""
-    from scipy.ndimage import gaussian_filter
-
-    node = np.rint(points[:, list(axes)] * (PAIR_NODES - 1)).astype(np.int64) @ (1, PAIR_NODES)
-    near, total = (
-        gaussian_filter(
-            np.bincount(node, weights, minlength=PAIR_NODES**2)
-            .astype(np.float64)
-            .reshape(PAIR_NODES, PAIR_NODES),
-            BLUR_NODES,
-            mode="constant",
-        ).ravel()
-        for weights in (None, values)
-    )
-    mean: FloatArray = np.divide(total, near, out=np.zeros_like(total), where=near > 0.0)
-    return mean
-
-
-def _grid(grid: Grid, share: NDArray[Any]) -> dict[str, Any]:
-    nx, ny, through = grid
-    values = np.rint(255.0 * share).astype(np.uint8)
+def _chance(surface: Surface, dims: int) -> dict[str, Any] | None:
+    """Return the chance at the nodes of a map in 255ths; None of more than three coordinates."""
+    if dims not in GRID:
+        return None
+    nx, ny, through = grid = GRID[dims]
+    values = np.rint(255.0 * surface.chance(nodes(grid))).astype(np.uint8)
     data = base64.b64encode(values.tobytes()).decode()
     return {"nx": nx, "ny": ny, "np": through, "data": data}
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.coverage.fmc import fmc
 from merge_sumo.samplers.belief import JUDGED_FROM, learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import FloatArray, Pool
@@ -23,10 +22,6 @@ from merge_sumo.verdict.score import Outcome
 
 FEWEST_FAILURES: Final = 5
 """Failures at a level from which a surrogate is learned. Chosen, not tuned."""
-PLAUSIBLE: Final = 0.1
-"""Chance to fail from which a place counts for `plausible_fmc`. Chosen, not tuned."""
-POOL_POINTS: Final = {2: 10_000, 3: 20_000, 4: 20_000, 5: 20_000, 6: 20_000}
-"""Uniform points by dimension: up to three as many as the cases of a ground truth."""
 PART: Final = 4000
 """Points asked at a time, so that memory does not grow with their number."""
 
@@ -34,51 +29,18 @@ Grid = tuple[int, int, int]
 """Nodes in each coordinate; of two coordinates the last number is 1."""
 
 
+@dataclass(frozen=True, slots=True)
 class Surface:
-    """The surrogate of one level of a run.
+    """The surrogate of one level of a run; `predict` is its learned chance to fail."""
 
-    Attributes:
-        plausible: chance from which a place counts for `plausible_fmc`.
-    """
-
-    def __init__(
-        self,
-        failing: FloatArray,
-        predict: Callable[[FloatArray], FloatArray],
-        tolerated: float = 0.0,
-    ) -> None:
-        """Use a learned chance to fail and the points, (n, d), of the failures found.
-
-        A place that fails in no more than a `tolerated` share of its runs is no failure.
-        """
-        self.plausible = max(PLAUSIBLE, tolerated)
-        self._failing, self._predict = failing, predict
+    predict: Callable[[FloatArray], FloatArray]
 
     def chance(self, points: FloatArray) -> FloatArray:
         """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
         parts = np.array_split(points, len(points) // PART + 1)
         # Each part in one thread: the answer is the same whatever the number of cores.
         with threadpool_limits(1), ThreadPoolExecutor(workers_or_cores(None)) as cores:
-            return np.concatenate(list(cores.map(self._predict, parts)))
-
-    def plausible_fmc(self) -> float:
-        """Return the coverage if all places failed that the surrogate does not exclude.
-
-        As many uniform points as a ground truth has cases, those with a chance of at least
-        `plausible`, together with the failures found. No more than the pool, though balls at its
-        faces reach out of it, unless the failures found alone cover more. No confidence bound: a
-        region of which the surrogate knows nothing is not in it.
-        """
-        points, chance = self.pool
-        whole = fmc(np.concatenate([self._failing, points[chance >= self.plausible]]))
-        return whole if whole <= 1.0 else max(1.0, fmc(self._failing))
-
-    @cached_property
-    def pool(self) -> tuple[FloatArray, FloatArray]:
-        """Uniform points of the unit cube, (n, d), and the chance of each to fail, (n,)."""
-        dims = self._failing.shape[1]
-        points = np.random.default_rng(0).random((POOL_POINTS[dims], dims))
-        return points, self.chance(points)
+            return np.concatenate(list(cores.map(self.predict, parts)))
 
 
 def nodes(grid: Grid) -> FloatArray:
@@ -99,10 +61,10 @@ def learn_surface(
     sampler.tolerated = tolerated
     sampler.tell(at_level)
     history = sampler.history(level)
-    failing = history.points[history.failed]
-    if len(failing) < FEWEST_FAILURES or len(history.failed) - len(failing) < JUDGED_FROM:
+    failing = int(history.failed.sum())
+    if failing < FEWEST_FAILURES or len(history.failed) - failing < JUDGED_FROM:
         return None
     with threadpool_limits(1):
         predict = learn_chance(history)
     assert predict is not None, "there are cases enough"  # noqa: S101
-    return Surface(failing, predict, tolerated)
+    return Surface(predict)

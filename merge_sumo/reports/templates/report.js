@@ -175,8 +175,6 @@ function FailureMap(figure) {
       drawMark(svg, i, x, y, faint);
       drawShare(svg, i, x, y, faint);
     }
-    const most = figure.querySelector(".most");
-    if (most) most.textContent = chance ? `${Math.round(100 * chance.most)} %` : "–";
     this.choose();
   };
   this.move = (value, everything) => {
