@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.campaigns.campaign import SCENARIOS, case_name
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
@@ -25,7 +25,6 @@ from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
 from merge_sumo.verdict.bodies import WIDTH_M
 from merge_sumo.verdict.merge import merged_rows
@@ -66,11 +65,6 @@ def write_folders(
         run.outcome(index)
     for index in indices:
         yield write(run, index, target / case_name(index), road)
-
-
-def write_sumo(run: Run, index: int, folder: Path, road: Corridor) -> Path:
-    """Write a case as a folder that sumo-gui replays."""
-    return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
 
 
 def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
@@ -285,7 +279,7 @@ def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
 
 
 SUMO: Final = ExportFormat(
-    about="folders that sumo-gui replays", write_case=write_sumo, below=SCENARIOS
+    about="folders that sumo-gui replays", write_case=export_case, below=SCENARIOS
 )
 OPENSCENARIO: Final = ExportFormat(
     about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any, Final
@@ -146,17 +146,17 @@ def _word(outcome: Outcome) -> str:
 
 
 def paired(
-    before: Sequence[Outcome], after: Sequence[Outcome], tolerated: float = 0.0
+    before: Sequence[Outcome], after: Sequence[Outcome], tolerated: float
 ) -> list[ComparedCase]:
     """Return the cases of both, what broke first, the worst first; see `Change` for the order.
 
     `tolerated` is the share of its runs in which a case may fail.
     """
     first, second = _by_case(before, tolerated), _by_case(after, tolerated)
-    cases = []
-    for key in first.keys() & second.keys():
-        (a, runs_a), (b, runs_b) = first[key], second[key]
-        cases.append(ComparedCase(a, b, runs_a, runs_b))
+    cases = [
+        ComparedCase(first[key][0], second[key][0], first[key][1], second[key][1])
+        for key in first.keys() & second.keys()
+    ]
     order = list(Change)
     return sorted(cases, key=lambda c: (order.index(c.change), c.b.margin or 0.0, c.b.index))
 
@@ -360,14 +360,15 @@ class Comparison(Result):
         return [*text, *self.notes]
 
     def _lines_of(self, step: Step) -> list[str]:
-        named = f"from {step.before} to {step.after}"
-        text = [f"{named}: {counted(len(step.cases), 'case')} with both"] if step.cases else []
+        named = f"from {step.before} to {step.after}: {counted(len(step.cases), 'case')} with both"
+        text = [named] if step.cases else []
         text += step.table_lines()
+        folder = self.versions[step.after - 1].folder
         for change in (Change.BROKE, Change.WITHIN_CHANCE, Change.STILL_CONTACT):
             cases = [case for case in step.cases if case.change is change]
-            text += [f"{change}{cut(len(cases), LISTED)}:"] if cases else []
-            text += [f"  case {case.b.index}: {case.became}" for case in cases[:LISTED]]
-            folder = self.versions[step.after - 1].folder
+            if cases:
+                text.append(f"{change}{cut(len(cases), LISTED)}:")
+                text += [f"  case {case.b.index}: {case.became}" for case in cases[:LISTED]]
             if cases and folder is not None:
                 text.append(f"  look at one: merge-sumo replay {quoted(folder)} {cases[0].b.index}")
         return text
@@ -375,14 +376,10 @@ class Comparison(Result):
     def fmc(self) -> dict[int, list[str]]:
         """Return by level the FMC of each version as text, of its own cases; "-" for none."""
         levels = sorted({level for version in self.versions for level in version.levels})
+        found = {level: [version.at.get(level) for version in self.versions] for level in levels}
         return {
-            level: [
-                f"{version.at[level].fmc:.4f}"
-                if level in version.levels and version.at[level].tested
-                else "-"
-                for version in self.versions
-            ]
-            for level in levels
+            level: [f"{one.fmc:.4f}" if one is not None and one.tested else "-" for one in row]
+            for level, row in found.items()
         }
 
     def to_record(self) -> dict[str, Any]:
@@ -440,16 +437,16 @@ def compare_against(run: Run) -> Comparison | None:
     return _of_two(before, Version.of(run), source)
 
 
+def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
+    """Compare a campaign with what another VUT does in its cases."""
+    later = Version.of(after)
+    earlier = replace(later, vut=vut, folder=None, outcomes=before)
+    return _of_two(earlier, later, f"the cases come from the search of {after.vut}")
+
+
 def _of_two(before: Version, after: Version, source: str) -> Comparison:
     """Return the comparison of two versions that ran the same cases."""
     return Comparison((before, after), (_step((before, after), 1),), source)
-
-
-def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
-    """Compare a campaign with what another VUT does in its cases."""
-    version = Version.of(after)
-    earlier = Version(vut, None, before, after.tolerated, version.levels)
-    return _of_two(earlier, version, f"the cases come from the search of {after.vut}")
 
 
 def _check_comparable(a: Run, b: Run) -> None:
@@ -592,8 +589,5 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
         f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
         f"now alone fails may lie elsewhere: `{search}` searches there"
     )
-    return _of_two(
-        Version(run.vut, str(run.folder), before, run.tolerated, levels),
-        Version(settings.vut, None, after, run.tolerated, levels),
-        source,
-    )
+    earlier = Version(run.vut, str(run.folder), before, run.tolerated, levels)
+    return _of_two(earlier, replace(earlier, vut=settings.vut, folder=None, outcomes=after), source)

@@ -62,22 +62,14 @@ class Column:
         return f"level-{self.level} POV, {self.vut}"
 
 
-TABLE_II: Final = (
-    Column(
-        "design1",
-        0,
-        {"truth": 0.1296, "uniform": 0.0223, "annealing": 0.0497, "subset": 0.0830, "gpr": 0.1012},
-    ),
-    Column(
-        "design2",
-        1,
-        {"truth": 0.0849, "uniform": 0.0144, "annealing": 0.0184, "subset": 0.0445, "gpr": 0.0585},
-    ),
-    Column(
-        "design2",
-        2,
-        {"truth": 0.0073, "uniform": 0.0, "annealing": 0.0006, "subset": 0.0019, "gpr": 0.0032},
-    ),
+PAPERS: Final = ("truth", "uniform", "annealing", "subset", "gpr")
+TABLE_II: Final = tuple(
+    Column(vut, level, dict(zip(PAPERS, found, strict=True)))
+    for vut, level, found in (
+        ("design1", 0, (0.1296, 0.0223, 0.0497, 0.0830, 0.1012)),
+        ("design2", 1, (0.0849, 0.0144, 0.0184, 0.0445, 0.0585)),
+        ("design2", 2, (0.0073, 0.0, 0.0006, 0.0019, 0.0032)),
+    )
 )
 
 

@@ -16,7 +16,7 @@ from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.scenario.case import Case, FloatArray, MergeCase, from_unit
+from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.result import Result, Shown
@@ -29,8 +29,6 @@ CORRIDORS: Final = 4
 PLACES: Final = tuple(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
 """Cases in the unit square of the first two coordinates of a level-0 pool: where the POV starts and
 how fast, in a merge."""
-LONG_BEGIN_US: Final = 20e3
-"""A campaign of hundreds of cases feels it when an episode takes longer than this to begin."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
@@ -78,9 +76,6 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         first = _run(ground, cases)
         problems, differing = _errors(cases, first), list[_Difference]()
         if not problems:
-            meetings = _meetings(first)
-            cases += meetings
-            first += _run(ground, meetings)
             backwards = _run(ground, cases[::-1])[::-1]
             differing += _differences("the same cases in another order", first, backwards)
             alone = [_run(ground, [case])[0] for case in cases]
@@ -88,7 +83,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
             for corridor in range(ground.world.corridors):
                 ground.vut.begin(corridor, from_stand)
             differing += _differences("a reset too many", first, _run(ground, cases))
-        notes = _limits(first) + timed.long_begin()
+        notes = _limits(first)
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:
@@ -120,58 +115,17 @@ class _Timed(DriverWrapper):
     def __init__(self, driver: Driver) -> None:
         super().__init__(driver)
         self.us_per_step: list[float] = []
-        self.us_per_begin: list[float] = []
-        self._begun, self._begin_s = 0, 0.0
-
-    def begin(self, corridor: int, case: Case) -> None:
-        start = perf_counter()
-        self._driver.begin(corridor, case)
-        self._begun, self._begin_s = self._begun + 1, self._begin_s + perf_counter() - start
 
     def act(self, scene: Scene) -> FloatArray:
         start = perf_counter()
         answer = self._driver.act(scene)
         spent = perf_counter() - start
         self.us_per_step.append(spent * 1e6 / max(int(scene.active.sum()), 1))
-        if self._begun:  # a VUT in a process of its own is told so with the step
-            self.us_per_begin.append((spent + self._begin_s) * 1e6 / self._begun)
-        self._begun, self._begin_s = 0, 0.0
         return answer
-
-    def long_begin(self) -> list[str]:
-        """Return a sentence where an episode takes long to begin."""
-        us = statistics.median(self.us_per_begin)
-        if us < LONG_BEGIN_US:
-            return []
-        return [
-            f"An episode takes {us / 1e3:.0f} ms to begin: a Python class without `reset` is made "
-            "anew for each; with `reset(self, seen)` one object drives one episode after the other."
-        ]
 
 
 def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
     return [t for _, t in sorted(ground.run(cases), key=lambda pair: pair[0])]
-
-
-def _meetings(trajectories: Sequence[Trajectory]) -> list[Case]:
-    """Return, for each speed of the POV, the case in which the two would meet at M.
-
-    Other kinds of scenarios than merges have none.
-    """
-    nearest: dict[float, tuple[Trajectory, MergeCase]] = {}
-    for one in sorted(trajectories, key=lambda one: -abs(_gap_m(one))):
-        if isinstance(one.case, MergeCase):
-            nearest[one.case.v_pov0_mps] = one, one.case
-    meetings: list[Case] = []
-    for one, case in nearest.values():
-        low_m, high_m = case.scenario.bounds("x_pov0_m")
-        x_pov0_m = min(max(case.x_pov0_m - _gap_m(one), low_m), high_m)
-        meetings.append(replace(case, x_pov0_m=x_pov0_m))
-    return meetings
-
-
-def _gap_m(trajectory: Trajectory) -> float:
-    return float(trajectory.x_pov_m[-1] - trajectory.x_vut_m[-1])
 
 
 def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
