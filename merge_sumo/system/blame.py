@@ -37,12 +37,8 @@ class Blame(Generic[T]):
     ) -> bool:
         """Count a death; return whether the item is to blame. If not, it is to run again alone.
 
-        Args:
-            item: the work that was running.
-            alone: whether nothing ran beside it.
-            named: whether it is known that it was at work at that moment.
-            repeatable: whether it would do the same again: it hung, and did not die.
-            killed: whether SIGKILL ended it, as the kernel does that is short of memory.
+        `alone` is where nothing ran beside it, `named` where it is known to have been at work,
+        `repeatable` where it hung and would again, `killed` where SIGKILL ended it.
         """
         self._deaths[item] += alone or named
         most = MAX_KILLS if killed else MAX_DEATHS

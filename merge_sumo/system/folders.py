@@ -185,14 +185,14 @@ def make_folder(path: Path, option: str = "`out`") -> None:
 
 def make_place(folder: Path, option: str = "`out`") -> None:
     """Make a folder unless it is there; `UserError` where it cannot be."""
-    try:
-        check_place(folder, option)
-        if not folder.is_dir():
+    check_place(folder, option)
+    if not folder.is_dir():
+        try:
             make_folder(folder, option)
-    except UserError:
-        if folder.name in ("", "..") or not _is_folder(folder):
-            raise
-        check_place(folder, option)  # made by another process since
+        except UserError:
+            if not _is_folder(folder):
+                raise
+            check_place(folder, option)  # made by another process since
 
 
 def _remove_if_empty(folder: Path) -> None:

@@ -143,13 +143,8 @@ def check_fields(value: Any) -> None:
 def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
     """Return the lines of a JSON-lines file by their `index`; nothing without the file.
 
-    Args:
-        path: the file.
-        kind: a dataclass with an `index`.
-        indices: the indices that lines may have, each at most once.
-
-    Raises:
-        RecordError: with the number of a line that is something else.
+    Raises `RecordError` for a line that is no dataclass `kind` with one of the `indices`, or whose
+    index an earlier line has.
     """
     try:
         lines = regular(path).read_bytes().splitlines()

@@ -103,15 +103,12 @@ class Workers(AbstractContextManager["Workers"]):
         *,
         chunk: int | None = None,
     ) -> Generator[tuple[int, R], None, None]:
-        """Yield (place in `items`, result) as chunks end.
+        """Yield (place in `items`, result) as chunks of `chunk` items, or `chunk_size`, end.
 
-        Args:
-            function: gives one result for each item of a chunk. It goes to other processes, so it
-                is found by its name there, and it must be safe to run twice; what it raises, this
-                raises, and `UserError` when the executor goes away.
-            items: what to work on.
-            lost: gives the result of an item that is to blame for the deaths of its workers.
-            chunk: items in a chunk; by default `chunk_size`.
+        `function` gives one result for each item of a chunk, is found by its name in other
+        processes, and may run twice; what it raises, this raises, and `UserError` when the executor
+        goes away. `lost` gives the result of an item that is to blame for the deaths of its
+        workers.
         """
         chunks = cut(items, chunk or self.chunk_size(len(items)))
         for first, results in self.run_chunks(function, chunks, lost):
