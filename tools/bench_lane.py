@@ -92,7 +92,7 @@ def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
         crash = -reward.weights.crash / 2
         print(
             f"{place_m:7.0f} {regret.mean():12.1%} {np.quantile(regret, 0.99):12.1%}"
-            f"{reached.collided.mean():13.1%} {(best < crash).mean():13.1%}"
+            f"{(reached.safe < crash).mean():13.1%} {(best < crash).mean():13.1%}"
         )
 
     return means

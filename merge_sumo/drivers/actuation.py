@@ -56,8 +56,7 @@ class ActuatedDriver(DriverWrapper):
         lag_s = act.at_most("lag_s")
         decay = np.exp(-DT_S / lag_s) if lag_s > 0.0 else 0.0
         self._decay[corridor], self._mean[corridor] = decay, lag_s / DT_S * (1.0 - decay)
-        power = act.power_w_per_kg
-        self._power[corridor] = np.inf if power is None else act.at_most("power_w_per_kg")
+        self._power[corridor] = act.at_most("power_w_per_kg")
         self._a_min[corridor] = case.scenario.a_min_mps2
         self._a_max[corridor] = case.scenario.a_max_mps2
         self._commands[:, corridor] = self._a_mps2[corridor] = 0.0

@@ -59,8 +59,6 @@ class Plan(NamedTuple):
         t_s: time at which the VUT is at M; infinite where it never is.
         gap_m: |dx| less `dx_crash_m`.
         is_rear: whether the VUT is the rear vehicle.
-        v_rear_mps: speed of the rear vehicle.
-        v_front_mps: speed of the other one.
         conflict: whether the gap is negative or unsafe under the model.
     """
 

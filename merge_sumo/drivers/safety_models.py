@@ -27,9 +27,6 @@ class Pair(NamedTuple):
 
     Attributes:
         gap_m: between the rear bumper of the front vehicle and the front bumper of the rear one.
-        v_rear_mps: speed of the rear vehicle.
-        v_front_mps: speed of the front one.
-        a_rear_mps2: acceleration of the rear one.
     """
 
     gap_m: FloatArray
@@ -52,8 +49,6 @@ class SafetyModel(ABC):
         delay_steps: steps from the first risk to the first braking.
         delay_s: the same as the formulas have it.
         released_mps2: deceleration in the delay: the pedal is released.
-        growth_mps2: growth of the deceleration in a step.
-        hardest_mps2: hardest deceleration.
     """
 
     perception_steps: int = 0

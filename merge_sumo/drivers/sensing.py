@@ -69,10 +69,8 @@ class SensedDriver(DriverWrapper):
         self._drives_on_s[corridor] = (1.0 - share) * DT_S if share > 0.0 else 0.0
         self._noise[:, corridor] = sense.at_most("noise_x_m"), sense.at_most("noise_v_mps")
         self._dropout[corridor] = sense.at_most("dropout")
-        ranged, hidden = sense.range_m is not None, sense.occluded_until_m is not None
-        self._range_m[corridor] = sense.at_most("range_m") if ranged else np.inf
-        until_m = sense.at_most("occluded_until_m") if hidden else -np.inf
-        self._occluded_until_m[corridor] = until_m
+        self._range_m[corridor] = sense.at_most("range_m")
+        self._occluded_until_m[corridor] = sense.at_most("occluded_until_m", -np.inf)
         self._far_m[corridor] = far_m(scenario)
         self._level0[:, corridor] = scenario.level0_a_mps2, scenario.level0_v_mps
         if self._is_random:
@@ -87,15 +85,11 @@ class SensedDriver(DriverWrapper):
             self._measure(self._row + step, np.array([step]), np.array(state)[..., None], one)
         start = np.array((x_m, v_mps))[..., None]
         told = tuple(map(tuple, self._shown(self._row, start, one)[..., 0].T.tolist()))
-        seen = ToldCase(
-            level=case.level,
-            svo_rad=case.svo_rad,
-            v_vut0_mps=case.v_vut0_mps,
-            draw=case.draw,
-            scenario=scenario,
-            told=told,
-        )
-        self._driver.begin(corridor, seen)
+        same = {
+            name: getattr(case, name)
+            for name in ("level", "svo_rad", "v_vut0_mps", "draw", "scenario")
+        }
+        self._driver.begin(corridor, ToldCase(told=told, **same))
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the driver to what it sees, (K,)."""

@@ -41,9 +41,6 @@ class Episodes(Sequence[Episode]):
     """The episodes of a chunk of cases; they are measured when one of them is asked for.
 
     Attributes:
-        trajectories: what happened in each case.
-        files: files of the VUT, as of an `Episode`.
-        pov_files: those of a POV.
         in_sumo: places of the cases that SUMO ran; the engine of the plan may be another.
     """
 

@@ -57,9 +57,6 @@ class SimulationPlan:
     Attributes:
         scenario: the scenario, with its follow-up behind M.
         road: the road on which it takes place.
-        vut: makes the VUT.
-        povs: the drivers of the POV at each level.
-        criterion: what counts as a failure.
         engine: what moves the vehicles; campaigns take SUMO.
         corridors: the most episodes at a time in SUMO; decides no outcome.
         substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more

@@ -25,8 +25,6 @@ class Simulator:
 
     Attributes:
         world: that of SUMO, or of a subclass's engine.
-        vut: the driver of the VUT.
-        pov: the drivers of the mainline.
         in_sumo: places of the cases of the last `run` that SUMO ran.
     """
 

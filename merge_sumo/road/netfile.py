@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -180,6 +181,14 @@ class NetFile:
         """Return the error for a net that cannot be used."""
         return UserError(f"the net {self.path} cannot host a merge: {what}")
 
+    @contextmanager
+    def _numbers(self, what: str) -> Iterator[None]:
+        """Raise the error for what is no number in a block."""
+        try:
+            yield
+        except ValueError as error:
+            raise self.broken(f"{what} is no number ({error!s:.200})") from error
+
     def lanes_near(self, place: Point, distance_m: float) -> list[Lane]:
         """Return the lanes that begin or end within a distance of a point, those of roads first.
 
@@ -195,10 +204,8 @@ class NetFile:
         near = []
         for name, lane in lanes:
             points = lane.get("shape", "").split()
-            try:
+            with self._numbers(f"shape of lane {name}"):
                 ends = [_point(text) for text in points[:1] + points[-1:]]
-            except ValueError as error:
-                raise self.broken(f"shape of lane {name} is no number ({error!s:.200})") from error
             if any(math.dist(end, place) <= distance_m for end in ends):
                 near.append(self._lane(name))
         return near
@@ -206,12 +213,8 @@ class NetFile:
     def _lane(self, name: str) -> Lane:
         # A net may have 100,000 lanes, of which a merge needs ten.
         if name not in self._known:
-            lane = self._lane_elements[name]
-            try:
-                self._known[name] = _lane(lane)
-            except ValueError as error:
-                what = f"index, length, speed or shape of lane {name} is no number ({error!s:.200})"
-                raise self.broken(what) from error
+            with self._numbers(f"index, length, speed or shape of lane {name}"):
+                self._known[name] = _lane(self._lane_elements[name])
         return self._known[name]
 
     @cached_property
@@ -233,11 +236,8 @@ class NetFile:
         """Elements by the lanes that end there."""
         found: dict[str, etree._Element] = {}
         for element in self._root.iterfind("junction"):
-            try:
+            with self._numbers(f"a coordinate of junction {element.get('id')}"):
                 float(element.get("x", "")), float(element.get("y", ""))
-            except ValueError as error:
-                what = f"junction {element.get('id')} has a coordinate that is no number"
-                raise self.broken(f"{what} ({error!s:.200})") from error
             if element.get("type") != "internal":
                 found |= dict.fromkeys(element.get("incLanes", "").split(), element)
         return found
@@ -249,10 +249,8 @@ class NetFile:
             if target.startswith(":") or target not in self._lane_elements:
                 continue
             visibility = element.get("visibility")
-            try:
+            with self._numbers("the visibility of a connection"):
                 visibility_m = None if visibility is None else float(visibility)
-            except ValueError as error:
-                raise self.broken(f"a connection has visibility {visibility!r}") from error
             via, state = tuple(self._via(element)), element.get("state", "M")
             yield element, Link(source, self._lane(target), via, state, visibility_m)
 

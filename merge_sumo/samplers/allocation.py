@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 from merge_sumo.verdict.score import Outcome
@@ -11,14 +10,6 @@ from merge_sumo.verdict.score import Outcome
 def even_shares(proposed: Mapping[int, int], n: int) -> dict[int, int]:
     """Share `n` cases out evenly; remainders go to the levels with the fewest cases `proposed`."""
     return whole_shares(dict.fromkeys(proposed, 1.0), proposed, n)
-
-
-def softmax_shares(
-    failure_share: Mapping[int, float], proposed: Mapping[int, int], n: int, xi: float
-) -> dict[int, int]:
-    """Share `n` cases out in proportion to exp(xi U_k), U_k the failure share of level k."""
-    weights = {level: math.exp(xi * u) for level, u in failure_share.items()}
-    return whole_shares(weights, proposed, n)
 
 
 def whole_shares(

@@ -64,7 +64,6 @@ class SamplerContract:
 
     Attributes:
         sampler: the class under test.
-        pool: cases from which it chooses.
     """
 
     sampler: type[Sampler]

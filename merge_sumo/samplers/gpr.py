@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from typing import Any, Final
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from merge_sumo.samplers.allocation import last_failure_share, softmax_shares
+from merge_sumo.samplers.allocation import last_failure_share, whole_shares
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
@@ -56,8 +57,11 @@ class GprSampler(LevelwiseSampler):
         """Return equal shares first, then shares by the softmax of the last failure shares."""
         outcomes = self.observed()
         proposed = {level: self.proposed(level) for level in self.pool.levels}
-        shares = {level: last_failure_share(outcomes, level) for level in self.pool.levels}
-        return softmax_shares(shares, proposed, n, XI)
+        # In proportion to exp(xi U_k), U_k the failure share of level k.
+        weights = {
+            level: math.exp(XI * last_failure_share(outcomes, level)) for level in self.pool.levels
+        }
+        return whole_shares(weights, proposed, n)
 
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int

@@ -63,9 +63,11 @@ class Imperfection:
         """Fields that are coordinates of the pool."""
         return tuple(name for name, value in self._given() if isinstance(value, tuple))
 
-    def at_most(self, name: str) -> float:
-        """Return the largest value of a number that may be a range."""
-        value: Amount = getattr(self, name)
+    def at_most(self, name: str, default: float = math.inf) -> float:
+        """Return the largest value of a number that may be a range; the default without one."""
+        value: Amount | None = getattr(self, name)
+        if value is None:
+            return default
         return value[1] if isinstance(value, tuple) else value
 
     @classmethod

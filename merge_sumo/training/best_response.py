@@ -42,24 +42,19 @@ def best_response(game: Game, state: FloatArray) -> FloatArray:
     """Return the best returns, (n,), from states, (n, 4), against a level-0 opponent."""
     best = _simple_returns(game, state)
     if game.role == "pov":
-        for chunk in (slice(start, start + _CHUNK) for start in range(0, len(state), _CHUNK)):
-            best[chunk] = _best_of_povs(game, state[chunk], best[chunk])
+        for start in range(0, len(state), _CHUNK):
+            of_chunk = best[start : start + _CHUNK]  # a view, which `ended` writes
+
+            def ended(cases: IntArray, so_far: FloatArray, _: FloatArray) -> FloatArray:
+                np.maximum.at(of_chunk, cases, so_far)  # noqa: B023 (called in this round)
+                return of_chunk - game.reward.weights.gap  # noqa: B023
+
+            _follow(game, state[start : start + _CHUNK], ended)
     else:
         starts, of_start = np.unique(state[:, 2:], axis=0, return_inverse=True)
         for number in range(len(starts)):
             cases = of_start == number
             best[cases] = _best_of_vuts(game, state[cases], best[cases])
-    return best
-
-
-def _best_of_povs(game: Game, state: FloatArray, best: FloatArray) -> FloatArray:
-    """Return the best returns, (n,), given those of known ways."""
-
-    def ended(cases: IntArray, so_far: FloatArray, _: FloatArray) -> FloatArray:
-        np.maximum.at(best, cases, so_far)
-        return best - game.reward.weights.gap
-
-    _follow(game, state, ended)
     return best
 
 

@@ -21,6 +21,7 @@ from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
+from merge_sumo.verdict.score import is_close
 
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201
@@ -32,14 +33,11 @@ class PolicyCheck:
     """A driver beside its best response, over random cases of the pool.
 
     Attributes:
-        cases: number of cases.
         mean_return: mean return of the driver, played in SUMO.
-        mean_best: mean return of the best response.
         mean_level0: mean return of level-0 behaviour in the driver's place.
         mean_regret: mean of best - return, as a share of the mean gain of the best response over
             level-0 behaviour.
         p99_regret: 99th percentile of the same.
-        collisions: collisions of the driver.
         avoidable_collisions: those in cases where the best response has none.
     """
 
@@ -53,20 +51,12 @@ class PolicyCheck:
     avoidable_collisions: int
 
 
-@dataclass(frozen=True, slots=True)
-class Returns(RewardParts):
-    """Returns of n games in parts, (n,) each, and who collided."""
-
-    collided: np.ndarray
-
-
-def returns_of(trajectories: list[Trajectory], reward: Reward) -> Returns:
+def returns_of(trajectories: list[Trajectory], reward: Reward) -> RewardParts:
     """Return the reward parts of episodes that were played in SUMO.
 
     The accelerations that count are the commanded ones; at a stand, those that were possible.
     """
     parts = np.zeros((3, len(trajectories)))
-    collided = np.zeros(len(trajectories), dtype=bool)
     for n, trajectory in enumerate(trajectories):
         v_pov, a_pov = trajectory.v_pov_mps[:-1], trajectory.a_pov_mps2[:-1]
         v_vut, a_vut = trajectory.v_vut_mps[:-1], trajectory.a_vut_mps2[:-1]
@@ -77,8 +67,7 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> Returns:
             dx = np.array([x_pov - x_vut])
             parts[0, n] = reward.safety(dx, np.array([v_pov_end - v_vut_end]))[0]
             parts[2, n] += reward.vut_end(np.array([v_vut_end]))[0]
-            collided[n] = abs(dx[0]) < reward.scenario.dx_crash_m
-    return Returns(parts[0], parts[1], parts[2], collided)
+    return RewardParts(*parts)
 
 
 def play(
@@ -130,13 +119,13 @@ def check_network(
     level0 = Level0Pov if is_pov else Level0Vut
     other = opponent or (Level0Vut if is_pov else Level0Pov)
 
-    def returns(driver: type[Driver] | QNetwork) -> tuple[FloatArray, np.ndarray]:
-        pair = (driver, other) if is_pov else (other, driver)
-        got = returns_of(play(cases, *pair), reward)
-        return got.of(role, svo_rad), got.collided
+    def played(driver: type[Driver] | QNetwork) -> tuple[FloatArray, list[Trajectory]]:
+        trajectories = play(cases, *((driver, other) if is_pov else (other, driver)))
+        return returns_of(trajectories, reward).of(role, svo_rad), trajectories
 
-    reached, collided = returns(network)
-    unmoved, _ = returns(level0)
+    reached, trajectories = played(network)
+    collided = np.array([is_close(one) for one in trajectories])
+    unmoved, _ = played(level0)
     game = Game(role, opponent, reward, network.a_min_mps2)
     best = best_returns(game, network, cases, svo_rad)
     if opponent is not None:

@@ -66,12 +66,8 @@ class RefineSettings:
     value_share: float = 0.1  # weight of the fit of Q beside the cost of the choice
 
 
-@dataclass(frozen=True, slots=True)
-class _Starts:
-    """Starts of games: states, (n, 4), and psi, (n,)."""
-
-    state: FloatArray
-    svo_rad: FloatArray
+_Starts = tuple[FloatArray, FloatArray]
+"""Starts of games: states, (n, 4), and psi, (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,12 +83,8 @@ class _Tried:
     mean_return: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Labelled:
-    """States as the network sees them, (n, features), and what each action is worth, (n, 7)."""
-
-    inputs: np.ndarray
-    returns: np.ndarray
+_Labelled = tuple[np.ndarray, np.ndarray]
+"""States as the network sees them, (n, features), and what each action is worth, (n, 7)."""
 
 
 def refine(
@@ -140,17 +132,17 @@ def _starts(
     """Return the starts of the games of a round; the first are near hard starts, if any."""
     state = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
-    if hard is not None and len(hard.state):
-        which = rng.integers(0, len(hard.state), round(s.hard * s.searched))
+    if hard is not None and len(hard[0]):
+        which = rng.integers(0, len(hard[0]), round(s.hard * s.searched))
         # The VUT starts where it did: it is the POV's state and psi that make a case.
         shift = rng.normal(size=(3, len(which))) * s.near
-        near = hard.state[which]
+        near = hard[0][which]
         near[:, 0] += shift[0] * state[:, 0].std()
         near[:, 1] = np.maximum(near[:, 1] + shift[1] * state[:, 1].std(), 0.0)
-        psi = hard.svo_rad[which] + shift[2] * svo_rad.std()
+        psi = hard[1][which] + shift[2] * svo_rad.std()
         state[: len(which)] = near
         svo_rad[: len(which)] = psi.clip(SVO.low, SVO.high) * network.sees_svo
-    return _Starts(state, svo_rad)
+    return state, svo_rad
 
 
 def _label(
@@ -171,14 +163,14 @@ def _label(
     returns = np.max(of_holds, axis=0)
     row, action = np.arange(len(kept)), tried.action[kept]
     returns[row, action] = np.maximum(returns[row, action], tried.to_go[kept])
-    return _Labelled(inputs[kept].astype(np.float32), returns.astype(np.float32))
+    return inputs[kept].astype(np.float32), returns.astype(np.float32)
 
 
 def _try(
     game: Game, network: QNetwork, starts: _Starts, rng: np.random.Generator, s: RefineSettings
 ) -> _Tried:
     """Play by the policy, from half of the starts with random actions too, and what is found."""
-    start, svo_rad = starts.state, starts.svo_rad
+    start, svo_rad = starts
     policy, searched = greedy(network, game.scenario), slice(s.searched)
     found = beam_search(game, start[searched], svo_rad[searched], network, s.beam)
     state = np.concatenate([start, start[::2], start[searched]])
@@ -212,7 +204,7 @@ def _try(
         action=np.concatenate([step[2] for step in steps]),
         to_go=total[index] - np.concatenate([step[3] for step in steps]),
         better=better[index],
-        hard=_Starts(start[most], svo_rad[most]),
+        hard=(start[most], svo_rad[most]),
         mean_return=float(total[: len(start)].mean()),
     )
 
@@ -230,8 +222,7 @@ def _fit(
 
     `average` follows the weights of the model.
     """
-    inputs = torch.from_numpy(np.concatenate([r.inputs for r in rounds]))
-    returns = torch.from_numpy(np.concatenate([r.returns for r in rounds]))
+    inputs, returns = (torch.from_numpy(np.concatenate(of)) for of in zip(*rounds, strict=True))
     costs = (returns.max(dim=1, keepdim=True).values - returns).clamp(max=COST_CAP)
     values = squash(returns)
     last_costs = []

@@ -115,10 +115,7 @@ class Feature:
     """An axis of regions in words: a coordinate of the pool, or the time it makes for.
 
     Attributes:
-        name: its name.
-        unit: its unit.
         decimals: with which bounds are written.
-        value: returns the value of a case.
     """
 
     name: str
@@ -174,10 +171,7 @@ class FailureBox:
     """A region of the pool where at least half of the cases that ran failed.
 
     Attributes:
-        level: POV level.
-        bounds: its bounds.
         indices: cases of the run inside, by the bounds as written.
-        failures: number of failures among them.
     """
 
     level: int

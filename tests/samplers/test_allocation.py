@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.samplers.allocation import (
     even_shares,
     last_failure_share,
-    softmax_shares,
     whole_shares,
 )
 from merge_sumo.scenario.case import MergeCase
@@ -45,10 +42,6 @@ class TestByHand:
     def test_a_batch_smaller_than_the_levels_serves_the_neediest(self):
         assert even_shares({0: 5, 1: 2, 2: 9}, 1) == {0: 0, 1: 1, 2: 0}
         assert even_shares({0: 5, 1: 2, 2: 9}, 2) == {0: 1, 1: 1, 2: 0}
-
-    def test_a_failure_share_of_log_2_over_xi_doubles_the_cases(self):
-        share = {0: 0.0, 1: math.log(2.0) / 3.0}
-        assert softmax_shares(share, {0: 0, 1: 0}, 9, xi=3.0) == {0: 3, 1: 6}
 
 
 class TestShares:
