@@ -80,14 +80,3 @@ class TestWithoutOne:
 
 def test_behind_m_where_a_pov_may_get_it_goes_on(vut):
     assert vut.act(scene(0.0, 8.0, 40.0, 6.0))[0] == 1.0
-
-
-def test_corridors_do_not_know_of_each_other():
-    vut = GapAcceptanceVut(2)
-    for corridor in (0, 1):
-        vut.begin(corridor, CASE)
-    due = due_s(-50.0, 6.0)
-    x_pov_m = np.array([-8.0 * (due + 5.0), -8.0 * due])
-    both = (np.full(2, value) for value in (8.0, -50.0, 6.0))
-    seen = Scene.of_pair(np.ones(2, dtype=bool), np.zeros(2, dtype=int), x_pov_m, *both)
-    assert vut.act(seen).tolist() == [1.0, 0.0]

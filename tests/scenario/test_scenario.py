@@ -54,6 +54,8 @@ class TestAFile:
             ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose -20 to 0"),
             ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
+            ("headway_behind_s = [1.0, 4.0]", "(1.0, 4.0): choose both headways, or none"),
+            ("v_vut0_mps = [20.0, 20.0]", "v_vut0_mps is (20.0, 20.0): choose low < high"),
             ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
             ("name = 3", "name is 3: it must be a text"),
         ],
