@@ -84,17 +84,6 @@ def play(
     return [played[index] for index in sorted(played)]
 
 
-def check_cases(
-    name: str, count: int = CHECK_CASES, seed: int = CHECK_SEED, *, scenario: Scenario
-) -> list[Case]:
-    """Return random cases of the pool in which to check a network."""
-    rng = np.random.default_rng(seed)
-    level = 2 if name == "pov2" else 1
-    scenario = of_two(scenario)
-    points = rng.random((count, len(scenario.dimensions(level))))
-    return from_unit(points, level, scenario=scenario)
-
-
 def check_policy(
     name: str,
     folder: Path | None = None,
@@ -112,7 +101,9 @@ def check_network(
     name: str, network: QNetwork, opponent: QNetwork | None, reward: Reward, count: int
 ) -> PolicyCheck:
     """Compare a network with its best response; `opponent` is None for level 0."""
-    cases = check_cases(name, count, scenario=reward.scenario)
+    level, scenario = 2 if name == "pov2" else 1, of_two(reward.scenario)
+    points = np.random.default_rng(CHECK_SEED).random((count, len(scenario.dimensions(level))))
+    cases = from_unit(points, level, scenario=scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
     role: Role = "pov" if name.startswith("pov") else "vut"
     is_pov = role == "pov"
@@ -127,10 +118,14 @@ def check_network(
     collided = np.array([is_close(one) for one in trajectories])
     unmoved, _ = played(level0)
     game = Game(role, opponent, reward, network.a_min_mps2)
-    best = best_returns(game, network, cases, svo_rad)
-    if opponent is not None:
+    start = np.array([[x for at in case.starts() for x in at] for case in cases])
+    if opponent is None:
+        best = best_response(game, start)
+    else:
         # The driver's own games are some that a search may find.
-        best = np.maximum(best, reached)
+        searched = beam_search(game, start, svo_rad, network).returns
+        rolled_out = game.play(start, svo_rad, game.improved(greedy(network, game.scenario)))
+        best = np.maximum(np.maximum(searched, rolled_out), reached)
     gain = float((best - unmoved).mean())
     regret = (best - reached) / gain
     return PolicyCheck(
@@ -143,16 +138,3 @@ def check_network(
         collisions=int(collided.sum()),
         avoidable_collisions=int((collided & (best > -reward.weights.crash / 2)).sum()),
     )
-
-
-def best_returns(
-    game: Game, network: QNetwork, cases: list[Case], svo_rad: FloatArray
-) -> FloatArray:
-    """Return the returns of the best response to the opponent, (n,): see `best_response`."""
-    x_vut0 = game.scenario.x_vut0_m
-    start = np.array([[c.x_pov0_m, c.v_pov0_mps, x_vut0, c.v_vut0_mps] for c in cases])
-    if game.opponent is None:
-        return best_response(game, start)
-    searched = beam_search(game, start, svo_rad, network).returns
-    policy = greedy(network, game.scenario)
-    return np.maximum(searched, game.play(start, svo_rad, game.improved(policy)))
