@@ -470,7 +470,7 @@ class CheckScenario(Policies):
 
 @dataclass(frozen=True)
 class Train(Asked):
-    """Train the learned drivers in SUMO, level by level, and measure their regret.
+    """Train the learned drivers, level by level, and measure their regret in SUMO.
 
     The regret is the loss of a driver against its best response, as a share of the gain of the best
     response over level-0 behaviour. An interrupted training continues.

@@ -410,7 +410,7 @@ def check_scenario(asked: verbs.CheckScenario) -> Shown:
 
 @verb(verbs.Train)
 def train(asked: verbs.Train) -> PolicyChecks:
-    """Train the learned drivers in SUMO and return what each loses, by the name of the network."""
+    """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
     for package in ("torch", "gymnasium"):
         if find_spec(package) is None:
             raise UserError(

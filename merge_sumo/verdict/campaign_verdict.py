@@ -36,6 +36,7 @@ class Trouble:
     Attributes:
         end: VUT_ERROR, SIM_ERROR or TIMEOUT.
         message: what the first of them says, on one line, without characters that do not print.
+        cases: their indices, ascending.
     """
 
     end: End
@@ -53,6 +54,8 @@ class Verdict:
     """The outcome of the cases of a campaign in numbers.
 
     Attributes:
+        cases: cases that ran.
+        failures: cases that fail under the criterion.
         contacts: failures in which bodies touch.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.

@@ -35,6 +35,7 @@ class RunsOfCase:
     """The runs of one case that have a verdict.
 
     Attributes:
+        case: the case, at draw 0.
         outcomes: its runs, (n,), at least one, in the order in which they are recorded.
     """
 

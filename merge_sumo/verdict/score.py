@@ -180,7 +180,10 @@ class Outcome:
     """A case that was run: its place in the campaign, its measures, and what was predicted of it.
 
     Attributes:
+        index: its place in the campaign.
         batch: the batch in which it ran.
+        case: the case.
+        measures: what was measured.
         prediction: what was predicted of it; None without a prediction.
         margin: how far it is from failing under the campaign's criterion, below 0 where it fails,
             without a unit; by default that of the score P; None after an error.

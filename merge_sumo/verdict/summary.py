@@ -19,6 +19,10 @@ class LevelSummary:
     """The findings at one POV level.
 
     Attributes:
+        cases: cases that ran.
+        tested: cases in which the VUT reached the merge point.
+        failures: cases that fail under the criterion.
+        severities: cases by severity, those that occur.
         fmc: failure mode coverage in the level's unit cube; M(s, 0.05, -500) under the paper's
             criterion and in up to three coordinates.
         regions: groups of failures that are linked at the radius of FMC.
