@@ -37,7 +37,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.sumo import allowed, replay, replay_folder
+from merge_sumo.sumo import replay, replay_folder
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.system.resources import resource
 
@@ -221,13 +221,6 @@ class TestAScenario:
             (scenario / replay_folder.RECORD).write_bytes(whole)
         if found is not None:
             replay._fault_of_record(found)
-
-    @here
-    @given(data=st.data())
-    def test_with_spoilt_types(self, scenario, tmp_path, data):
-        path = tmp_path / replay_folder.TYPES
-        path.write_bytes(data.draw(some((scenario / replay_folder.TYPES).read_bytes())))
-        answer(lambda: replay._read(path, allowed.TYPES))
 
     @here
     @given(data=st.data())

@@ -154,18 +154,10 @@ class TestAnExport:
 OF_LEVEL_2 = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
 MOTIONS: dict[str, tuple[Case, Command, Command, int, End]] = {
     "a timeout": (at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT),
-    "a stand": (at_level_0(-200.0, 0.0, 0.0), lambda _: 1.0, lambda _: 2.0, 136, End.MERGED),
     "bodies that overlap": (at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED),
     "a fast POV": (at_level_0(-180.0, 35.0), lambda _: 2.0, lambda _: -4.0, 300, End.TIMEOUT),
     "no step": (at_level_0(-250.0, 30.0), constant, constant, 0, End.VUT_ERROR),
     "level 2": (OF_LEVEL_2, lambda s: (s // 5) % 7 - 4.0, lambda _: 1.0, 83, End.MERGED),
-    "a fast VUT": (
-        at_level_0(-300.0, 30.0, 45.0),
-        constant,
-        constant,
-        41,
-        End.MERGED,
-    ),
 }
 """Case, acceleration of the POV and of the VUT, steps and end."""
 

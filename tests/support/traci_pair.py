@@ -259,12 +259,6 @@ class Drive:
         self.session.put(self._states(a_mps2))
         self.real.simulationStep()
 
-    def place(self, x_m: list[float], v_mps: list[float]) -> None:
-        """Put the vehicles of the session somewhere else."""
-        self.x_m, self.v_mps = x_m, v_mps
-        self.session.step()
-        self.session.put(self._states(0.0))
-
     def speeds(self) -> tuple[float, float]:
         ours, real = self.both(lambda c: c.vehicle.getSpeed("vut"))
         return ours, real

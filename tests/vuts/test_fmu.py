@@ -127,19 +127,3 @@ def test_an_output_merge_is_whether_to_merge(unit, version, wish):
     assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
     assert vut.wishes().tolist() == [STAY, MERGE]
     vut.close()
-
-
-def test_an_output_merge_may_have_another_name_and_must_be_a_number_or_a_boolean(unit):
-    vut = in_process(f"fmu:{unit()}?merge=acceleration_mps2")(1)
-    begin(vut)
-    vut.act(on_lane([-51.0]))
-    assert vut.wishes().tolist() == [MERGE]
-    vut.close()
-    nan = unit(fault="u->v[5] = NAN; u->v[4] = 0.0; return 0;", wish="number")
-    vut = in_process(f"fmu:{nan}")(1)
-    begin(vut)
-    for _ in range(4):
-        answer = vut.act(on_lane([-51.0])._replace(v_mps=np.array([[31.0], [20.0]])))
-    assert np.isnan(answer)[0]
-    assert vut.reason(0) == "WrongAnswerError: wishes nan instead of a number, to merge or not"
-    vut.close()

@@ -25,7 +25,6 @@ SCRIPTS: dict[str, list[tuple]] = {
         (8, V, "setSpeed", 10.0),
         (12, V, "setMaxSpeed", 17.9),
     ],
-    "slowing down within a limit": [(0, V, "setDecel", 2.5), (0, V, "slowDown", 16.0, 1.5)],
     "an acceleration after another": [
         (0, V, "setAcceleration", 1.0, 0.5),
         (3, V, "setAcceleration", -2.0, 1.5),

@@ -78,12 +78,3 @@ class TestTheProtocol:
         session.results()
         session.step()
         assert "vut" in session.sumo.at_m
-
-    @given(st.binary(min_size=4, max_size=4))
-    def test_a_length_is_one_that_can_be_or_a_protocol_error(self, head):
-        announced = int.from_bytes(head, signed=True)
-        if 4 <= announced <= tp.MAX_MESSAGE_BYTES + 4:
-            assert tp.message_length(head) == announced - 4
-        else:
-            with pytest.raises(tp.ProtocolError, match=f"{announced} bytes was announced"):
-                tp.message_length(head)
