@@ -125,16 +125,13 @@ def avoidance(
         size = min(chunk, max(few, math.ceil(len(failing) / processes.count)))
         chunks = (failing[first : first + size] for first in range(0, len(failing), size))
         run_some = partial(run_counterfactuals, plan)
-        with closing(processes.run_chunks(run_some, chunks, _unknown)) as results:
+        # Nothing is known of a failure that ended every worker that ran it.
+        with closing(processes.run_chunks(run_some, chunks, lambda _: None)) as results:
             for _, some in results:
                 avoided += [one for one in some if one is not None]
                 on_part(done := done + len(some), len(failing))
                 check()
     return sorted(avoided, key=lambda one: one.index)
-
-
-def _unknown(_: Failure) -> None:
-    """Return nothing for a failure that ended every worker that ran it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -40,7 +40,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import Scenario, level_name
 from merge_sumo.studies.exposure import Distribution, read_distribution
-from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies.run_study import RunStudy, check_least
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.studies.surface import learn_surface
 from merge_sumo.studies.traffic import Traffic, named_traffic
@@ -235,7 +235,11 @@ def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) ->
     """
     levels, scenario = study.settings.levels, study.settings.scenario
     cases = DEFAULT_CASES[study.plan.engine] if asked.cases is None else asked.cases
-    _check(asked, cases)
+    check_least(asked, cases=1, seed=0)
+    if not 0.5 <= asked.confidence < 1.0:
+        raise UserError(f"`confidence` is {asked.confidence}: choose 0.5 or more, and below 1")
+    if asked.distribution is not None and asked.traffic is not None:
+        raise UserError("choose a distribution or a traffic: a traffic states its own")
     check_new_file(out)
     study.check_same_system()
     traffic = None if asked.traffic is None else named_traffic(str(asked.traffic))
@@ -280,21 +284,6 @@ def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) ->
     )
     write_new(out, to_json(result, indent=2))
     return result
-
-
-def _check(asked: verbs.Probability, cases: int) -> None:
-    if asked.distribution is not None and asked.traffic is not None:
-        raise UserError("choose a distribution or a traffic: a traffic states its own")
-    for name, number, fits, bounds in (
-        ("cases", cases, cases >= 1, "it must be 1 or more"),
-        (
-            *("confidence", asked.confidence, 0.5 <= asked.confidence < 1.0),
-            "choose 0.5 or more, and below 1",
-        ),
-        ("seed", asked.seed, asked.seed >= 0, "it must be 0 or more"),
-    ):
-        if not fits:
-            raise UserError(f"`{name}` is {number}: {bounds}")
 
 
 def expected_cells(study: RunStudy, stated: Distribution) -> list[Cells]:

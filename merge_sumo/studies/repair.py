@@ -44,7 +44,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, from_unit, to_unit
 from merge_sumo.studies.comparison import Comparison, compare_outcomes, cut, passes
-from merge_sumo.studies.run_study import OnPart, RunStudy
+from merge_sumo.studies.run_study import OnPart, RunStudy, check_least
 from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_json, to_plain
@@ -274,11 +274,7 @@ def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
     if not ranges:
         raise UserError("name what may change: `params` NAME=LOW..HIGH")
     # Today's values and both ends of each range are tried.
-    least = {"rounds": 1, "cases": 1, "seed": 0, "trials": 1 + 2 * len(ranges)}
-    for name, number in least.items():
-        given = getattr(asked, name)
-        if given is not None and given < number:
-            raise UserError(f"`{name}` is {given}: it must be {number} or more")
+    check_least(asked, rounds=1, cases=1, seed=0, trials=1 + 2 * len(ranges))
     return ranges
 
 

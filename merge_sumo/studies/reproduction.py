@@ -22,12 +22,11 @@ from merge_sumo.coverage.fmc import fmc
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import versions
 from merge_sumo.engine.povs import Povs
-from merge_sumo.errors import UserError
 from merge_sumo.samplers.gpr import predicted_margin
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import LEVELS, US23
-from merge_sumo.studies.run_study import OnPart
+from merge_sumo.studies.run_study import OnPart, check_least
 from merge_sumo.studies.sampler_study import SamplerRun, SamplerStudy, Study
 from merge_sumo.studies.truth import TRUTH_CASES
 from merge_sumo.system.records import to_plain
@@ -75,7 +74,7 @@ TABLE_II: Final = tuple(
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scale:
-    """How much is run. The default is the paper's; `UserError` for numbers that make none.
+    """How much is run. The default is the paper's.
 
     Attributes:
         seeds: runs of each sampler.
@@ -89,10 +88,6 @@ class Scale:
     batches: int = 20
     batch: int = 20
 
-    def __post_init__(self) -> None:
-        if self.seeds < 1:
-            raise UserError(f"`seeds` is {self.seeds}: it must be 1 or more")
-
 
 def quick(seeds: int) -> Scale:
     """Return a scale for a first look and for tests: it shows that all works, and no more."""
@@ -100,7 +95,8 @@ def quick(seeds: int) -> Scale:
 
 
 def scale_of(asked: verbs.Reproduce) -> Scale:
-    """Return the scale that a person asks for."""
+    """Return the scale that a person asks for; `UserError` for numbers that make none."""
+    check_least(asked, seeds=1)
     if asked.quick:
         return quick(2 if asked.seeds is None else asked.seeds)
     return Scale() if asked.seeds is None else Scale(seeds=asked.seeds)

@@ -19,6 +19,14 @@ OnPart = Callable[[str, int, int, str, str], None]
 """Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
 
 
+def check_least(asked: object, **least: int) -> None:
+    """Raise `UserError` for a number of what is asked, by its name, that is less than the least."""
+    for name, number in least.items():
+        given = getattr(asked, name)
+        if given is not None and given < number:
+            raise UserError(f"`{name}` is {given}: it must be {number} or more")
+
+
 @dataclass(frozen=True, slots=True)
 class RunStudy:
     """A recorded campaign, and how a study runs cases of it.

@@ -25,7 +25,7 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.run_study import OnPart
+from merge_sumo.studies.run_study import OnPart, check_least
 from merge_sumo.studies.truth import (
     DENSE_CASES,
     TRUTH_CASES,
@@ -121,8 +121,7 @@ def names_of(asked: verbs.Benchmark) -> list[str]:
     names = list(dict.fromkeys(map(str.strip, known)))
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
-    if asked.seeds < 1:
-        raise UserError(f"`seeds` is {asked.seeds}: it must be 1 or more")
+    check_least(asked, seeds=1)
     return names
 
 

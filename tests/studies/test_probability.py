@@ -239,7 +239,7 @@ class TestATraffic:
 
 
 def failure_probability(run, out, engine="kinematic", **other):
-    settings = settings_of(run.folder, run.settings)
+    settings = settings_of(run.folder, run.record)
     study = RunStudy(run, settings, resolve(settings).with_engine(engine))
     return failure_probability_of(study, verbs.Probability(run, **other), out)
 
