@@ -66,9 +66,8 @@ class Imperfection:
     def at_most(self, name: str, default: float = math.inf) -> float:
         """Return the largest value of a number that may be a range; the default without one."""
         value: Amount | None = getattr(self, name)
-        if value is None:
-            return default
-        return value[1] if isinstance(value, tuple) else value
+        largest = value[1] if isinstance(value, tuple) else value
+        return default if largest is None else largest
 
     @classmethod
     def parsed(cls, text: str, option: str) -> Self:

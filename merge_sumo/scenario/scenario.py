@@ -250,10 +250,11 @@ class Scenario:
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
         """Yield (field, whether it fits with the others, what would)."""
         v_vut0 = self.bounds("v_vut0_mps")
-        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, self._before_m
-        yield "v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, self._speeds
-        is_number = type(self.v_vut0_mps) is float
-        yield "v_vut0_mps", is_number or v_vut0[0] < v_vut0[1], "low < high"
+        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
+        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, before
+        fits = 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps
+        yield "v_vut0_mps", fits, f"between 0 and {self.v_start_max_mps:g}"
+        yield "v_vut0_mps", self.v_vut0_mps != (v_vut0[0], v_vut0[0]), "low < high"
         yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
         for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
             yield name, getattr(self, name) > 0.0, "above 0"
@@ -302,14 +303,6 @@ class Scenario:
         if self.place == "M":
             return text
         return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
-
-    @property
-    def _before_m(self) -> str:
-        return f"metres before M, -{self.reach_m:g} to 0, low < high"
-
-    @property
-    def _speeds(self) -> str:
-        return f"between 0 and {self.v_start_max_mps:g}"
 
     def bounds(self, name: str) -> Bounds:
         """Return the bounds of a number that may be a range; twice the number where it is none."""
@@ -440,9 +433,11 @@ class MergeScenario(Scenario):
         x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
         shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
         apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
-        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, self._before_m
+        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
+        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, before
         yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
-        yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, self._speeds
+        most = f"between 0 and {self.v_start_max_mps:g}"
+        yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, most
         has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
         yield "headway_behind_s", has_both, "both headways, or none"
         for name in ("headway_ahead_s", "headway_behind_s"):

@@ -47,7 +47,6 @@ class TestAFile:
         [
             ("x_pov0_m = [-180, -340]", "x_pov0_m is (-180.0, -340.0): choose metres before M"),
             ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
-            ("x_pov0_m = [-180, true]", "it must be two numbers"),
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': did you mean x_pov0_m"),
             ("v_vut0_mps = 99", "v_vut0_mps is 99.0: choose between 0 and 45"),
             ("v_vut0_mps = nan", "v_vut0_mps is nan: it must be finite"),
@@ -55,7 +54,6 @@ class TestAFile:
             ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
             ("headway_behind_s = [1.0, 4.0]", "(1.0, 4.0): choose both headways, or none"),
-            ("v_vut0_mps = [20.0, 20.0]", "v_vut0_mps is (20.0, 20.0): choose low < high"),
             ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
             ("name = 3", "name is 3: it must be a text"),
         ],
