@@ -206,13 +206,10 @@ def within(section: str, option: str, value: str) -> Edit:
 
 ADDITIONAL = {
     "edgeData": '<edgeData id="a" file="{VICTIM}" freq="1"/>',
-    "a socket of edgeData": '<edgeData id="a" file="{HOST}" freq="1"/>',
     "an e2 detector": '<e2Detector id="a" lane="ramp_0" pos="1" endPos="9" file="{VICTIM}"/>',
-    "an include": '<include href="{SECRET}"/>',
     "an include of an address": '<include href="http://{HOST}/a.xml"/>',
     "a flow without end": '<flow id="f" from="ramp" to="main_out" begin="0" end="1e9" '
     'period="0.001"/>',
-    "hidden text": '<![CDATA[<edgeData file="{VICTIM}"/>]]>',
     "an instruction": '<?include href="{SECRET}"?>',
 }
 """What an additional file, and so a net, may hold beside what is allowed: all of it is dropped."""
@@ -220,9 +217,7 @@ BOMBS = {
     "billion laughs": "<!DOCTYPE l [<!ENTITY a0 'ha'>"
     + "".join(f"<!ENTITY a{n} '{f'&a{n - 1};' * 10}'>" for n in range(1, 12))
     + "]>",
-    "quadratic": f"<!DOCTYPE l [<!ENTITY a11 '{'x' * 50_000}'>]>",
     "an external file": '<!DOCTYPE l [<!ENTITY a11 SYSTEM "file://{SECRET}">]>',
-    "an address": '<!DOCTYPE l [<!ENTITY a11 SYSTEM "http://{HOST}/x">]>',
     "a parameter entity": '<!DOCTYPE l [<!ENTITY % p SYSTEM "http://{HOST}/x.dtd"> %p;]>',
 }
 
@@ -239,16 +234,10 @@ def bomb(declaration: str) -> Edit:
 OF_A_KIND: dict[tuple[str, str], dict[str, Edit]] = {
     (CONFIG, IDENTICAL): {
         "a log in the configuration": within("report", "log", "{VICTIM}"),
-        "trips in the configuration": within("report", "tripinfo-output", "{UP}"),
         "a schema in the configuration": within("report", "save-schema", "{HOST}"),
-        "a state in the configuration": within("report", "save-state.files", "{NEW}"),
         "a remote port": within("time", "remote-port", "48173"),
         "a script of python": within("time", "python-script", "{SECRET}"),
-        "an additional file upwards": instead(
-            '"vehicles.add.xml,labels.add.xml"', '"../home/secret.xml"'
-        ),
         "a net elsewhere": instead('"us23.net.xml"', '"{SECRET}"'),
-        "a state to load": within("input", "load-state", "{SECRET}"),
         "no end": instead('<end value="9.9"/>', '<end value="1e15"/>'),
         **{f"{name} in the configuration": bomb(text) for name, text in BOMBS.items()},
     },
@@ -263,17 +252,15 @@ OF_A_KIND: dict[tuple[str, str], dict[str, Edit]] = {
     (TYPES, REFUSED): {
         **{
             f"a length {value} of a type": instead('length="5"', f'length="{value}"')
-            for value in ("nan", "1e300", "{SECRET}", "")
+            for value in ("nan", "{SECRET}")
         },
         "a colour that is a path": instead("0.90,0.62,0", "{SECRET}"),
         "a million types": added("<a/>" * 900_000),
-        "deeply nested types": added("<a>" * 5000 + "</a>" * 5000),
     },
     (LABELS, IDENTICAL): {
         "a picture in the labels": added('<poi id="a" x="0" y="0" imgFile="{SECRET}"/>'),
     },
     (VIEW, IDENTICAL): {
-        "a picture in the view": added('<decal file="{SECRET}"/>'),
         "a snapshot in the view": added('<snapshot file="{VICTIM}" time="1"/>'),
     },
     (CASE, IDENTICAL): {"a case that is no JSON": lambda _: "[" * 100_000},
@@ -287,33 +274,25 @@ OF_A_KIND: dict[tuple[str, str], dict[str, Edit]] = {
         "a lane in the other place": instead('lane="ramp_0"', 'lane="main_out_0"'),
     },
     (RECORD, REFUSED): {
-        "a third vehicle": instead('id="vut"', 'id="third"'),
         **{
             f"{column} {value} in the record": instead(f' {column}="', f' {column}="{value}" was="')
-            for column, value in (("x", "nan"), ("pos", "1e300"), ("speed", "nan"))
+            for column, value in (("x", "nan"), ("pos", "1e300"))
         },
         "a time in the far future": instead('time="0.10"', 'time="9e99"'),
         "no vehicle in a row": lambda text: re.sub(
             r'(time="2.00">).*?(</timestep>)', r"\1\2", text, flags=re.DOTALL
         ),
-        "a million rows": added('<timestep time="99"/>' * 190_000),
     },
     (NET, REFUSED): {
         "a net of a million edges": added('<edge id="e"/>' * 250_000),
-        "a deeply nested net": added("<edge>" * 1000 + "</edge>" * 1000),
         "a net with a long shape": added(
             f'<edge id="e"><lane id="e_0" shape="{"1,1 " * 50_000}"/></edge>'
         ),
         "a net with coordinates that are none": instead('x="2000.000000"', 'x="nan"'),
-        "a net with an infinite length": instead(' length="2000.000000"', ' length="inf"'),
         "a net with a projection of a file": instead('"!"', '"+proj=utm +nadgrids={SECRET}"'),
-        "a net with a projection of an address": instead('"!"', '"+init=http://{HOST}/epsg:1"'),
         "a net with a schema of its own": instead(SCHEMA, "http://{HOST}/net.xsd"),
         "a net with an id that is a path": instead('id="main_end"', 'id="../{SECRET}"'),
         "a net with an endless list of ids": instead('incLanes=""', f'incLanes="{"a" * 60_000}|"'),
-        "a net with an index of a billion": instead(
-            '<lane id="main_in_1" index="1"', '<lane id="main_in_1" index="1000000000"'
-        ),
     },
     (NET, IDENTICAL): {
         **{f"{name} in the net": added(text) for name, text in ADDITIONAL.items()},
@@ -352,7 +331,6 @@ IN_PLACE: dict[str, Callable[[Path], object]] = {
     "UTF-16": lambda path: path.write_text(path.read_text(), encoding="utf-16"),
     "NUL in the middle": lambda path: path.write_text(path.read_text().replace(">\n", ">\0\n")),
     "bytes of no text": lambda path: path.write_bytes(bytes(range(256)) * 100),
-    "nothing": lambda path: path.write_bytes(b""),
 }
 """Attacks that are no text, on a file of the folder."""
 FILES = {
@@ -387,8 +365,8 @@ def verdict(result: object) -> str:
 @pytest.mark.parametrize(
     "name",
     [
-        *(f"{what} in the configuration" for what in ("a log", "trips", "a schema")),
-        *("edgeData in the types", "a socket of edgeData in the types", "edgeData in the net"),
+        *("a log in the configuration", "a schema in the configuration"),
+        *("edgeData in the types", "edgeData in the net"),
         *("an e2 detector in the net", "a device of a type"),
     ],
 )
@@ -403,12 +381,10 @@ def test_plain_sumo_does_what_the_attack_wants(scene, name):
 
 
 SOME = [
-    name
-    if number % (3 if name in FILES else 6) == 0
-    else pytest.param(name, marks=pytest.mark.long)
+    name if number % 3 == 0 else pytest.param(name, marks=pytest.mark.long)
     for number, name in enumerate(ATTACKS)
 ]
-"""Each sixth text and each third file: attacks of a kind stand beside each other."""
+"""Each third: attacks of a kind stand beside each other."""
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -509,7 +485,6 @@ class TestTheProgramsThatAreStarted:
         monkeypatch.setattr(replay_module, "run_program", show)
         for name in (
             "a snapshot in the view",
-            "a picture in the view",
             "edgeData in the types",
             "a log in the configuration",
         ):

@@ -32,9 +32,9 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.workers import Workers
 from merge_sumo.training import helix
 
-NAMELESS = ["", ".", "./", "..", "../.", "./..", "../..", "theirs/..", "missing/../..", "here/.."]
-BELOW = ["file/new", "file/a/b", "to-file/new", "dangling/new", "loop/new", "pipe/new"]
-TOO_LONG = ["x" * 256, "é" * 128, "x" * 5000, "a/" + "y" * 256, "/".join(["d" * 200] * 30)]
+NAMELESS = ["", ".", "./..", "theirs/..", "missing/../.."]
+BELOW = ["file/new", "dangling/new", "loop/new", "pipe/new"]
+TOO_LONG = ["é" * 128, "/".join(["d" * 200] * 30)]
 NOT_SAYABLE = ["nul\0byte", "half\ud800"]
 """Only Python can say these."""
 ODD = [
@@ -173,7 +173,7 @@ def full(_: int) -> None:
 
 
 class TestAFolderOfFiles:
-    @pytest.mark.parametrize("file", ["case.json", "episode.fcd.xml", "replay.sumocfg"])
+    @pytest.mark.parametrize("file", ["case.json", "replay.sumocfg"])
     def test_whose_writer_is_killed_is_gone_on_with_and_nothing_is_hidden(
         self, run, tmp_path, file
     ):
@@ -264,7 +264,7 @@ OURS = {
 THEIRS: dict[str, Callable[[Path], object]] = {
     "a page": lambda path: path.write_text("<!doctype html><title>notes on merge-sumo</title>"),
     "a record": lambda path: path.write_text('{"mine": 1}\n'),
-    **{name: make for name, make in PLACES.items() if name not in ("a file", "a link to itself")},
+    **{name: PLACES[name] for name in ("a folder", "an empty folder", "a dangling link", "a pipe")},
 }
 
 
@@ -380,12 +380,13 @@ class TestAFolderOfPolicies:
         assert asked == [tmp_path / "new"] * 4, "two levels, twice"
 
 
-@pytest.mark.parametrize("name", [name for name in ODD if name.isprintable() or "\x1b" in name])
-def test_a_name_in_a_command_is_read_by_a_shell_as_it_is(name):
-    command = [shutil.which("bash") or "", "-c", f"printf '%s|' {quoted(name)} end"]
+def test_a_name_in_a_command_is_read_by_a_shell_as_it_is():
+    names = [name for name in ODD if name.isprintable() or "\x1b" in name]
+    words = [quoted(name) for name in names]
+    command = [shutil.which("bash") or "", "-c", f"printf '%s\\0' {' '.join(words)}"]
     done = subprocess.run(command, capture_output=True, check=True)
-    assert done.stdout == os.fsencode(name) + b"|end|"
-    assert printable(quoted(name)) == quoted(name)
+    assert done.stdout.split(b"\0")[:-1] == [os.fsencode(name) for name in names]
+    assert [printable(word) for word in words] == words
 
 
 class TestTheLinkToTheNewestRun:

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 SMALL = {"--cases": "20", "--seeds": "1", "--radius": "0.3"}
 MORE = {
     "benchmark": ["--cases", "20", "--truth-cases", "100"],
+    "probability": ["--cases", "40"],
     "repair": ["--trials", "8", "--rounds", "1", "--cases", "20"],
 }
 ELSEWHERE = {"train", "reproduce"}

@@ -110,11 +110,7 @@ class TestOtherCommands:
         "command",
         [
             ("campaign", "--vut", "design1"),
-            ("truth", "--vut", "design1", "--level", 0),
-            ("benchmark", "--vut", "design1", "--level", 0),
             ("reproduce", "--quick"),
-            ("vuts",),
-            ("check-vut", "design1"),
         ],
         ids=lambda command: command[0],
     )
@@ -159,8 +155,7 @@ class TestAFolder:
             run_campaign(settings(folder), tmp_path / "run")
         assert not (tmp_path / "run").exists()
 
-    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
-    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    @pytest.mark.parametrize(("name", "value"), [("pov1", np.nan), ("vut1", 1e39)])
     def test_with_a_weight_that_is_not_finite_is_refused(self, call, same, tmp_path, name, value):
         layers = [np.zeros((ACTIONS, FEATURES))]
         layers[0][3, 4] = value

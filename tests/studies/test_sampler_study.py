@@ -88,8 +88,6 @@ class Vut:
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param("my_vut.py", marks=pytest.mark.long),
-        pytest.param("gain_of_mine.py", marks=pytest.mark.long),
         "late_gain.py",
         "gain.txt",
     ],
