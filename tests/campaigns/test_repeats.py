@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from campaigning import campaign_settings, run_campaign
-from conftest import some
 from typer.testing import CliRunner
 
 import merge_sumo as ms
@@ -36,25 +35,10 @@ SHY = """
         return -2.0 if {remembered} and seen.v_vut_mps > 10.0 else 1.0
 """
 OWN = SHY.format(remember="self.shy = True", remembered="self.shy")
-FORGETS = "class Vut:\n    shy = False\n    def reset(self, seen):\n        pass\n" + OWN
-IN_ITS_CLASS = "class Vut:\n    shy = False\n" + SHY.format(
-    remember="Vut.shy = True", remembered="Vut.shy"
-)
 IN_ITS_MODULE = "import collections\nSEEN = collections.Counter()\nclass Vut:\n" + SHY.format(
     remember="SEEN['near'] += 1", remembered="SEEN['near'] % 7 == 3"
 )
-ATTRIBUTE = """
-def Vut(seen):
-    Vut.steps = getattr(Vut, "steps", 0) + 1
-    return 1.0 - 1e-6 * (Vut.steps > 3000)
-"""
 RANDOM = "import random\ndef Vut(seen):\n    return 1.0 + random.random() / 100.0\n"
-REMEMBERING = {
-    "forgets": FORGETS,
-    "class": IN_ITS_CLASS,
-    "module": IN_ITS_MODULE,
-    "attribute": ATTRIBUTE,
-}
 
 
 @pytest.fixture
@@ -74,9 +58,8 @@ def campaign(spec: str, folder: Path, workers: int = 1, **settings) -> Run:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", some(REMEMBERING, "module"))
-def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path, name):
-    spec, folder = vut(REMEMBERING[name]), tmp_path / "run"
+def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path):
+    spec, folder = vut(IN_ITS_MODULE), tmp_path / "run"
     arguments = ["campaign", "--vut", spec, "--level", "0", "--cases", "60", "--sampler"]
     arguments += ["uniform"]
     done = CliRunner().invoke(cli.app, [*arguments, "--out", str(folder), "-q"])

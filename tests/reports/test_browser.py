@@ -8,7 +8,6 @@ import json
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,6 @@ from merge_sumo.reports import report
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
 
-LONG = partial(pytest.param, marks=pytest.mark.long)
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
 
@@ -73,15 +71,9 @@ def chosen(page) -> int:
     return int(page.inner_text("#case-title").split()[1])
 
 
-NARROW = {"viewport": {"width": 380, "height": 800}}
-LOOKS = pytest.mark.parametrize(
-    "options", [NARROW, LONG({"color_scheme": "dark"})], ids=["narrow", "dark"]
-)
-
-
-@LOOKS
-def test_it_opens_without_a_complaint_and_fits_the_window(browser, made, options):
-    with shown(browser, made.folder / report.REPORT, **options) as page:
+def test_it_opens_without_a_complaint_and_fits_the_window(browser, made):
+    narrow = {"width": 380, "height": 800}
+    with shown(browser, made.folder / report.REPORT, viewport=narrow) as page:
         assert page.locator(".map .mark.fail").count() == len(failures(made.outcomes))
         width = page.evaluate("document.documentElement.scrollWidth")
         assert width <= page.viewport_size["width"]
@@ -138,9 +130,6 @@ def click(page, part: str) -> None:
     found.scroll_into_view_if_needed()
     box = found.bounding_box()
     page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-
-
-WIDE, PHONE = (1280, 900), (390, 800)
 
 
 def rows(page) -> list[int]:

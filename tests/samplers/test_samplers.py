@@ -18,14 +18,9 @@ from merge_sumo.verdict.score import Measures, Outcome
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
 POOLS = {
-    "2-d": Pool(levels=(0,), scenario=US23),
-    "3-d": Pool(levels=(2,), scenario=US23),
     "2-d and 3-d": Pool(levels=(0, 1, 2), scenario=US23),
     "4-d": Pool(levels=(0,), scenario=TRAFFIC),
-    "4-d and 5-d": Pool(levels=(1, 2), scenario=TRAFFIC),
-    "6-d": Pool(levels=(2,), scenario=replace(TRAFFIC, v_vut0_mps=(14.0, 22.0))),
 }
-LONG = ("2-d", "3-d", "4-d and 5-d", "6-d")
 
 
 @pytest.fixture(scope="module", params=sorted(SAMPLERS))
@@ -33,10 +28,7 @@ def name(request) -> str:
     return request.param
 
 
-@pytest.fixture(
-    scope="module",
-    params=[pytest.param(name, marks=pytest.mark.long) if name in LONG else name for name in POOLS],
-)
+@pytest.fixture(scope="module", params=POOLS)
 def pool(request) -> Pool:
     return POOLS[request.param]
 

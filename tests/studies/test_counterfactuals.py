@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from campaigning import campaign_settings, run_campaign
 from plans import plan_for
 
 from merge_sumo.campaigns.plan import resolve
@@ -34,8 +34,6 @@ from merge_sumo.studies.counterfactuals import (
 from merge_sumo.verdict.merge import brake_after_mps2
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
-
-LONG = pytest.mark.long
 
 
 def avoidance_of(run, workers=None, **other):
@@ -108,29 +106,11 @@ class TestEveryFailure:
             assert one.pov_careful == avoids
 
 
-FOLLOWED_UP = {"levels": (0,), "cases": 200, "follow_up_s": 3.0, "fail_when": "unsafe"}
-UNSAFE = {"levels": (0, 2), "cases": 300, "fail_when": "unsafe"}
-DRIVEN = [
-    pytest.param("design1", "us23", {"levels": (0,), "cases": 60}, 10),
-    pytest.param("design1", "us23", {"levels": (0, 1, 2), "cases": 400}, 100, marks=LONG),
-    pytest.param("design2", "us23", {"levels": (1, 2), "cases": 400}, 60, marks=LONG),
-    pytest.param("level0", "us23-traffic", {"levels": (0, 2), "cases": 200}, 60, marks=LONG),
-    pytest.param("level0", "roundabout", {"levels": (0, 1), "cases": 200}, 60, marks=LONG),
-    pytest.param("sumo:IDM", "us23", FOLLOWED_UP, 30, marks=LONG),
-    pytest.param("level0", "us23-lane", UNSAFE, 15, marks=LONG),
-    pytest.param("design1", "us23-lane-traffic", UNSAFE, 30, marks=LONG),
-]
-
-
-@pytest.mark.parametrize(("vut", "scenario", "settings", "at_least"), DRIVEN)
-def test_eq_4_alone_says_what_sumo_says(tmp_path, vut, scenario, settings, at_least):
-    settings, scenario = dict(settings), named_scenario(scenario)
-    if "follow_up_s" in settings:
-        scenario = replace(scenario, follow_up_s=settings.pop("follow_up_s"))
-    settings = CampaignSettings(vut=vut, scenario=scenario, batch=20, seed=1, **settings)
+def test_eq_4_alone_says_what_sumo_says(tmp_path):
+    settings = campaign_settings(vut="design1", cases=60, batch=20, seed=1)
     run = run_campaign(settings, tmp_path / "run")
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
-    assert len(failing) >= at_least
+    assert len(failing) >= 10
     plan = replace(resolve(settings), vut=VutFactory.of("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 CAMPAIGN: Final = "campaign --vut design1 --level 0 --sampler uniform --cases 60 --seed 1 --quiet"
-TRUTH: Final = "truth --vut design1 --level 0 --cases 300 --workers 1"
 BENCHMARK: Final = (
     "benchmark --vut design1 --level 0 --samplers uniform --seeds 1 --cases 40 --truth-cases 300 "
     "--workers 1"
