@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -47,6 +48,8 @@ def main() -> None:
     128 + its number.
     """
     prepare_streams()
+    for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     try:
         # From here on, so that no signal finds a temporary folder that nobody removes.
         with stopping_in_order():

@@ -297,7 +297,13 @@ class Search(Asked):
     """Which cases run."""
 
     sampler: str = option(DEFAULT_SAMPLER, str, "What chooses the cases: {samplers}.", EXPERTS)
-    cases: int = option(DEFAULT_CASES, int, "Number of test cases.", CASES)
+    cases: int | None = option(
+        None,
+        int,
+        "Number of test cases.",
+        CASES,
+        shown=f"until the search has converged, at most {DEFAULT_CASES}",
+    )
     batch: int | None = keyword(None, "Cases per batch; by default as many as the sampler wants.")
     in_flight: int | None = option(
         None,
@@ -321,7 +327,7 @@ class Search(Asked):
     stop_when_converged: bool = option(
         False,
         bool,
-        "Stop early when the last 100 cases have added less than 1 % to the coverage.",
+        "Stop before --cases when the last 100 cases have added less than 1 % to the coverage.",
         CASES,
         "--stop-when-converged",
     )

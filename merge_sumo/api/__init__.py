@@ -320,7 +320,7 @@ def repair(asked: verbs.Repair) -> RepairResult:
     with opened(where, plan) as workers, Bars(shown=where.progress) as bars:
 
         def fresh(spec: str, number: int) -> Run:
-            of_round = mending.fresh_settings(settings, asked, spec, number)
+            of_round = mending.fresh_settings(settings, before, asked, spec, number)
             to, total, number_of = (
                 folder / mending.CAMPAIGN.format(number),
                 of_round.cases,

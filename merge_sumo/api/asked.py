@@ -17,6 +17,7 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError
 from merge_sumo.options import (
+    DEFAULT_CASES,
     AnyPath,
     Asked,
     Execution,
@@ -126,6 +127,8 @@ def settings_for(
     if isinstance(asked, Campaign):
         against, workers = _earlier(asked, workers)
         fields |= asked.values(Search) | against
+        if asked.cases is None:
+            fields |= {"cases": DEFAULT_CASES, "stop_when_converged": True}
     scenario = scenario_of(asked.scenario, asked.values(OfScenario))
     folder = policies_folder(asked.policies, scenario)
     levels = parse_levels(str(asked.level), folder, scenario.levels, own=pov is not None)
@@ -170,6 +173,8 @@ def stated_again(
     if isinstance(asked, SearchOfTest):
         against, workers = _earlier(asked, workers)
         fields |= asked.stated(Search) | against
+        if asked.cases is not None:
+            fields["stop_when_converged"] = asked.stop_when_converged
     return fields, _where(asked, workers)
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import ParamSpec, TypeVar
 
+from threadpoolctl import threadpool_limits
+
 from merge_sumo.help_texts import with_names
 from merge_sumo.options import Asked
 from merge_sumo.system.suggestions import nearest
@@ -35,7 +37,9 @@ def verb(record: Callable[P, A]) -> Callable[[Callable[[A], R]], Callable[P, R]]
                 )
             asked = record(*args, **given)
             object.__setattr__(asked, "given", frozenset(given))
-            return do(asked)
+            # One thread: products are small, and the cores are for workers.
+            with threadpool_limits(1):
+                return do(asked)
 
         call.__name__, call.__qualname__, call.__module__ = (
             do.__name__,

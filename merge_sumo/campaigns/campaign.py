@@ -198,10 +198,10 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
         known = recorded.get(name) or {}
         record[name] = files_now(known, record[name] or {}) or None
     # Which cases come next does not depend on how many there are to be.
-    cases = recorded.get("cases")
-    grown = isinstance(cases, int) and cases < settings.cases
+    ended = before.settings.stop_when_converged and not settings.stop_when_converged
+    grown = before.settings.cases < settings.cases or ended
     if grown:
-        recorded["cases"] = settings.cases
+        recorded |= {"cases": settings.cases, "stop_when_converged": settings.stop_when_converged}
     changes = differences(RECORDED_BY_DEFAULT | recorded, record)
     if before.criterion != settings.criterion:
         raise UserError(

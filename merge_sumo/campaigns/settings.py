@@ -15,7 +15,7 @@ from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
-from merge_sumo.options import Limits, Search
+from merge_sumo.options import DEFAULT_CASES, Limits, Search
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -36,6 +36,7 @@ class CampaignSettings(Search, Limits):
 
     vut: str
     levels: tuple[int, ...]
+    cases: int = DEFAULT_CASES
     policies: str | None = None
     pov: str | None = None
     against: str | None = None

@@ -279,13 +279,13 @@ def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
 
 
 def fresh_settings(
-    today: CampaignSettings, asked: verbs.Repair, spec: str, number: int
+    today: CampaignSettings, before: Run, asked: verbs.Repair, spec: str, number: int
 ) -> CampaignSettings:
     """Return the settings of the fresh campaign of a round: another seed, and no earlier lesson.
 
-    `today` are those of the campaign before.
+    `today` are those of the campaign `before`.
     """
-    cases = today.cases if asked.cases is None else asked.cases
+    cases = len(before.outcomes) if asked.cases is None else asked.cases
     few: dict[str, Any] = {
         name: None if (known := getattr(today, name)) is None or known > cases else known
         for name in ("batch", "in_flight")

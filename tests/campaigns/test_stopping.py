@@ -7,9 +7,11 @@ from typing import Any
 
 from campaigning import run_campaign
 
+from merge_sumo import api
 from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, has_converged
+from merge_sumo.options import DEFAULT_CASES
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -60,3 +62,20 @@ def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(
     text = (tmp_path / "whole" / "outcomes.jsonl").read_bytes()
     assert text.startswith((tmp_path / "early" / "outcomes.jsonl").read_bytes())
     assert json.loads((tmp_path / "early" / "campaign.json").read_text())["stop_when_converged"]
+
+
+def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may_go_on(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(stopping, "WINDOW", 20)
+    plan: dict[str, Any] = {"level": 0, "sampler": "annealing", "progress": False}
+    run = api.campaign("design1", **plan, out=tmp_path / "run")
+    assert run.converged
+    assert 20 < len(run.run.outcomes) < DEFAULT_CASES
+    assert any("stopped after" in line for line in run.lines())
+    more = api.resume(run, cases=len(run.run.outcomes) + 40, progress=False)
+    whole = api.campaign("design1", cases=len(more.run.outcomes), **plan, out=tmp_path / "whole")
+    assert not more.converged
+    assert len(whole.run.outcomes) == len(run.run.outcomes) + 40
+    texts = [(one.folder / "outcomes.jsonl").read_bytes() for one in (more, whole)]
+    assert texts[0] == texts[1]
