@@ -23,6 +23,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
+from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.system.folders import TakenError, check_new, check_own
@@ -229,13 +230,18 @@ def _run(
     begin: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
-    scheduler = _scheduler(campaign, earlier, on_case)
-    if earlier is None:
-        run = scheduler.run(partial(evaluate_chunks, campaign.plan, workers=workers), workers)
-    else:
-        both = partial(evaluate_both, campaign.plan, earlier.plan, workers)
-        run = scheduler.run(both, workers, whole=True)
-    with closing(run):
+    sampler = _sampler(campaign, earlier)
+    two = earlier is None and workers.count > 1
+    with ExitStack() as opened:
+        if two:
+            opened.enter_context(sampler.two_processes())
+        scheduler = _scheduler(sampler, campaign, earlier, on_case)
+        if earlier is None:
+            run = scheduler.run(partial(evaluate_chunks, campaign.plan, workers=workers), workers)
+        else:
+            both = partial(evaluate_both, campaign.plan, earlier.plan, workers)
+            run = scheduler.run(both, workers, whole=True)
+        opened.enter_context(closing(run))
         begin()
         for groups in run:
             if earlier is not None:
@@ -252,12 +258,18 @@ def _run(
     return done
 
 
-def _scheduler(campaign: _Version, earlier: _Version | None, on_case: OnCase) -> Scheduler:
-    """Return the scheduler of a campaign, which knows what ran before."""
+def _sampler(campaign: _Version, earlier: _Version | None) -> Sampler:
+    """Return the sampler of a campaign, which was told nothing."""
     settings, twin = campaign.settings, twin_of(campaign.settings, campaign.plan)
     predictor = twin if earlier is None else TwinPair(twin, twin_of(settings, earlier.plan))
-    sampler = settings.with_repeats(settings.new_sampler(predictor))
-    motion = sampler.uses_predictions
+    return settings.with_repeats(settings.new_sampler(predictor))
+
+
+def _scheduler(
+    sampler: Sampler, campaign: _Version, earlier: _Version | None, on_case: OnCase
+) -> Scheduler:
+    """Return the scheduler of a campaign, which knows what ran before."""
+    settings, motion = campaign.settings, sampler.uses_predictions
     history = campaign.history(motion=motion)
     if earlier is not None:
         old = earlier.history(motion=motion)

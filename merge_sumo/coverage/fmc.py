@@ -20,6 +20,7 @@ much of such a layer takes about as many balls.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -103,9 +104,13 @@ def fmc(points: ArrayLike, radius: float | None = None) -> float:
     cases = _checked(points, radius)
     dimension = cases.shape[1]
     unit = radius_for(dimension) if radius is None else radius
-    centres = _in_radii(cases, unit)
-    if len(centres) == 0:
-        return 0.0
+    return _volume(cases.tobytes(), dimension, float(unit)) if len(cases) else 0.0
+
+
+@lru_cache(maxsize=256)
+def _volume(cases: bytes, dimension: int, unit: float) -> float:
+    """Return the volume of the union: a search that goes on asks for that of its beginning."""
+    centres = _in_radii(np.frombuffer(cases).reshape(-1, dimension), unit)
     if dimension == 1:
         volume = 2.0 + float(np.minimum(np.diff(centres[:, 0]), 2.0).sum())
     elif dimension == 2:

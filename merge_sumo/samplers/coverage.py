@@ -8,6 +8,8 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import partial
 from typing import Final
 
@@ -18,6 +20,7 @@ from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration, nearness
+from merge_sumo.samplers.beside import CopyBeside
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.gpr import exploiting
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
@@ -26,6 +29,7 @@ from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.verdict.prediction import Prediction
+from merge_sumo.verdict.score import Outcome
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -59,9 +63,34 @@ class CoverageSampler(Sampler):
     uses_predictions = True
     overlaps = True
 
+    _beside: CopyBeside | None = None
+
+    @contextmanager
+    def two_processes(self) -> Iterator[None]:
+        """Search some of the levels in a second process."""
+        if self.predictor is None or len(self.pool.levels) < 2:
+            yield
+            return
+        with closing(CopyBeside(self)) as self._beside:
+            yield
+        self._beside = None
+
+    def tell(
+        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
+    ) -> None:
+        """Take outcomes, also for what searches beside."""
+        super().tell(outcomes, motions)
+        if self._beside is not None:
+            self._beside.tell(outcomes, motions)
+
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
-        proposals = self._search(n)
+        *others, last = self.pool.levels
+        if self._beside is not None:
+            self._beside.ask(others, n, self._pending)
+        proposals = self.search([last], n)
+        answer = None if self._beside is None else self._beside.answer()
+        proposals |= self.search(others, n) if answer is None else answer
         shares = self._shares(proposals, n)
         self._predictions = [
             prediction
@@ -88,15 +117,15 @@ class CoverageSampler(Sampler):
         most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
         return max(most, a_level * levels)
 
-    def _search(self, n: int) -> dict[int, Proposal]:
-        """Return a batch of each level.
+    def search(self, levels: Sequence[int], n: int) -> dict[int, Proposal]:
+        """Return a batch of each of some levels.
 
         Their searches go in step, so that the predictor answers all of them at once.
         """
         from threadpoolctl import threadpool_limits
 
         proposals: dict[int, Proposal] = {}
-        searches = {level: self._propose(level, n) for level in self.pool.levels}
+        searches = {level: self._propose(level, n) for level in levels}
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
             answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
@@ -112,7 +141,7 @@ class CoverageSampler(Sampler):
                 if queries and self.predictor is not None:
                     gaps = self.predictor.predict(list(queries.values()))
                     answers.update(zip(queries, gaps, strict=True))
-        return {level: proposals[level] for level in self.pool.levels}
+        return proposals
 
     def _propose(self, level: int, n: int) -> Asking[Proposal]:
         history, rng, pending = self.history(level), self.rng(level), self.pending(level)

@@ -1,0 +1,69 @@
+"""A copy of a sampler in a process of its own, which searches some levels meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Future
+from copy import deepcopy
+from typing import TYPE_CHECKING, Any, Final
+
+from merge_sumo.samplers.greedy import Proposal
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.system.workers import LocalProcesses
+from merge_sumo.verdict.score import Outcome
+
+if TYPE_CHECKING:
+    from merge_sumo.samplers.coverage import CoverageSampler
+
+Proposals = dict[int, Proposal]
+_copies: Final[list[CoverageSampler]] = []
+"""The copy, in its process."""
+
+
+class CopyBeside:
+    """Tells the copy what the sampler is told, and asks it; to be used in `with`.
+
+    Proposals of a level follow from what was told alone, so it makes no difference where they are
+    made. Where the process has ended, nothing is answered.
+    """
+
+    def __init__(self, sampler: CoverageSampler) -> None:
+        """Take a sampler that was told nothing."""
+        self._process = LocalProcesses(1, "merge_sumo.twin.experts")
+        # It travels some time from now, when the sampler may have been told something.
+        self._process.submit(_keep, deepcopy(sampler))
+        self._asked: Future[Proposals] | None = None
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
+        """Tell what the sampler is told."""
+        self._submit("tell", outcomes, motions)
+
+    def ask(self, levels: Sequence[int], n: int, pending: Sequence[Case]) -> None:
+        """Ask for `n` cases of each of some levels; `answer` waits for them."""
+        self._submit("pend", pending)
+        self._asked = self._submit("search", levels, n)
+
+    def answer(self) -> Proposals | None:
+        """Return what was asked for."""
+        try:
+            return None if self._asked is None else self._asked.result()
+        except BrokenExecutor:
+            return None
+
+    def _submit(self, method: str, *arguments: Any) -> Future[Any] | None:
+        try:
+            return self._process.submit(_do, method, *arguments)
+        except BrokenExecutor:
+            return None
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.shutdown(cancel_futures=True)
+
+
+def _keep(sampler: CoverageSampler) -> None:
+    _copies.append(sampler)
+
+
+def _do(method: str, *arguments: Any) -> Any:
+    return getattr(_copies[0], method)(*arguments)
