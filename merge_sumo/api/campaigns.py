@@ -105,7 +105,7 @@ def _write_findings(
         known := avoidance(done, plan, workers=workers, check=check, on_part=careful)
     ):
         AVOIDANCE.write_lines(done.folder, known)
-    note_explanation(done, plan, workers=workers, check=check)
+    note_explanation(done, plan, check=check)
     link_latest(done.folder)
     write_report(done, result.summary, counted("surrogates of the report", "levels"))
 

@@ -50,6 +50,7 @@ TOLD: Final = {
     "cases with contact that are no failures",
     "cases that ran more than once",
     "failures that ran too seldom to tell",
+    "failures that reference drivers drove",
     "failures that driver careful avoids",
     "failures that a careful POV avoids",
 }

@@ -14,9 +14,11 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
 from merge_sumo.reports.report import REPORT, RunningReport
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.chance import one_per_case
+from merge_sumo.verdict.diagnosis import failure_boxes
 from merge_sumo.verdict.score import Outcome
 
 PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
@@ -27,6 +29,8 @@ LINE_S: Final = 1.0
 """Seconds between two of these lines, at least."""
 FRESH_S: Final = 0.25
 """Seconds for which what a terminal shows may be old."""
+FIRST_ANSWER: Final = 100
+"""Cases after which a campaign of more says where failures lie so far."""
 SLOW_S: Final = 60.0
 """Seconds after which a line stands whatever has ended."""
 
@@ -188,6 +192,8 @@ class CampaignBars(Bars):
         """Count a case."""
         self._outcomes.append(outcome)
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
+        if len(self._outcomes) == FIRST_ANSWER < self._cases:
+            self._say_where()
         self._report.rewrite()
 
     def ran_before(self, outcome: Outcome) -> None:
@@ -195,6 +201,15 @@ class CampaignBars(Bars):
         self._outcomes.append(outcome)
         bar = self._bars.setdefault("cases", _Bar(self._cases, 0.0))
         bar.before, bar.start_s = len(self._outcomes), time.monotonic()
+
+    def _say_where(self) -> None:
+        """Say where the failures so far lie, in the largest region of each level."""
+        cases = one_per_case(self._outcomes, self._tolerated)
+        self.say(f"so far {judge(cases).counts}")
+        for level in sorted({outcome.case.level for outcome in cases}):
+            for box in failure_boxes(cases, level)[:1]:
+                inside = f"{box.failures} of {counted(box.cases, 'case')} fail"
+                self.say(f"  POV level {level_name(level)}, {box.where}: {inside}")
 
     def _found(self) -> str:
         return ", ".join(judge(one_per_case(self._outcomes, self._tolerated)).found)

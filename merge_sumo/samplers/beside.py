@@ -24,14 +24,14 @@ class CopyBeside:
     """Tells the copy what the sampler is told, and asks it; to be used in `with`.
 
     Proposals of a level follow from what was told alone, so it makes no difference where they are
-    made. Where the process has ended, nothing is answered.
+    made. Where the process is not there, nothing is answered.
     """
 
     def __init__(self, sampler: CoverageSampler) -> None:
         """Take a sampler that was told nothing."""
         self._process = LocalProcesses(1, "merge_sumo.twin.experts")
         # It travels some time from now, when the sampler may have been told something.
-        self._process.submit(_keep, deepcopy(sampler))
+        self._there: Future[None] = self._process.submit(_keep, deepcopy(sampler))
         self._asked: Future[Proposals] | None = None
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
@@ -39,9 +39,14 @@ class CopyBeside:
         self._submit("tell", outcomes, motions)
 
     def ask(self, levels: Sequence[int], n: int, pending: Sequence[Case]) -> None:
-        """Ask for `n` cases of each of some levels; `answer` waits for them."""
-        self._submit("pend", pending)
-        self._asked = self._submit("search", levels, n)
+        """Ask for `n` cases of each of some levels; `answer` waits for them.
+
+        Nothing is asked before the process is there: it takes longer to start than to search.
+        """
+        self._asked = None
+        if self._there.done() and self._there.exception() is None:
+            self._submit("pend", pending)
+            self._asked = self._submit("search", levels, n)
 
     def answer(self) -> Proposals | None:
         """Return what was asked for."""
