@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -103,12 +103,13 @@ def run_campaign(
     check_new(folder / SCENARIOS / case_name(settings.cases))
     versions = _versions(folder, settings, plan, workers)
     with workers_or_here(workers) as available, ExitStack() as opened:
+        sampler = opened.enter_context(_searching(versions, available))
         for one in versions:
             open_simulators(one.plan, available, first=settings.in_flight is not None)
         for one in versions:
             journal = Journal.create(one.folder, record_of(one.settings, one.plan))
             one.journal = opened.enter_context(journal)
-        return _run(*versions, workers=available, on_case=on_case, check=check, begin=begin)
+        return _run(sampler, versions, available, on_case, check, begin)
 
 
 def resume_campaign(
@@ -162,7 +163,8 @@ def resume_campaign(
                 one.journal.rewrite_settings(rewritten)
         for outcome in campaign.outcomes:
             on_before(outcome)
-        return _run(*versions, workers=available, on_case=on_case, check=check, begin=begin)
+        sampler = opened.enter_context(_searching(versions, available))
+        return _run(sampler, versions, available, on_case, check, begin)
 
 
 def _versions(
@@ -221,27 +223,22 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
 
 
 def _run(
-    campaign: _Version,
-    earlier: _Version | None = None,
-    *,
+    sampler: Sampler,
+    versions: Sequence[_Version],
     workers: Workers,
     on_case: OnCase,
     check: Callable[[], None],
     begin: Callable[[], None],
 ) -> Run:
     """Run what is missing of a campaign, then some cases a second time; export the worst."""
-    sampler = _sampler(campaign, earlier)
-    two = earlier is None and workers.count > 1
-    with ExitStack() as opened:
-        if two:
-            opened.enter_context(sampler.two_processes())
-        scheduler = _scheduler(sampler, campaign, earlier, on_case)
-        if earlier is None:
-            run = scheduler.run(partial(evaluate_chunks, campaign.plan, workers=workers), workers)
-        else:
-            both = partial(evaluate_both, campaign.plan, earlier.plan, workers)
-            run = scheduler.run(both, workers, whole=True)
-        opened.enter_context(closing(run))
+    campaign, earlier = versions[0], versions[1] if len(versions) > 1 else None
+    scheduler = _scheduler(sampler, campaign, earlier, on_case)
+    if earlier is None:
+        run = scheduler.run(partial(evaluate_chunks, campaign.plan, workers=workers), workers)
+    else:
+        both = partial(evaluate_both, campaign.plan, earlier.plan, workers)
+        run = scheduler.run(both, workers, whole=True)
+    with closing(run):
         begin()
         for groups in run:
             if earlier is not None:
@@ -258,11 +255,19 @@ def _run(
     return done
 
 
-def _sampler(campaign: _Version, earlier: _Version | None) -> Sampler:
-    """Return the sampler of a campaign, which was told nothing."""
-    settings, twin = campaign.settings, twin_of(campaign.settings, campaign.plan)
-    predictor = twin if earlier is None else TwinPair(twin, twin_of(settings, earlier.plan))
-    return settings.with_repeats(settings.new_sampler(predictor))
+@contextmanager
+def _searching(versions: Sequence[_Version], workers: Workers) -> Iterator[Sampler]:
+    """Give the sampler of a campaign, which was told nothing.
+
+    Where there are workers it may search in a second process.
+    """
+    settings = versions[0].settings
+    twins = [twin_of(settings, one.plan) for one in versions]
+    predictor = twins[0] if len(twins) == 1 else TwinPair(*twins)
+    sampler = settings.with_repeats(settings.new_sampler(predictor))
+    two = len(twins) == 1 and workers.count > 1
+    with sampler.two_processes() if two else nullcontext():
+        yield sampler
 
 
 def _scheduler(
