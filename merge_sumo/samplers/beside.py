@@ -21,7 +21,7 @@ _copies: Final[list[CoverageSampler]] = []
 
 
 class CopyBeside:
-    """Tells the copy what the sampler is told, and asks it; to be used in `with`.
+    """Tells the copy what the sampler is told, and asks it; to be closed.
 
     Proposals of a level follow from what was told alone, so it makes no difference where they are
     made. Where the process is not there, nothing is answered.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Final
 
@@ -67,13 +67,16 @@ class CoverageSampler(Sampler):
 
     @contextmanager
     def two_processes(self) -> Iterator[None]:
-        """Search some of the levels in a second process."""
-        if self.predictor is None or len(self.pool.levels) < 2:
+        """Search some of the levels in a second process, if the system lets one start."""
+        if self.predictor is not None and len(self.pool.levels) > 1:
+            with suppress(OSError, RuntimeError):
+                self._beside = CopyBeside(self)
+        try:
             yield
-            return
-        with closing(CopyBeside(self)) as self._beside:
-            yield
-        self._beside = None
+        finally:
+            beside, self._beside = self._beside, None
+            if beside is not None:
+                beside.close()
 
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
