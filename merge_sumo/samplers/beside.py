@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future
 from copy import deepcopy
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
+from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.system.workers import LocalProcesses
 from merge_sumo.verdict.score import Outcome
 
-if TYPE_CHECKING:
-    from merge_sumo.samplers.coverage import CoverageSampler
-
 Proposals = dict[int, Proposal]
-_copies: Final[list[CoverageSampler]] = []
+_copies: Final[list[Sampler]] = []
 """The copy, in its process."""
 
 
@@ -27,9 +25,9 @@ class CopyBeside:
     made. Where the process is not there, nothing is answered.
     """
 
-    def __init__(self, sampler: CoverageSampler) -> None:
+    def __init__(self, sampler: Sampler) -> None:
         """Take a sampler that was told nothing."""
-        self._process = LocalProcesses(1, "merge_sumo.twin.experts")
+        self._process = LocalProcesses(1)
         # It travels some time from now, when the sampler may have been told something.
         self._there: Future[None] = self._process.submit(_keep, deepcopy(sampler))
         self._asked: Future[Proposals] | None = None
@@ -66,7 +64,7 @@ class CopyBeside:
         self._process.shutdown(cancel_futures=True)
 
 
-def _keep(sampler: CoverageSampler) -> None:
+def _keep(sampler: Sampler) -> None:
     _copies.append(sampler)
 
 

@@ -14,6 +14,7 @@ def test_a_second_process_and_its_death_change_no_byte(tmp_path, monkeypatch):
     answer, answered = CopyBeside.answer, []
 
     def noted(beside):
+        beside._there.exception()  # waits until the process is there
         found = answer(beside)
         answered.append(found is not None)
         return found
