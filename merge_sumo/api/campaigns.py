@@ -22,6 +22,7 @@ from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.scenario.scenario import LEVELS, MergeScenario, Scenario, level_name
 from merge_sumo.studies.counterfactuals import AVOIDANCE, avoidance
 from merge_sumo.studies.explanation import note_explanation
+from merge_sumo.studies.share import note_shares
 from merge_sumo.system.folders import check_new, link_latest
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
@@ -94,7 +95,7 @@ def _write_findings(
     bars: CampaignBars,
     check: Callable[[], None],
 ) -> None:
-    """Write what follows the cases into the folder: counterfactuals and report."""
+    """Write what follows the cases into the folder: counterfactuals, shares and report."""
 
     def counted(title: str, unit: str) -> Callable[[int, int], None]:
         return lambda count, total: bars.counted(title, count, total, unit)
@@ -105,6 +106,7 @@ def _write_findings(
         known := avoidance(done, plan, workers=workers, check=check, on_part=careful)
     ):
         AVOIDANCE.write_lines(done.folder, known)
+    note_shares(done, plan, check)
     note_explanation(done, plan, check=check)
     link_latest(done.folder)
     write_report(done, result.summary, counted("surrogates of the report", "levels"))

@@ -15,7 +15,7 @@ from merge_sumo.campaigns.settings import named_again
 from merge_sumo.campaigns.stopping import LITTLE, WINDOW
 from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import Fact, facts_of, table_lines
+from merge_sumo.reports.facts import STARTS_THAT_FAIL, Fact, facts_of, table_lines
 from merge_sumo.reports.motion import lines_of, verdict_of
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import US23
@@ -216,6 +216,7 @@ class CampaignRun(Result):
             self.verdict.counts,
             *self.verdict.trouble_lines(),
             *table_lines(self.facts),
+            self._shares_line(),
             *(f"  {fact.name}: {fact.shown}" for fact in told),
             f"  {run.ran_again_in_words}" if run.ran_again else None,
             *(f"  note: {note}" for note in doubts(run.cases, run.criterion)),
@@ -228,6 +229,13 @@ class CampaignRun(Result):
         if again := named_again(self.settings):
             optional.append(f"run it again: merge-sumo rerun {quoted(self.folder)}{again}")
         return [line for line in optional if line is not None]
+
+    def _shares_line(self) -> str | None:
+        """Return how to measure the share of starts that fail, where that is not known."""
+        if any(fact.name == STARTS_THAT_FAIL for fact in self.facts):
+            return None
+        measure = f"merge-sumo probability {quoted(self.folder)}{named_again(self.settings)}"
+        return f"  {STARTS_THAT_FAIL}: not measured; {measure}"
 
     def _against_lines(self) -> list[str]:
         if self.against is None:

@@ -17,6 +17,7 @@ from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.scenario.scenario import lane_of, level_name
 from merge_sumo.studies.counterfactuals import AVOIDANCE
 from merge_sumo.studies.probability import PROBABILITY
+from merge_sumo.studies.share import SHARES
 from merge_sumo.studies.stress import STRESS
 from merge_sumo.system.printable import printable
 from merge_sumo.verdict.campaign_verdict import Verdict
@@ -27,7 +28,8 @@ from merge_sumo.verdict.summary import LevelSummary, Summary
 
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"
-TABLE: Final = ("cases", "without a verdict", "failures", "regions", "FMC", PLACE)
+STARTS_THAT_FAIL: Final = "starts that fail"
+TABLE: Final = (STARTS_THAT_FAIL, "cases", "without a verdict", "failures", "regions", "FMC", PLACE)
 """Facts of levels that stand in the table of a terminal."""
 FAILING: Final = "margin < 0"
 """By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
@@ -72,6 +74,7 @@ def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
     """
     return [
         *_tested(run),
+        *_shares(run),
         *_found(run, summary, verdict),
         *(
             fact
@@ -121,6 +124,13 @@ def _tested(run: Run) -> Iterator[Fact]:
     yield Fact("a case fails when", words, "", SETTINGS, key)
     sampler = f"{settings.sampler}, seed {settings.seed}"
     yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
+
+
+def _shares(run: Run) -> Iterator[Fact]:
+    known = SHARES.read(run.folder)
+    for place, one in enumerate(() if known is None else known.levels):
+        key = f"levels[{place}]: failures of cases, 95 %"
+        yield Fact(STARTS_THAT_FAIL, one.shown, "", SHARES.name, key, one.level)
 
 
 def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
