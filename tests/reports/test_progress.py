@@ -51,6 +51,14 @@ def said(run, tmp_path, clock, **how) -> str:
 def test_without_a_terminal_a_line_at_the_start_and_for_every_tenth(run, tmp_path, clock):
     first, *lines = said(run, tmp_path, clock).splitlines()
     assert first == f"a [b]: 180 cases, watch {tmp_path / REPORT}"
+    so_far = next(place for place, line in enumerate(lines) if line.startswith("so far "))
+    assert lines[so_far - 1].startswith("cases: 90/180  ")
+    assert lines[so_far].endswith(" in 100 cases")
+    del lines[so_far]
+    regions = [line for line in lines if line.startswith("  POV level ")]
+    assert [line[12] for line in regions] == ["0", "1", "2"], "the largest of each level"
+    assert all(line.endswith(" cases fail") for line in regions)
+    lines = [line for line in lines if line not in regions]
     failing = sum(outcome.failed for outcome in run.outcomes)
     assert len(lines) == 20
     assert lines[0].startswith("cases: 18/180  ")
