@@ -134,12 +134,6 @@ def seed_option(help: str) -> Any:
     return option(0, int, help, CASES)
 
 
-def tolerated_option() -> Any:
-    """Return the field of a share of runs."""
-    about = "A case fails where more than this share of its runs do."
-    return option(0.0, float, about, VERDICT, "--tolerate", metavar="SHARE")
-
-
 def vut_again(help: str = "", shown: str = "the campaign's") -> Any:
     """Return the field of the VUT of a recorded campaign."""
     about = (
@@ -322,7 +316,14 @@ class Search(Asked):
         metavar="N|auto",
         parse=_runs_of_a_case,
     )
-    tolerated: float = tolerated_option()
+    tolerated: float = option(
+        0.0,
+        float,
+        "A case fails where more than this share of its runs do.",
+        VERDICT,
+        "--tolerate",
+        metavar="SHARE",
+    )
     seed: int = seed_option("Same seed, same outcomes.")
     stop_when_converged: bool = option(
         False,

@@ -172,7 +172,8 @@ class CampaignRun(Result):
     @property
     def converged(self) -> bool:
         """Whether the search ended before its number of cases, as little new was found."""
-        return self._run.may_converge and len(self._run.outcomes) < self._run.settings.cases
+        settings = self._run.settings
+        return settings.stop_when_converged and len(self._run.outcomes) < settings.cases
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
@@ -218,7 +219,7 @@ class CampaignRun(Result):
             *table_lines(self.facts),
             self._shares_line(),
             *(f"  {fact.name}: {fact.shown}" for fact in told),
-            f"  {run.ran_again_in_words}" if run.ran_again else None,
+            f"  {run.ran_again_in_words}" if run.settings.ran_again else None,
             *(f"  note: {note}" for note in doubts(run.cases, run.criterion)),
             *self._against_lines(),
             f"report: {self.report_file}",

@@ -217,8 +217,8 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
             f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
             "same, or begin a new campaign"
         )
-    if before.ran_again:
-        record[RAN_AGAIN] = before.ran_again
+    if before.settings.ran_again:
+        record[RAN_AGAIN] = before.settings.ran_again
     return record if moved or grown else None
 
 

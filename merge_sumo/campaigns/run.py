@@ -169,32 +169,22 @@ class Run:
         return printable(str(self.settings.pov)[:NAME_CHARACTERS])
 
     @property
-    def may_converge(self) -> bool:
-        """Whether the campaign may end before its number of cases."""
-        return self.settings.stop_when_converged
-
-    @property
     def interruption(self) -> str:
         """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
-        fewer = len(self.outcomes) < self.settings.cases and not self.may_converge
+        fewer = len(self.outcomes) < self.settings.cases and not self.settings.stop_when_converged
         if not (self.torn or fewer):
             return ""
         torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
         return f"This campaign was interrupted, and what is shown is of the cases that ran{torn}."
 
     @property
-    def ran_again(self) -> int:
-        """Number of cases that ran again because a process had died or had been stopped."""
-        return self.settings.ran_again
-
-    @property
     def ran_again_in_words(self) -> str:
         """A sentence on the cases that ran again; empty where none did."""
-        if not self.ran_again:
+        if not (number := self.settings.ran_again):
             return ""
         return (
-            f"{counted(self.ran_again, 'case')} ran again, because a process was killed or "
-            "stopped; the outcome is that of the last time."
+            f"{counted(number, 'case')} ran again, because a process was killed or stopped; the "
+            "outcome is that of the last time."
         )
 
     def outcome(self, index: int) -> Outcome:

@@ -13,7 +13,6 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.system.workers import LocalProcesses
 from merge_sumo.verdict.score import Outcome
 
-Proposals = dict[int, Proposal]
 _copies: Final[list[Sampler]] = []
 """The copy, in its process."""
 
@@ -30,11 +29,12 @@ class CopyBeside:
         self._process = LocalProcesses(1)
         # It travels some time from now, when the sampler may have been told something.
         self._there: Future[None] = self._process.submit(_keep, deepcopy(sampler))
-        self._asked: Future[Proposals] | None = None
+        self._asked: Future[dict[int, Proposal]] | None = None
+        self._told: list[Future[None]] = []
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None) -> None:
         """Tell what the sampler is told."""
-        self._submit("tell", outcomes, motions)
+        self._told += filter(None, [self._submit("tell", outcomes, motions)])
 
     def ask(self, levels: Sequence[int], n: int, pending: Sequence[Case]) -> None:
         """Ask for `n` cases of each of some levels; `answer` waits for them.
@@ -46,10 +46,14 @@ class CopyBeside:
             self._submit("pend", pending)
             self._asked = self._submit("search", levels, n)
 
-    def answer(self) -> Proposals | None:
-        """Return what was asked for."""
+    def answer(self) -> dict[int, Proposal] | None:
+        """Return what was asked for; raises what the copy raised when it was told something."""
+        if self._asked is None:
+            return None
         try:
-            return None if self._asked is None else self._asked.result()
+            while self._told:
+                self._told.pop().result()
+            return self._asked.result()
         except BrokenExecutor:
             return None
 

@@ -70,7 +70,7 @@ def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lamb
     Nothing is written for drivers that need SUMO, where it takes long (`probability`), nor where a
     case may fail in some of its runs. `check` is called after each level, and may raise.
     """
-    if plan.needs_sumo is not None or run.tolerated:
+    if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
         return
     pool, kinematic = Pool(levels=tuple(run.levels), scenario=run.scenario), plan.with_engine(None)
     levels = []

@@ -109,9 +109,9 @@ class TestKills:
         struck = campaign("struck", DIES.format(how=how, times=times))
         assert outcomes(struck) == outcomes(calm)
         bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
-        assert calm.ran_again == 0
+        assert calm.settings.ran_again == 0
         assert RAN_AGAIN not in calm.record
-        assert struck.ran_again == bad
+        assert struck.settings.ran_again == bad
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
         assert f"{bad} cases ran again, because a process was killed" in struck.ran_again_in_words
 
@@ -127,7 +127,7 @@ class TestKills:
                 assert said in outcome.measures.error
             else:
                 assert not outcome.measures.end.is_error
-        assert run.ran_again == 0
+        assert run.settings.ran_again == 0
 
     @pytest.mark.slow
     def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, calm):
@@ -148,4 +148,4 @@ def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, calm):
     stopped = campaign("stopped", STOPS, deadline_s=2.0)
     assert (stopped.folder.parent / "went-on").exists()
     assert outcomes(stopped) == outcomes(calm)
-    assert stopped.ran_again >= 1
+    assert stopped.settings.ran_again >= 1
