@@ -256,11 +256,11 @@ class OfScenario(Asked):
     follow_up_s: float | None = option(
         None,
         float,
-        "Time for which both drive on after the merge, with measures of its own.",
+        "Time for which all drive on after the merge; 0 ends an episode there.",
         TESTED,
         "--follow-up",
         metavar="SECONDS",
-        shown="the scenario's, 0",
+        shown="the scenario's, 3",
     )
     sense: Sensing | str | None = option(
         None,

@@ -188,7 +188,7 @@ def measured(scenario: Scenario, k: int, count: int, rounds: int) -> dict[str, l
         host_s(world, cases[:k])
         for _ in range(rounds):
             seconds, trajectories = host_s(world, cases)
-            us = seconds / sum(len(t.motion) - 1 for t in trajectories) * 1e6
+            us = seconds / sum(len(t.whole) - 1 for t in trajectories) * 1e6
             row["us"].append(us)
             row["cases_per_s"].append(len(cases) / seconds)
             row["to_bare"].append(us / bare_s_per_step(world, trajectories) / 1e6)

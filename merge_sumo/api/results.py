@@ -300,7 +300,7 @@ class CaseRun(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo run --json` prints: outcome, motion and signals of the VUT."""
-        record = {**self.outcome.to_record(), "motion": self.trajectory.motion.tolist()}
+        record = {**self.outcome.to_record(), "motion": self.trajectory.whole.tolist()}
         return record | ({"signals": self.trajectory.signals} if self.trajectory.signals else {})
 
     def lines(self) -> list[str]:

@@ -165,13 +165,14 @@ def _encoded(group: Sequence[Episode]) -> tuple[bytes, bytes]:
     }
     text = json.dumps(signals, allow_nan=False).encode()
     kept: dict[str, Any] = {"signals": np.frombuffer(text, np.uint8)} if signals else {}
+    motions = [trajectory.whole for trajectory in trajectories]
     arrays = io.BytesIO()
     np.savez(
         arrays,
         **kept,
         index=np.array([o.index for o in outcomes]),
-        rows=np.array([len(t.motion) for t in trajectories]),
-        motion=np.concatenate([t.motion.reshape(len(t.motion), -1) for t in trajectories]),
+        rows=np.array([len(motion) for motion in motions]),
+        motion=np.concatenate([motion.reshape(len(motion), -1) for motion in motions]),
         lines_sha256=hashlib.sha256(lines).hexdigest(),
     )
     return lines, arrays.getvalue()

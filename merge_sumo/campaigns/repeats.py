@@ -132,14 +132,15 @@ def _compared(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
 
 def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
     """Return from when on two motions differ, and which vehicle differs first."""
-    rows = min(len(one.motion), len(other.motion))
-    pairs = [trajectory.motion[:rows].copy() for trajectory in (one, other)]
+    wholes = one.whole, other.whole
+    rows = min(map(len, wholes))
+    pairs = [whole[:rows].copy() for whole in wholes]
     for pair in pairs:
         pair[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
     differs = pairs[0] != pairs[1]
     steps = np.flatnonzero(differs.any(axis=(1, 2)))
     if not steps.size:
-        same = len(one.motion) == len(other.motion)
+        same = len(wholes[0]) == len(wholes[1])
         return (None, None) if same else (round((rows - 1) * DT_S, 1), None)
     step = int(steps[0])
     # The acceleration of a step is the answer to its state, which was the same.

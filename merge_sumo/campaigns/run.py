@@ -33,9 +33,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.options import Search
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.kinds import scenario_of_record
-from merge_sumo.scenario.scenario import ALL_LEVELS, US23, Scenario
+from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
-from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.records import convert, decode
@@ -201,18 +201,20 @@ class Run:
         Raises `LostError` when it is missing or unreadable, `UserError` when it is no motion.
         """
         outcome = self.outcome(index)
-        motion = self._batch(outcome.batch).get(index)
-        if motion is None:
+        whole = self._batch(outcome.batch).get(index)
+        if whole is None:
             path = batch_file(self.folder, outcome.batch)
             raise LostError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
+        motion, after = cut_at(whole, round(measures.t_end_s / DT_S))
         return Trajectory(
             outcome.case,
             motion,
             measures.end,
             measures.error,
             measures.clipped_steps,
-            signals=self._signals.get(index),
+            after,
+            self._signals.get(index),
         )
 
     def trajectories(self, indices: Iterable[int]) -> dict[int, Trajectory]:

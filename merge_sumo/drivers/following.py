@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 
 FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
 LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
@@ -82,21 +82,6 @@ class Following:
     def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
         """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""
         return car_met(x_m, v_mps, self._a_mps2, self._v_mps)
-
-
-def keep_behind_vut(
-    a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: Scenario
-) -> None:
-    """Lower accelerations, (A, K), of cars that are behind a VUT that has merged to what is safe.
-
-    The states are (A, K); a car that Krauss' speed asks for more than it can brakes as it can.
-    """
-    behind = (x_m < x_m[VUT]) & (x_m[VUT] >= 0.0)
-    gap_m = x_m[VUT] - x_m - (scenario.vut_length_m + scenario.min_gap_m)
-    v_vut = np.broadcast_to(v_mps[VUT], v_mps.shape)
-    safe = safe_speed_mps(gap_m, v_vut, -scenario.a_min_mps2, scenario.tau_s)
-    most = np.where(behind, (safe - v_mps) / DT_S, np.inf)
-    np.minimum(a_mps2, most, out=a_mps2)
 
 
 def car_met(

@@ -24,7 +24,7 @@ from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import VUT, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
 
@@ -104,7 +104,7 @@ class KinematicSimulator(Simulator):
         """Raise `UserError` where a case ended otherwise in SUMO."""
         lines = centre_lines(self._plan.road)
         verdicts = [self._plan.criterion.verdict(one, lines) for one in (kinematic, sumo)]
-        ours, theirs = _whole(kinematic), _whole(sumo)
+        ours, theirs = kinematic.whole, sumo.whole
         if (
             kinematic.end is sumo.end
             and kinematic.error == sumo.error
@@ -145,13 +145,6 @@ def drawn(cases: Sequence[Case]) -> set[int]:
     seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
     count = math.ceil(CHECKED_SHARE * len(cases))
     return set(np.random.default_rng(seed).choice(len(cases), count, replace=False).tolist())
-
-
-def _whole(trajectory: Trajectory) -> FloatArray:
-    """Return the motion of an episode and of its follow-up, (T, A, 3)."""
-    if trajectory.after is None:
-        return trajectory.motion
-    return np.concatenate((trajectory.motion, trajectory.after))
 
 
 def _said(trajectory: Trajectory) -> str:

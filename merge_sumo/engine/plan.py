@@ -14,7 +14,7 @@ from typing import Any, Final
 from merge_sumo.engine.povs import Povs
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.scenario.scenario import OWN, Scenario
+from merge_sumo.scenario.scenario import OWN, Scenario, lane_of
 from merge_sumo.system.workers import AnyWorkers
 from merge_sumo.verdict.criteria import CRITERIA
 from merge_sumo.verdict.criterion import Criterion
@@ -116,6 +116,12 @@ class SimulationPlan:
         if level == OWN:
             return self
         return replace(self, povs=replace(self.povs, own=None))
+
+    def for_verdicts(self) -> SimulationPlan:
+        """Return the plan for verdicts alone: where these are those of M, without a follow-up."""
+        if not self.criterion.is_papers or lane_of(self.scenario) is not None:
+            return self
+        return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
 
     def with_engine(self, engine: str | None) -> SimulationPlan:
         """Return the plan with an engine; None is the kinematic one where the drivers allow it.

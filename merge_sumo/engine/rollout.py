@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
-from merge_sumo.drivers.following import Following, keep_behind_vut
+from merge_sumo.drivers.following import Following
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
 from merge_sumo.scenario.signals import Left, series
-from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.system.blame import Blame
 from merge_sumo.system.pulse import Pulse
@@ -255,8 +255,10 @@ class _Rollout:
         self.quarantine = bool(self.suspects)
         self.refill(range(self.world.corridors))
 
-    def refill(self, corridors: Iterable[int]) -> None:
+    def refill(self, corridors: Sequence[int]) -> None:
         """Begin the next episodes in corridors whose own have ended."""
+        if not corridors:
+            return
         if self.quarantine:  # nothing else runs
             self.quarantine = bool(self.suspects)
             corridors = range(self.world.corridors)
@@ -310,7 +312,9 @@ class _Rollout:
             np.isfinite(x_m).all() and np.isfinite(v_mps).all()
         ):
             raise SimulationError("a position or a speed is not finite")
-        merged = None if self.merging is None else self.merging.merged
+        merged = x_m[VUT] >= 0.0 if self.follow_steps else None
+        if self.merging is not None:
+            merged = self.merging.merged
         scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is not None:
@@ -323,8 +327,6 @@ class _Rollout:
             following.limit(answer, x_m, v_mps)
         if self.merging is not None:
             self.merging.take(self.vut.wishes(), answer, x_m, v_mps)
-        elif self.follow_steps:
-            keep_behind_vut(answer, x_m, v_mps, self.world.scenario)
         acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
         self.now[..., 2] = acceleration.T
         off = answer - acceleration
@@ -399,10 +401,8 @@ class _Rollout:
             signals = series(episode.left, len(motion))
             alone = Trajectory(episode.case, motion, end, error, clipped, signals=signals)
             return episode.index, alone
-        steps = episode.merge_row - episode.first_row
-        before, after = motion[: steps + 1].copy(), motion[steps:]
-        before[-1, :, 2] = 0.0
-        signals = series(episode.left, len(before))
+        signals = series(episode.left, len(motion))
+        before, after = cut_at(motion, episode.merge_row - episode.first_row)
         merged = Trajectory(
             episode.case, before, self.ends_as, None, episode.clipped, after, signals
         )

@@ -100,4 +100,5 @@ def corridors_of(plan: SimulationPlan, most: int) -> int:
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:
     """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
     library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
-    return library if lane_of(scenario) is None else LanePov(library)
+    drives_on = lane_of(scenario) is not None or scenario.follow_up_s > 0.0
+    return LanePov(library) if drives_on else library

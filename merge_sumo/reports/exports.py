@@ -22,7 +22,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
@@ -46,8 +46,6 @@ CONTROLLER: Final = "EgoController"
 """Parameter that names the controller of a free VUT."""
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
-MERGED_S: Final = 1.0
-"""For which a recorded scenario goes on where the VUT has merged from an acceleration lane."""
 
 WriteCase = Callable[[Run, int, Path, Corridor], Path]
 """Writes a case of a run into a new folder; returns the path of the file to open."""
@@ -108,7 +106,7 @@ def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
     start = {c.field: c.of(case) for c in coordinates(scenario)}
     merged = merged_rows(trajectory)
     severity = run.outcome(index).measures.severity
-    for step, state in enumerate(trajectory.motion.reshape(len(trajectory.motion), -1).tolist()):
+    for step, state in enumerate(trajectory.whole.reshape(len(merged), -1).tolist()):
         row: dict[str, Any] = {
             "case": index,
             "level": case.level,
@@ -133,9 +131,8 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     `EgoController`; the other cars do what they did, whatever it does, and keep their last speed
     where the record ends. That one ends by the scenario's timeout.
 
-    A merge from an acceleration lane is the last step of the VUT's trajectory, with a lane change
-    to the lane of the POV at its end; the first scenario goes on for `MERGED_S`, with all cars at
-    their last speeds. In the road that lane has OpenDRIVE's type "entry".
+    A merge from an acceleration lane is a step of the VUT's trajectory, from lane to lane. In the
+    road that lane has OpenDRIVE's type "entry".
 
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
@@ -164,24 +161,23 @@ def _scenario(
 ) -> Any:
     """Return a case as a scenario; where the VUT is free, somebody else's controller drives it."""
     scenario = trajectory.case.scenario
-    changes_lane = bool(merged_rows(trajectory).any())
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))
     for row, who in enumerate(VEHICLES[: trajectory.motion.shape[1]]):
         entities.add_scenario_object(who, _car(xosc, who, scenario))
         places = _places(xosc, road, trajectory, row)
-        afterwards = _afterwards(xosc, trajectory, row) if free or changes_lane else []
         init.add_init_action(who, xosc.TeleportAction(places[0]))
         init.add_init_action(who, _speed(xosc, float(trajectory.motion[0, row, 1])))
         if free and row == VUT:
             controller = xosc.Controller(f"${CONTROLLER}", xosc.Properties())
             init.add_init_action(who, xosc.AssignControllerAction(controller))
         else:
-            act.add_maneuver_group(_follow(xosc, who, places, afterwards))
+            after = _speed(xosc, float(trajectory.whole[-1, row, 1])) if free else None
+            act.add_maneuver_group(_follow(xosc, who, places, after))
     story = xosc.Story(name)
     story.add_act(act)
-    shown_s = trajectory.t_end_s + (MERGED_S if changes_lane else 0.0)
-    end_s = scenario.timeout_s if free else round(shown_s, 1)
+    shown_s = round((len(trajectory.whole) - 1) * DT_S, 1)
+    end_s = scenario.timeout_s if free else shown_s
     board = xosc.StoryBoard(init, _at_time(xosc, "end", end_s))
     board.add_story(story)
     parameters = xosc.ParameterDeclarations()
@@ -201,21 +197,11 @@ def _scenario(
     )
 
 
-def _afterwards(xosc: Any, trajectory: Trajectory, row: int) -> list[tuple[str, Any]]:
-    """Return the actions of a car behind its trajectory, each with a name."""
-    who = VEHICLES[row]
-    actions = [(f"{who} keeps its speed", _speed(xosc, float(trajectory.motion[-1, row, 1])))]
-    if row == VUT:
-        change = xosc.RelativeLaneChangeAction(0, VEHICLES[POV], _at_once(xosc))
-        actions.insert(0, (f"{who} changes to the lane of {VEHICLES[POV]}", change))
-    return actions
-
-
 def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list[Any]:
     """Return the places of a car at all steps."""
     places = []
     for x_m, merged in zip(
-        trajectory.motion[:, row, 0].tolist(), merged_rows(trajectory).tolist(), strict=True
+        trajectory.whole[:, row, 0].tolist(), merged_rows(trajectory).tolist(), strict=True
     ):
         _, _, x, y, angle_deg = road.lane_point(x_m, on_ramp=row == VUT and not merged)
         # SUMO's angles run clockwise from north, OpenSCENARIO's the other way round from east.
@@ -224,10 +210,8 @@ def _places(xosc: Any, road: Corridor, trajectory: Trajectory, row: int) -> list
     return places
 
 
-def _follow(
-    xosc: Any, who: str, places: Sequence[Any], afterwards: Sequence[tuple[str, Any]]
-) -> Any:
-    """Return the maneuvers of a car: to follow its places, and then the actions afterwards."""
+def _follow(xosc: Any, who: str, places: Sequence[Any], afterwards: Any) -> Any:
+    """Return the maneuvers of a car: to follow its places, and then an action, if any."""
     times = np.round(np.arange(len(places)) * DT_S, 1).tolist()
     track = xosc.Trajectory(f"{who} recorded", closed=False)
     track.add_shape(xosc.Polyline(times, list(places)))
@@ -243,11 +227,10 @@ def _follow(
     event.add_trigger(_at_time(xosc, f"{who} start", 0.0))
     event.add_action(f"{who} follows", follow)
     maneuver.add_event(event)
-    if afterwards:
+    if afterwards is not None:
         event = xosc.Event(f"{who} afterwards", xosc.Priority.override)
         event.add_trigger(_at_time(xosc, f"{who} has followed", times[-1]))
-        for name, action in afterwards:
-            event.add_action(name, action)
+        event.add_action(f"{who} keeps its speed", afterwards)
         maneuver.add_event(event)
     group = xosc.ManeuverGroup(f"{who} group")
     group.add_actor(who)
@@ -262,11 +245,8 @@ def _at_time(xosc: Any, name: str, time_s: float) -> Any:
 
 
 def _speed(xosc: Any, v_mps: float) -> Any:
-    return xosc.AbsoluteSpeedAction(v_mps, _at_once(xosc))
-
-
-def _at_once(xosc: Any) -> Any:
-    return xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0.0)
+    at_once = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0.0)
+    return xosc.AbsoluteSpeedAction(v_mps, at_once)
 
 
 def _car(xosc: Any, who: str, scenario: Scenario) -> Any:

@@ -22,7 +22,6 @@ from merge_sumo.studies.stress import STRESS
 from merge_sumo.system.printable import printable
 from merge_sumo.verdict.campaign_verdict import Verdict
 from merge_sumo.verdict.chance import MOST_RUNS, by_case, is_decided
-from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.summary import LevelSummary, Summary
 
@@ -153,16 +152,6 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
         number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
         if number:
             yield counted(about, number, f"severity: {severity}, not {FAILING}")
-    before = sum(map(_overlaps_before, run.cases))
-    if before:
-        key = "before_clearance_m < 0, severity not contact"
-        yield counted(run.scenario.said("cases whose bodies overlap before M alone"), before, key)
-
-
-def _overlaps_before(outcome: Outcome) -> bool:
-    measures = outcome.measures
-    overlap = (measures.before_clearance_m or 0.0) < 0.0
-    return overlap and measures.severity != Severity.CONTACT
 
 
 def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> Iterator[Fact]:

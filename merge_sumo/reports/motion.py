@@ -76,16 +76,17 @@ def _measures(outcome: Outcome) -> Iterator[str]:
 
 
 def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:
-    """Return the motion as a table: a row for each second and for the end of the episode.
+    """Return the motion as a table: a row for each second, for the merge, and for the end.
 
     Of every vehicle x in m, v in m/s and a in m/s2; then the signals that the VUT has left.
     """
-    motion = trajectory.motion
+    motion, until = trajectory.whole, len(trajectory.motion) - 1
     cars = VEHICLES[: motion.shape[1]]
     lines = ["  t s" + "".join(f"  {f'x {who.upper()}':>8}   m/s  m/s2" for who in cars)]
-    for row in dict.fromkeys([*range(0, len(motion), round(every_s / DT_S)), len(motion) - 1]):
+    for row in sorted({*range(0, len(motion), round(every_s / DT_S)), until, len(motion) - 1}):
         values = "".join(f"  {x:8.1f} {v:5.1f} {a:5.1f}" for x, v, a in motion[row].tolist())
         signals = {name: of[row] for name, of in (trajectory.signals or {}).items()}
         left = "".join(f"  {name} {value}" for name, value in signals.items() if value is not None)
-        lines.append(f"{row * DT_S:5.1f}{values}{left}")
+        place = f"  {trajectory.case.scenario.place}" if row == until < len(motion) - 1 else ""
+        lines.append(f"{row * DT_S:5.1f}{values}{place}{left}")
     return lines

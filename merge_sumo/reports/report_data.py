@@ -111,7 +111,7 @@ def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]
         "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
         "nearest": VEHICLES.index(measures.nearest),
         "offset": offset,
-        "rows": 0 if motion is None else len(motion.motion),
+        "rows": 0 if motion is None else len(motion.whole),
         "end": measures.end,
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
         "severity": measures.severity,
@@ -180,7 +180,7 @@ def _search(model: ReportModel) -> dict[str, Any]:
 
 def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
     """Return the speeds of all cars at every step in base64, and the first row of each motion."""
-    speeds = [motion.motion[:, :, 1] for motion in motions.values()]
+    speeds = [motion.whole[:, :, 1] for motion in motions.values()]
     whole = [np.rint(np.clip(v / SPEED_UNIT_MPS, 0, 65535)).astype("<u2").tobytes() for v in speeds]
     first = np.cumsum([0, *map(len, speeds)]).tolist()
     return base64.b64encode(b"".join(whole)).decode(), dict(zip(motions, first, strict=False))

@@ -167,7 +167,7 @@ class Scenario:
         a_min_mps2: hardest braking of all vehicles, negative.
         a_max_mps2: hardest acceleration of all vehicles.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
-        follow_up_s: how long all drive on behind M; the verdict of the paper is at M.
+        follow_up_s: how long all drive on behind M, 3 s where nothing is said.
         v_hw_min_mps: lowest speed that the mainline drives at.
         v_hw_max_mps: highest speed that it drives at.
         v_min_mps: below this the VUT is slow.
@@ -417,6 +417,7 @@ class MergeScenario(Scenario):
     }
     default_goal: ClassVar[str] = "the merge point"
     default_criterion: ClassVar[str] = "paper"
+    follow_up_s: float = 3.0
 
     name: str = "us23"
     mainline: Edges = ("main_in", "main_out")

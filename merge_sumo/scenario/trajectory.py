@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
+import numpy as np
+
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VUT
 from merge_sumo.scenario.signals import Signals
@@ -61,8 +63,8 @@ class Trajectory:
     (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
     the simulation did wrong. `clipped_steps` counts the answers of the VUT that were outside the
     limits of acceleration and were clipped. `after` is the motion behind M where the scenario has
-    it followed up, its first row that of the merge; it is measured and not kept. `signals` are what
-    the VUT left for each row, where it left any.
+    it followed up, its first row that of the merge. `signals` are what the VUT left for each row of
+    both, where it left any.
     """
 
     case: Case
@@ -77,6 +79,13 @@ class Trajectory:
         """Return its end in a line: the motion is an array of hundreds of numbers."""
         cars, rows = self.motion.shape[1], len(self.motion)
         return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
+
+    @property
+    def whole(self) -> FloatArray:
+        """The motion up to M and behind it, (T + 1, A, 3)."""
+        if self.after is None:
+            return self.motion
+        return np.concatenate((self.motion[:-1], self.after))
 
     @property
     def x_pov_m(self) -> FloatArray:
@@ -117,10 +126,22 @@ class Trajectory:
         return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
 
     def facing(self, car: int) -> Trajectory:
-        """Return the motion of the VUT and one car of the mainline, in the POV's row."""
-        return replace(self, motion=self.motion[:, [car, VUT]])
+        """Return the motion up to M of the VUT and one car of the mainline, in the POV's row."""
+        return replace(self, motion=self.motion[:, [car, VUT]], after=None)
 
     @property
     def t_end_s(self) -> float:
         """Time of the last row."""
         return round((len(self.motion) - 1) * DT_S, 1)
+
+
+def cut_at(whole: FloatArray, row: int) -> tuple[FloatArray, FloatArray | None]:
+    """Return the motion up to the row of the merge, and that behind it; None where it ends there.
+
+    The acceleration in the last row of a motion is 0.
+    """
+    if len(whole) <= row + 1:
+        return whole, None
+    motion = whole[: row + 1].copy()
+    motion[-1, :, 2] = 0.0
+    return motion, whole[row:]

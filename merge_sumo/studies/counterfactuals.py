@@ -117,7 +117,8 @@ def avoidance(
     if not failing:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    plan = replace(plan, vut=VutFactory.of(CAREFUL)).with_log(run.folder.resolve() / LOG)
+    plan = replace(plan, vut=VutFactory.of(CAREFUL)).for_verdicts()
+    plan = plan.with_log(run.folder.resolve() / LOG)
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:
         on_part(done := 0, len(failing))

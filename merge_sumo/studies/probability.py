@@ -250,7 +250,7 @@ def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) ->
         stated = traffic.in_pool(scenario, levels)
     cells = expected_cells(study, stated)
     drawn = draw(cells, scenario, cases, np.random.default_rng([asked.seed, STREAM]))
-    plan = study.plan.for_cases(cases)
+    plan = study.plan.for_verdicts().for_cases(cases)
     if study.workers is not None:
         open_simulators(plan, study.workers)
     counted, in_sumo = [], 0

@@ -72,7 +72,8 @@ def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lamb
     """
     if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
         return
-    pool, kinematic = Pool(levels=tuple(run.levels), scenario=run.scenario), plan.with_engine(None)
+    pool = Pool(levels=tuple(run.levels), scenario=run.scenario)
+    kinematic = plan.for_verdicts().with_engine(None)
     levels = []
     for level in run.levels:
         rng = np.random.default_rng([run.settings.seed, STREAM, level])

@@ -171,6 +171,7 @@ def ground_truth(
         if not isinstance(number, Integral) or number < least:
             raise UserError(f"`{name}` is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
+    plan = plan.for_verdicts()
     kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
     known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
     if known is not None:
@@ -215,6 +216,7 @@ def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
     """Return the truth that the cache has, by whichever engine; None where it has none."""
+    plan = plan.for_verdicts()
     found = TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
     return None if found is None else found[0]
 

@@ -16,7 +16,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.received import Allowed
-from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, VEHICLES, VUT
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, VEHICLES, VUT
 from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.replay_folder import (
@@ -44,7 +44,7 @@ TOLERANCE: Final = 1e-6
 LANE_END_M: Final = 2e-3
 """Nearer than this to where a lane begins, a vehicle may be on the lane before or behind."""
 MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
-MAX_TIMESTEPS: Final = round(MAX_EPISODE_S / DT_S) + 1 + HOLD_STEPS
+MAX_TIMESTEPS: Final = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -224,7 +224,7 @@ def _types(trajectory: Trajectory) -> etree._Element:
 
 def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
-    rows = [*zip(trajectory.motion.tolist(), merged_rows(trajectory).tolist(), strict=True)]
+    rows = [*zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True)]
     rows += [rows[-1]] * HOLD_STEPS
     for step, (vehicles, merged) in enumerate(rows):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")

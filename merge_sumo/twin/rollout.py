@@ -19,6 +19,7 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.twin.observation import Inputs, Observation
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.verdict.merge import REACTION_S
 
 Answer = Callable[[Inputs], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs)."""
@@ -64,11 +65,10 @@ class TwinRollout:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
         A rollout is of a merge and ends at M: none is possible of other kinds of scenarios, or
-        where what happens behind M counts, or where the VUT chooses the place.
+        where the VUT chooses the place.
         """
         known = level == 0 or level in self._networks
-        at_m = isinstance(self._scenario, MergeScenario) and self._scenario.lane_m is None
-        return known and at_m and (self._by_gap or not self._scenario.follow_up_s)
+        return known and isinstance(self._scenario, MergeScenario) and not self._scenario.lane_m
 
     def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
@@ -111,10 +111,20 @@ class TwinRollout:
             last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
             of_row = motion[: last + 1, :, :, row].copy()
             of_row[-1, :, 2] = 0.0
-            end = End.TIMEOUT if np.isnan(gap_m[row]) else End.MERGED
-            judged = self._criterion.judged(Trajectory(case, of_row, end), self._lines)
+            end, after = End.TIMEOUT, None
+            if not np.isnan(gap_m[row]):
+                end, after = End.MERGED, self._drives_on(of_row[-1])
+            found_of = Trajectory(case, of_row, end, after=after)
+            judged = self._criterion.judged(found_of, self._lines)
             found[row] = judged.signed_gap
         return found
+
+    def _drives_on(self, at_m: FloatArray) -> FloatArray | None:
+        """Predict the follow-up of a state at M, (A, 3): all keep their speeds for a reaction."""
+        steps = round(min(REACTION_S, self._scenario.follow_up_s) / DT_S)
+        after = np.tile(at_m, (steps + 1, 1, 1))
+        after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
+        return after if steps else None
 
     def _play(
         self,

@@ -91,10 +91,10 @@ OURS: Final = (
     ),
     _low(
         "clearance_m",
-        "smallest gap between bumpers from M on, to the end of the follow-up, or without one for "
-        "0.75 s at the speeds of M; 0 or less where bodies touch, None without a merge",
+        "smallest gap between bumpers from M on, to the end of the follow-up; 0 or less where "
+        "bodies touch, None without a merge",
         unit="m",
-        label="smallest gap, driving on",
+        label="smallest gap from M on",
         column="clearance",
     ),
     _low(
@@ -196,7 +196,7 @@ OURS: Final = (
     _low(
         "after_gap_m",
         "least gap between bumpers in the follow-up, 0 or less where bodies touch; this and the "
-        "next two are None without a merge, and recorded where there is a follow-up only",
+        "next three are None without a merge, and recorded where there is a follow-up only",
         unit="m",
         label="smallest bumper gap behind M",
     ),
@@ -211,6 +211,12 @@ OURS: Final = (
         "hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
         unit="m/s2",
         label="braking needed behind M",
+    ),
+    _high(
+        "after_brake_mps2",
+        "hardest braking in it of the cars behind the VUT, and of the VUT behind the nearest car",
+        unit="m/s2",
+        label="hardest braking behind M",
     ),
     Measure(
         "x_merge_m",

@@ -58,12 +58,13 @@ def place_of_merge_m(trajectory: Trajectory) -> float:
 
 
 def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
-    """Return the rows, (T + 1,), in which the VUT has left an acceleration lane for the mainline's.
+    """Return the rows, (T + 1,), of the whole motion in which the VUT has left its lane.
 
-    There are none without a lane: ramp and mainline have the same lanes behind M.
+    There are none without an acceleration lane: ramp and mainline have the same lanes behind M.
     """
-    merged = np.zeros(len(trajectory.motion), dtype=np.bool_)
-    merged[-1] = lane_of(trajectory.case.scenario) is not None and trajectory.end is End.MERGED
+    merged = np.zeros(len(trajectory.whole), dtype=np.bool_)
+    leaves = lane_of(trajectory.case.scenario) is not None and trajectory.end is End.MERGED
+    merged[len(trajectory.motion) - 1 :] = leaves
     return merged
 
 
@@ -114,22 +115,32 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
 def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
     """Return the smallest clearance from M on, in m, and the speed of the first contact, in m/s.
 
-    Where the scenario has a follow-up that is the motion in it. Elsewhere both drive on at their
-    speeds for the time that a driver takes to react: nobody can avoid what happens until then. The
-    clearance is infinite without a merge, the speed None without a contact.
+    Both are of the motion: at M, and in the follow-up where the scenario has one. The clearance is
+    infinite without a merge, the speed None without a contact.
     """
-    if trajectory.after is None:
-        pairs = neighbours(trajectory)
-        gaps_m = [gap - max(closing, 0.0) * REACTION_S for gap, closing in pairs]
-        at_once = [abs(w) for g, w in pairs if g <= 0.0]
-        later = [w for (_, w), gap in zip(pairs, gaps_m, strict=True) if gap <= 0.0]
-        return min(gaps_m, default=math.inf), max(at_once or later, default=None)
-    gap_m, closing_mps = _gaps_behind_m(trajectory.case.scenario, trajectory.after)
+    if trajectory.end is not End.MERGED:
+        return math.inf, None
+    after = trajectory.motion[-1:] if trajectory.after is None else trajectory.after
+    gap_m, closing_mps = _gaps_behind_m(trajectory.case.scenario, after)
     touching = np.argwhere(gap_m <= 0.0)
     if not len(touching):
         return float(gap_m.min()), None
     first = gap_m[touching[0, 0]] <= 0.0
     return float(gap_m.min()), float(np.abs(closing_mps[touching[0, 0]][first]).max())
+
+
+def braked_after_mps2(trajectory: Trajectory) -> float | None:
+    """Return the hardest braking behind M, in m/s2, of those that are behind another there.
+
+    They are the cars behind the VUT at M, and the VUT itself where the nearest car is ahead of it.
+    None without a follow-up.
+    """
+    if trajectory.after is None:
+        return None
+    x_m = trajectory.after[0, :, 0]
+    is_behind = x_m < x_m[VUT]
+    is_behind[VUT] = x_m[trajectory.nearest] > x_m[VUT]
+    return max(0.0, -float(trajectory.after[:, is_behind, 2].min(initial=0.0)))
 
 
 def _gaps_behind_m(scenario: Scenario, after: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -43,6 +43,7 @@ from merge_sumo.verdict.measures import (
 )
 from merge_sumo.verdict.merge import (
     brake_after_mps2,
+    braked_after_mps2,
     closest_after_m,
     followed_up,
     neighbours,
@@ -113,6 +114,7 @@ class Measures:
     after_gap_m: float | None = None
     after_ttc_s: float | None = None
     after_drac_mps2: float | None = None
+    after_brake_mps2: float | None = None
     x_merge_m: float | None = None
     lane_share: float | None = None
     gap_ahead_m: float | None = None
@@ -264,7 +266,7 @@ class Outcome:
         return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 
-FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2")
+FOLLOWED_UP: Final = ("after_gap_m", "after_ttc_s", "after_drac_mps2", "after_brake_mps2")
 """Measures of the follow-up."""
 ON_LANE: Final = (
     *("x_merge_m", "lane_share", "gap_ahead_m", "gap_behind_m"),
@@ -298,9 +300,11 @@ def _record_fields(
     not_fields = {"further", *left_out}
     measure_names = tuple(name for name in Measures.__slots__ if name not in not_fields)
     types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
-    required = [(name, types[name]) for name in ("index", "batch", *case_names, *measure_names)]
+    names = [name for name in measure_names if name not in FOLLOWED_UP]
+    required = [(name, types[name]) for name in ("index", "batch", *case_names, *names)]
     further = [(name, float | None, None) for name in further_measures()]
     optional = [
+        *((name, types[name], None) for name in measure_names if name in FOLLOWED_UP),
         *further,
         ("draw", int, 0),
         ("margin", float | None, None),
@@ -401,8 +405,8 @@ def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> 
             gap = abs(dx) - trajectory.case.scenario.dx_crash_m
             drac = 0.0 if dx * dv >= 0 else (dv * dv / (2 * gap) if gap > 0 else None)
     clearance, impact = closest_after_m(trajectory)
-    brake = brake_after_mps2(trajectory)
-    severity = severity_of(end, clearance, is_close=close, brake_mps2=brake)
+    brake, braked = brake_after_mps2(trajectory), braked_after_mps2(trajectory)
+    severity = severity_of(end, clearance, is_close=close, brake_mps2=braked)
     followed: tuple[float | None, ...] = followed_up(trajectory) or (None, None, None)
     return Measures.of(
         trajectory,
@@ -424,6 +428,7 @@ def _measure(trajectory: Trajectory, before_m: float, *, avoidability: bool) -> 
         after_gap_m=followed[0],
         after_ttc_s=_finite(followed[1]),
         after_drac_mps2=_finite(followed[2]),
+        after_brake_mps2=braked,
         **on_lane(trajectory),
     )
 

@@ -101,9 +101,7 @@ def try_formula(text: str) -> None:
 
 def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
     """Return the signals of an episode by name, (T + 1,), with those of the follow-up behind M."""
-    motion = trajectory.motion
-    if trajectory.after is not None:
-        motion = np.concatenate([motion[:-1], trajectory.after])
+    motion = trajectory.whole
     scenario = trajectory.case.scenario
     (x_pov, v_pov, a_pov), (x_vut, v_vut, a_vut) = (
         motion[:, row].T for row in (trajectory.nearest, 1)

@@ -118,7 +118,7 @@ class TestARecord:
     def test_has_the_fields_of_the_specification_in_their_order(self):
         names = [name for name in episode(0).outcome.to_record() if name not in further_measures()]
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
-        assert names[-1] == "error"
+        assert names[-len(FOLLOWED_UP) :] == list(FOLLOWED_UP)
 
 
 class TestReading:

@@ -43,7 +43,7 @@ class TestTheCommand:
         told = json.loads(out)
         was = run.outcome(7)
         assert told["score"] == was.measures.score
-        assert (np.array(told["motion"]) == run.trajectory(7).motion).all()
+        assert (np.array(told["motion"]) == run.trajectory(7).whole).all()
         assert code == (1 if was.failed else 0)
 
     def test_runs_a_vut_in_this_process_for_a_debugger(self, command_line, tmp_path, monkeypatch):
@@ -101,7 +101,7 @@ class TestInSumoGui:
         without = run_one(plan, COLLIDES)
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
-        assert len(slept) == len(live.trajectory.motion) - 1, "every step waits for its time"
+        assert len(slept) == len(live.trajectory.whole) - 1, "every step waits for its time"
 
     def test_opens_no_port(self, window):
         ports: list[list[str]] = []

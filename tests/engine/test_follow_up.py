@@ -13,7 +13,6 @@ import pytest
 from plans import plan_for
 from test_score import CASE, ending
 
-from merge_sumo.drivers.following import keep_behind_vut
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
@@ -25,7 +24,7 @@ from merge_sumo.verdict.score import FOLLOWED_UP, Outcome, measure
 from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 
-FOLLOWED = replace(US23, follow_up_s=3.0)
+FOLLOWED, AT_M = US23, replace(US23, follow_up_s=0.0)
 CASES = Pool(levels=(0,), scenario=FOLLOWED).cases(np.random.default_rng(3).random((12, 2)), 0)
 
 
@@ -46,7 +45,7 @@ class TestMeasures:
         # The POV is behind, 5 m between bumpers, and slower.
         assert followed_up(followed((-10.0, 20.0, 0.0, 25.0))) == (5.0, math.inf, 0.0)
         measures = measure(followed((-10.0, 20.0, 0.0, 25.0)))
-        assert [getattr(measures, name) for name in FOLLOWED_UP] == [5.0, None, 0.0]
+        assert [getattr(measures, name) for name in FOLLOWED_UP] == [5.0, None, 0.0, 0.0]
 
     def test_of_bodies_that_touch(self):
         episode = followed((-10.0, 30.0, 0.0, 20.0), (-4.0, 30.0, 0.5, 20.0))
@@ -60,26 +59,16 @@ class TestMeasures:
     def test_are_in_the_record_where_there_is_a_follow_up(self):
         outcome = Criterion("contact").outcome(0, 0, followed((-10.0, 20.0, 0.0, 25.0)))
         record = json.loads(json.dumps(outcome.to_record()))
-        assert list(record)[-4:] == [*FOLLOWED_UP, "margin"]
+        assert list(record)[-5:] == [*FOLLOWED_UP, "margin"]
         assert Outcome.from_json(json.dumps(record), FOLLOWED) == outcome
-        assert not set(FOLLOWED_UP) & set(Outcome(0, 0, CASE, measure(ending(9.0))).to_record())
+        assert not set(FOLLOWED_UP) & set(
+            Outcome(0, 0, replace(CASE, scenario=AT_M), measure(ending(9.0))).to_record()
+        )
 
     def test_that_nobody_takes_are_refused(self):
         with pytest.raises(UserError, match="`follow_up_s` SECONDS"):
-            Criterion("after_ttc_s < 2").check(US23)
+            Criterion("after_ttc_s < 2").check(AT_M)
         Criterion("after_ttc_s < 2").check(FOLLOWED)
-
-
-def test_a_car_behind_brakes_as_krauss_does():
-    # 42.5 m between fronts leave 35 m; b tau = 4: sqrt(16 + 400 + 280) - 4 = 22.38 m/s.
-    x, v = np.array([[-42.5, 20.0], [0.0, 0.0]]), np.array([[25.0, 25.0], [20.0, 20.0]])
-    wanted = np.array([[1.0, 1.0], [1.0, 1.0]])
-    keep_behind_vut(wanted, x, v, US23)
-    assert wanted[0, 0] == pytest.approx((math.sqrt(696.0) - 4.0 - 25.0) / DT_S)
-    assert wanted[0, 1] == wanted[1, 0] == wanted[1, 1] == 1.0  # ahead of it, or the VUT itself
-    before = np.array([[1.0], [1.0]])
-    keep_behind_vut(before, np.array([[-42.5], [-1.0]]), v[:, :1], US23)
-    assert before[0, 0] == 1.0
 
 
 def run(vut, scenario):
@@ -90,9 +79,34 @@ def run(vut, scenario):
         return dict(ground.run(cases))
 
 
+class TestSeverity:
+    @pytest.mark.parametrize(
+        ("states", "severity"),
+        [
+            # 5 m long: bodies overlap in the second row, by half a metre.
+            ([(-10.0, 30.0, 0.0, 20.0), (-4.5, 30.0, 0.0, 20.0)], "contact"),
+            ([(-5.5, 30.0, 0.0, 30.0)], "conflict"),
+            ([(-20.0, 30.0, 0.0, 30.0)], "safe"),
+        ],
+    )
+    def test_is_of_the_motion(self, states, severity):
+        after = followed(*states).after
+        motion = replace(ending(20.0), motion=after[:1]).motion
+        measures = measure(replace(followed(*states), motion=motion))
+        assert measures.severity == severity
+        assert (measures.impact_speed_mps == 10.0) is (severity == "contact")
+
+    @pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])
+    def test_is_harsh_where_a_car_behind_did_brake(self, braking, severity):
+        episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))
+        episode.after[0, :, 2] = braking, -4.0  # the VUT, ahead of it, may brake as it likes
+        measures = measure(replace(episode, motion=episode.after[:1]))
+        assert (measures.severity, measures.after_brake_mps2) == (severity, -braking)
+
+
 class TestDrivingOn:
     def test_changes_nothing_up_to_m(self):
-        at_m, behind = run("design1", US23), run("design1", FOLLOWED)
+        at_m, behind = run("design1", AT_M), run("design1", FOLLOWED)
         for index, merged in at_m.items():
             on = behind[index]
             assert np.array_equal(on.motion, merged.motion)
@@ -109,6 +123,12 @@ class TestDrivingOn:
             assert np.allclose(x[1:], x[:-1] + v[:-1] * DT_S, atol=1e-9)
             assert np.allclose(v[1:], np.maximum(v[:-1] + a[:-1] * DT_S, 0.0), atol=1e-9)
             assert (x[:, VUT] >= 0.0).all()
+
+    def test_a_car_behind_the_vut_brakes_for_it(self):
+        slow = replace(US23, v_vut0_mps=12.0, level0_a_mps2=0.1)
+        behind = [t for t in run("level0", slow).values() if t.after[0, 0, 0] < t.after[0, VUT, 0]]
+        assert behind
+        assert min(t.after[:, 0, 2].min() for t in behind) < -1.0
 
     def test_ends_where_the_vut_goes_wrong_and_the_merge_stays(self, tmp_path):
         (tmp_path / "ends.py").write_text(

@@ -15,7 +15,7 @@ from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenari
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.world import World
-from merge_sumo.verdict.score import measure
+from merge_sumo.verdict.score import FOLLOWED_UP, measure
 from merge_sumo.vuts.base import VutOptions, seen_in
 from merge_sumo.vuts.factory import VutFactory
 
@@ -90,7 +90,9 @@ class TestCarsOfTheMainline:
             # A car far behind may still have to brake a little.
             found = measure(other)
             assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
-            assert replace(found, brake_after_mps2=measure(one).brake_after_mps2) == measure(one)
+            of_all = ("brake_after_mps2", *FOLLOWED_UP)
+            same = {name: getattr(measure(one), name) for name in of_all}
+            assert replace(found, **same) == measure(one)
 
     def test_brake_behind_one_that_brakes_and_never_touch_it(self):
         following, rng = Following(50), np.random.default_rng(0)

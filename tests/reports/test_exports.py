@@ -119,7 +119,7 @@ class TestAMergeFromALane:
         road, folder = road_for(made.scenario), tmp_path_factory.mktemp("osc") / "case"
         return write_openscenario(made, 0, folder, road)
 
-    def test_is_the_last_step_of_the_trajectory_and_then_a_lane_change(self, made, scenario):
+    def test_is_a_step_of_the_trajectory_from_lane_to_lane(self, made, scenario):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             xosc.ParseOpenScenario(str(scenario))
@@ -129,19 +129,8 @@ class TestAMergeFromALane:
         assert {y for _, x, y, _ in before if x > -70.0} == {-3.2}
         assert len([x for _, x, _, _ in before if x > -70.0]) > 30
         assert merge == pytest.approx((trajectory.t_end_s, x_vut[-1], 0.0, 0.0), abs=1e-8)
-        (change,) = tree.iterfind(".//LaneChangeAction")
-        assert change.find("LaneChangeActionDynamics").get("dynamicsShape") == "step"
-        target = change.find("LaneChangeTarget/RelativeTargetLane")
-        assert (target.get("entityRef"), target.get("value")) == ("pov", "0")
-        for who in ("pov", "vut"):
-            afterwards = tree.find(f".//Event[@name='{who} afterwards']")
-            begins = afterwards.find(".//SimulationTimeCondition").get("value")
-            assert float(begins) == trajectory.t_end_s
         stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
-        assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s + 1.0)
-
-        free = etree.parse(scenario.with_name(f"{scenario.stem}-free.xosc"))
-        assert free.find(".//LaneChangeAction") is None, "it is left to a free VUT"
+        assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s)
 
     def test_has_a_road_whose_entry_lane_ends(self, scenario):
         tree = etree.parse(scenario.with_name("road.xodr"))

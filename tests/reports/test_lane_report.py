@@ -54,7 +54,7 @@ class TestSentences:
         assert {"Δx at the merge m", "braking asked after the merge m/s²"} <= {*titles}
         found = meanings(LANE)
         assert found[Severity.CONTACT] == "bodies touch at the merge or within 5 s after it"
-        assert found[Severity.HARSH].endswith("brake harder than 3 m/s² after the merge")
+        assert found[Severity.HARSH].endswith("harder than 3 m/s² within 5 s after the merge")
 
 
 def test_merges_are_among_the_facts_of_each_level_beside_published_figures(made, page):

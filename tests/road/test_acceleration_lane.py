@@ -144,7 +144,7 @@ class TestAScenario:
 
     def test_at_a_point_on_such_a_road_warns_and_says_where_its_vut_starts(self, tmp_path):
         scenario, lines = self.new(tmp_path, *LANES["lane drop"], point=True)
-        assert (scenario.lane_m, scenario.follow_up_s) == (None, 0.0)
+        assert (scenario.lane_m, scenario.follow_up_s) == (None, 3.0)
         assert "lane_end" not in (tmp_path / "mine.toml").read_text()
         assert any(line.startswith("kind: merge at the point M, as asked for") for line in lines)
         lane, start = api.check_scenario(scenario).record["warnings"]

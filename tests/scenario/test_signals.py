@@ -14,7 +14,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.scenario import POV, US23, VUT
 from merge_sumo.scenario.signals import (
     CHARACTERS,
     MOST_NAMES,
@@ -62,12 +62,13 @@ def test_every_step_has_what_was_left_at_it(campaign):
     for outcome in Run(run.folder).outcomes:
         found = Run(run.folder).trajectory(outcome.index)
         assert found.signals is not None
-        gap_m = found.x_pov_m - found.x_vut_m
+        x_pov_m, x_vut_m = found.whole[:, POV, 0], found.whole[:, VUT, 0]
+        gap_m = x_pov_m - x_vut_m
         left = found.signals["gap_m"]
         assert left[-1] is None, "nobody acts in the last row"
         assert left[:-1] == pytest.approx(gap_m[:-1], rel=1e-5)
         yields = np.array(found.signals["mode"][:-1]) == "yield"
-        begins = (found.x_vut_m[:-1] > -60.0) & (np.abs(gap_m[:-1]) < 15.0)
+        begins = (x_vut_m[:-1] > -60.0) & (np.abs(gap_m[:-1]) < 15.0)
         assert np.array_equal(yields, np.maximum.accumulate(begins))
 
 

@@ -167,7 +167,7 @@ class TestAnHonestRecordReplaysIdentically:
     def test_of_a_campaign(self, run, tmp_path, failed):
         outcome = next(o for o in run.outcomes if o.failed is failed)
         export_case(run, outcome.index, tmp_path / "case")
-        steps = len(run.trajectory(outcome.index).motion) - 1
+        steps = len(run.trajectory(outcome.index).whole) - 1
         assert_identical(tmp_path / "case", steps)
 
     @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
@@ -276,8 +276,8 @@ def without_vut(record: etree._Element) -> None:
 
 
 CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
-    (many(HOLD_STEPS), "must have from 11 to 1211 timesteps"),
-    (many(MAX_TIMESTEPS + 1), "must have from 11 to 1211 timesteps"),
+    (many(HOLD_STEPS), "must have from 11 to 1511 timesteps"),
+    (many(MAX_TIMESTEPS + 1), "must have from 11 to 1511 timesteps"),
     (lambda record: record[ROW].set("time", "4.05"), "every 0.1 s"),
     (lambda record: record[ROW].attrib.pop("time"), RECORD),
     (lambda record: record[ROW].append(copy.deepcopy(record[ROW][1])), "two rows of vut at 4 s"),

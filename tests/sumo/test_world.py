@@ -122,7 +122,7 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
         call, calls = getattr(world, half_step), iter(range(10_000))
 
         def failing(*arguments):
-            if next(calls) == 100:
+            if next(calls) == 50:
                 raise SimulationError("the simulation broke")
             call(*arguments)
 

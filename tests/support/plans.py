@@ -46,4 +46,6 @@ def key_of(
 ) -> TruthKey:
     """Return what a truth is kept under."""
     options = VutOptions(policies=POVS.policies, deadline_s=deadline_s)
-    return TruthKey(plan_for(VutFactory.of(vut, options)).key(level), level, cases, seed)
+    return TruthKey(
+        plan_for(VutFactory.of(vut, options)).for_verdicts().key(level), level, cases, seed
+    )

@@ -1,7 +1,7 @@
-"""Contact, conflict, harsh and safe against a second calculation: polygons, and braking in steps.
+"""Contact, conflict, harsh and safe against a second calculation: polygons, and rows of the motion.
 
-It shares nothing with the package but the points of the lanes: rectangles are shapely's, contact
-after M and braking are found by moving both cars in steps of a millisecond.
+It shares nothing with the package but the points of the lanes: rectangles are shapely's, gaps and
+braking behind M follow from the recorded places and speeds.
 """
 
 from __future__ import annotations
@@ -18,13 +18,11 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Pool
-from merge_sumo.scenario.scenario import LEVELS
+from merge_sumo.scenario.scenario import LEVELS, VUT
 from merge_sumo.scenario.trajectory import Trajectory
 
 LENGTH_M, WIDTH_M, NEAR_M = 5.0, 1.8, 6.0
-REACTION_S, HARSH_MPS2, STEP_S = 0.75, 3.0, 0.001
-CLOSE_CALL_M = 0.03
-"""Nearer to a limit than this the steps of a millisecond cannot tell."""
+HARSH_MPS2, CLOSE_CALL = 3.0, 1e-6
 
 
 def body(road: Corridor, front_m: float, *, on_ramp: bool) -> Polygon:
@@ -49,36 +47,32 @@ def overlap_before_m(road: Corridor, trajectory: Trajectory) -> float:
     return largest
 
 
-def after_m(dx_m: float, dv_mps: float, braking_mps2: float, until_s: float) -> float:
-    """Return the smallest bumper gap behind M: the car behind reacts, then brakes.
-
-    `dx_m` and `dv_mps` are those of the car ahead less those of the car behind.
-    """
-    time_s = np.arange(0.0, until_s, STEP_S)
-    closing = np.where(time_s < REACTION_S, 0.0, -braking_mps2)
-    speed = np.maximum(-dv_mps + np.cumsum(closing) * STEP_S, 0.0) if dv_mps < 0.0 else 0.0 * time_s
-    return float((dx_m - LENGTH_M - np.cumsum(speed) * STEP_S).min())
-
-
 def expected(trajectory: Trajectory) -> str | None:
-    """Return the severity of a merge; None where it is too close to call."""
-    motion = trajectory.motion
-    (x_vut, v_vut), rest = motion[-1, 1, :2], np.delete(motion[-1, :, :2], 1, axis=0)
-    pairs = [(x - x_vut, v - v_vut) if x >= x_vut else (x_vut - x, v_vut - v) for x, v in rest]
-    drive_on_m = min(after_m(dx, dv, 0.0, REACTION_S) for dx, dv in pairs)
-    braking_m = min(
-        after_m(dx, dv, HARSH_MPS2, REACTION_S + max(-dv, 0.0) / HARSH_MPS2 + 0.1)
-        for dx, dv in pairs
+    """Return the severity of a merge by its rows behind M; None where it is too close to call."""
+    assert trajectory.after is not None
+    x_m, v_mps = trajectory.after[:, :, 0], trajectory.after[:, :, 1]
+    cars = [row for row in range(x_m.shape[1]) if row != VUT]
+    at_m = {car: float(x_m[0, car] - x_m[0, VUT]) for car in cars}
+    nearest = min(cars, key=lambda car: abs(at_m[car]))
+    behind = [car for car in cars if at_m[car] < 0.0] + [VUT] * (at_m[nearest] > 0.0)
+    least_m = (
+        min(
+            abs(float(of_car - of_vut))
+            for car in cars
+            for of_car, of_vut in zip(x_m[:, car], x_m[:, VUT], strict=True)
+        )
+        - LENGTH_M
     )
-    nearest_m = min(abs(x - x_vut) for x, _ in rest)
-    near_calls = (drive_on_m, braking_m, nearest_m - NEAR_M)
-    if min(map(abs, near_calls)) < CLOSE_CALL_M:
+    falls = [v_mps[t, row] - v_mps[t + 1, row] for row in behind for t in range(len(v_mps) - 1)]
+    hardest_mps2 = float(max([0.0, *falls])) / 0.1
+    near_m = abs(at_m[nearest]) - NEAR_M
+    if min(abs(least_m), abs(near_m), abs(hardest_mps2 - HARSH_MPS2)) < CLOSE_CALL:
         return None
-    if drive_on_m < 0.0:
+    if least_m < 0.0:
         return "contact"
-    if nearest_m < NEAR_M:
+    if near_m < 0.0:
         return "conflict"
-    return "harsh" if braking_m < 0.0 else "safe"
+    return "harsh" if hardest_mps2 > HARSH_MPS2 else "safe"
 
 
 @pytest.mark.parametrize(

@@ -36,13 +36,14 @@ function motion(i) {
     for (let t = 1; t < rows; t++) places.push(places[t - 1] + speed[t - 1] * DT);
     return places;
   });
-  // On an acceleration lane the last row is that of the merge.
-  const merge = LANE && cases.end[i] === "MERGED" ? x[VUT][rows - 1] : null;
-  return { rows, v, x, met: cases.nearest[i], merge };
+  // Behind this row all drive on after the merge.
+  const until = Math.round(cases.t_end_s[i] / DT);
+  const merge = LANE && cases.end[i] === "MERGED" ? x[VUT][until] : null;
+  return { rows, v, x, met: cases.nearest[i], merge, until };
 }
 
 /* ---------- plots over time ---------- */
-function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], windows = [], dots = [], flags = [], xTicks = 4, yTicks = true, decimals = null }) {
+function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], windows = [], dots = [], flags = [], xTicks = 4, yTicks = true, decimals = null, merged = null }) {
   const [, , w, h] = svg.getAttribute("viewBox").split(" ").map(Number);
   const left = 40, right = w - 12, top = 8, bottom = h - 28;
   const X = (x) => left + (x - xRange[0]) / (xRange[1] - xRange[0] || 1) * (right - left);
@@ -52,6 +53,7 @@ function plot(svg, { xRange, yRange, xLabel, lines, bars = [], bands = [], windo
     const [a, b] = [Y(clamp(high, ...yRange)), Y(clamp(low, ...yRange))];
     draw(svg, "rect", { class: name, x: left, y: a, width: right - left, height: b - a });
   }
+  if (merged !== null) draw(svg, "line", { class: "moment", x1: X(merged), x2: X(merged), y1: top, y2: bottom });
   const step = nice((yRange[1] - yRange[0]) / 5);
   for (let y = Math.ceil(yRange[0] / step) * step; yTicks && y <= yRange[1] + 1e-12; y += step) {
     draw(svg, "line", { class: "grid", x1: left, x2: right, y1: Y(y), y2: Y(y) });
@@ -86,17 +88,17 @@ function range(values, pad = 0.06) {
 const slider = byId("time"), view = new TopView(byId("road"));
 let moving = null, step = 0, final = 0, playing = false, last = 0, charts = [];
 function animate(first, flags, more) { // flags: who begins to brake, and when; more: further charts up to a time
-  const { v, x, met, rows, merge } = moving = first;
+  const { v, x, met, rows, merge, until } = moving = first;
   const over = (values) => values.map((value, t) => [t * DT, value]);
   const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
   const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
   const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
   final = rows - 1;
-  const end = final * DT, common = { xRange: [0, end], xLabel: "time, s" };
+  const end = final * DT, common = { xRange: [0, end], xLabel: "time, s", merged: until < final ? until * DT : null };
   charts = [
     plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
-    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x), windows: LANE ? [LANE] : [], dots: merge === null ? [] : [{ name: "merged", x: end, y: merge }] }),
+    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x), windows: LANE ? [LANE] : [], dots: merge === null ? [] : [{ name: "merged", x: until * DT, y: merge }] }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
       lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
@@ -142,9 +144,9 @@ function TopView(svg) {
     if (moving.merge !== null) across("merge", data.main, data.ramp, Math.min(moving.merge, end));
   };
   this.at = (t) => {
-    const { rows, x: xs, v: vs, merge } = moving, k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
+    const { rows, x: xs, v: vs, merge, until } = moving, k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
     const mix = (values) => values[k] + (t - k) * (values[next] - values[k]); // between two rows
-    const merged = merge !== null && t >= rows - 1;
+    const merged = merge !== null && t >= until;
     const places = xs.map((x, who) => pose(who === VUT && !merged ? data.ramp : data.main, mix(x)));
     const vutAbove = places[VUT].y > places[POV].y;
     // The view follows all cars, never closer than 90 m.

@@ -70,7 +70,6 @@ function words(i) {
   } else {
     parts.push(`${end}: ${(cases.error[i] || "no reason given").replace(/\.?$/, ".")}`);
   }
-  if (cases.before_clearance_m[i] !== null && cases.before_clearance_m[i] < 0) parts.push(`Bodies overlap before ${PLACE}, where the lanes run together.`);
   if (LANE && cases.stood_s[i] > 0) parts.push(`The VUT stood on the lane for ${fixed(cases.stood_s[i], 1)} s.`);
   if (cases.margin[i] !== null) {
     parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
@@ -337,7 +336,7 @@ function show(i) {
 function showMotion(i) {
   const flags = [[moving.met, cases.pov_brakes_s[i]], [VUT, cases.vut_brakes_s[i]]].filter(([, t]) => t !== null);
   animate(moving, flags, (end) => [...signalCharts(i, end), ...whyCharts(i)]);
-  at(failed(i) ? final : 0);
+  at(failed(i) ? moving.until : 0);
 }
 function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
   const found = data.why[cases.index[i]];
@@ -350,9 +349,9 @@ function whyCharts(i) { // why it failed: until when something could be done, an
   return [moments(byId("why-time"), i)];
 }
 function moments(svg, i) { // both distances to M, and the last moments at which something helps
-  const { rows, x } = moving, end = (rows - 1) * DT;
-  const lines = vehicles.map((name, who) => ({ name, points: x[who].map((place, t) => [t * DT, -place]) }));
-  const dots = [{ name: "merged", x: end, y: -x[VUT][rows - 1] }];
+  const { until, x } = moving, end = until * DT;
+  const lines = vehicles.map((name, who) => ({ name, points: x[who].slice(0, until + 1).map((place, t) => [t * DT, -place]) }));
+  const dots = [{ name: "merged", x: end, y: -x[VUT][until] }];
   const yRange = range(lines.flatMap(({ points }) => points.map(([, y]) => y)));
   const chart = plot(svg, { xRange: [0, end], yRange, xLabel: "time, s", lines, dots }), [top, bottom] = [8, 162];
   const never = cases.kind[i] !== null && cases.last_avoidable_s[i] === null, closes = never ? 0 : cases.last_avoidable_s[i];
