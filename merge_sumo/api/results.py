@@ -16,7 +16,7 @@ from merge_sumo.campaigns.stopping import LITTLE, WINDOW
 from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import STARTS_THAT_FAIL, Fact, facts_of, table_lines
-from merge_sumo.reports.motion import lines_of, verdict_of
+from merge_sumo.reports.motion import lines_of
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -32,6 +32,7 @@ from merge_sumo.verdict.campaign_verdict import (
     parse_gates,
     shortened,
 )
+from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.plausibility import doubts
 from merge_sumo.verdict.score import Measures, Outcome
@@ -291,12 +292,12 @@ class CaseRun(Result):
         return self.measures.end is End.MERGED and not self.failed
 
     @property
-    def verdict(self) -> str:
-        """Outcome in a sentence."""
-        return verdict_of(self.outcome, self.trajectory)
+    def cause(self) -> str:
+        """What happened, in a sentence; for a failure also until when it was avoidable."""
+        return cause(self.outcome, self.trajectory)
 
     def __repr__(self) -> str:
-        return f"<case: {self.verdict}>"
+        return f"<case: {self.cause}>"
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo run --json` prints: outcome, motion and signals of the VUT."""

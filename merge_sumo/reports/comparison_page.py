@@ -16,6 +16,7 @@ from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import VEHICLES, VUT
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
+from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import replace_own
 from merge_sumo.verdict.campaign_verdict import judge
 
@@ -69,8 +70,8 @@ def _maps(step: Step) -> dict[int, Any]:
 def _sections(step: Step, runs: Sequence[Run | None]) -> list[tuple[Change, int, Any]]:
     """Return each change with the number of its cases, and of the first of them both motions.
 
-    A case is shown as the pair of the versions, each with its run, its outcome, and its charts,
-    which are none without a motion.
+    A case is shown as the pair of the versions, each with its run, its outcome, its cause, and
+    its charts, which are none without a motion.
     """
     sections, left = [], SHOWN
     of_versions = runs[step.before - 1], runs[step.after - 1]
@@ -78,20 +79,19 @@ def _sections(step: Step, runs: Sequence[Run | None]) -> list[tuple[Change, int,
         cases = [case for case in step.cases if case.change is change]
         shown = cases[:left]
         left -= len(shown)
+        outcomes = [one.a for one in shown], [one.b for one in shown]
+        sides = list(zip(of_versions, outcomes, strict=True))
         motions = [
-            {} if run is None else run.trajectories(own)
-            for run, own in zip(
-                of_versions,
-                ([one.a.index for one in shown], [one.b.index for one in shown]),
-                strict=True,
-            )
+            {} if run is None else run.trajectories(o.index for o in own) for run, own in sides
         ]
+        said = [{} if run is None else causes(run, own) for run, own in sides]
         rows = []
         for one in shown:
             own = [found.get(o.index) for found, o in zip(motions, (one.a, one.b), strict=True)]
             both = [motion for motion in own if motion is not None]
             charts = [[] if motion is None else _charts(motion, both) for motion in own]
-            rows.append((one, list(zip(of_versions, (one.a, one.b), charts, strict=True))))
+            words = said[0].get(one.a.index), said[1].get(one.b.index)
+            rows.append((one, list(zip(of_versions, (one.a, one.b), words, charts, strict=True))))
         if cases:
             sections.append((change, len(cases), rows))
     return sections

@@ -21,11 +21,11 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against
+from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
-from merge_sumo.verdict.campaign_verdict import GateResult, Verdict, message_of
+from merge_sumo.verdict.campaign_verdict import GateResult, Verdict
 from merge_sumo.verdict.chance import by_case
 from merge_sumo.verdict.score import Outcome
 
@@ -59,11 +59,12 @@ def write_junit(
         _step(root, f"against {earlier}", compared.steps[0])
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
     shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
+    said = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
     for level, _ in by_level(facts)[1]:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.cases:
             if outcome.case.level == level:
-                _case(suite, outcome, shares.get(outcome.index, ""))
+                _case(suite, outcome, shares.get(outcome.index, ""), said.get(outcome.index))
     _write(path, root)
 
 
@@ -116,19 +117,15 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
                 _wrong(test, "failure", REGRESSION, one.became)
 
 
-def _case(suite: etree._Element, outcome: Outcome, runs: str) -> None:
+def _case(suite: etree._Element, outcome: Outcome, runs: str, cause: str | None) -> None:
+    """Add a case; it has a cause where it did not pass."""
     case, measures = outcome.case, outcome.measures
     name = f"case {outcome.index}: {described(case)}{runs}"
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
-    if measures.end.is_error:
-        _wrong(test, "error", measures.end.value, message_of(outcome))
-    elif not outcome.is_tested:
-        _wrong(test, "failure", End.TIMEOUT.value, message_of(outcome))
-    elif outcome.failed:
-        parts = [measures.became, f"margin {outcome.margin:.3g}"]
-        if measures.impact_speed_mps is not None:
-            parts.append(f"relative speed {measures.impact_speed_mps:.1f} m/s")
-        _wrong(test, "failure", measures.severity or FAILED, ", ".join(parts))
+    if cause is not None:
+        tag = "error" if measures.end.is_error else "failure"
+        kind = (measures.severity or FAILED) if outcome.is_tested else measures.end
+        _wrong(test, tag, kind, cause)
 
 
 def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> etree._Element:

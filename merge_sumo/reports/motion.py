@@ -1,4 +1,4 @@
-"""One episode for a terminal: its verdict in words, its measures, and its motion as a table."""
+"""One episode for a terminal: its cause, its measures, and its motion as a table."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ from collections.abc import Iterator
 from typing import Final
 
 from merge_sumo.scenario.coordinates import described
-from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, level_name
-from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.verdict.campaign_verdict import message_of
-from merge_sumo.verdict.diagnosis import diagnose
-from merge_sumo.verdict.score import Measures, Outcome, measures_in
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
+from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.verdict.cause import cause, met
+from merge_sumo.verdict.score import Outcome, measures_in
 
 LABEL: Final = 31
 """Characters of the name of a measure; more where one is longer."""
 
 
 def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
-    """Return an episode as a terminal shows it: the case, the verdict, measures and motion."""
+    """Return an episode as a terminal shows it: the case, its cause, measures and motion."""
     case = outcome.case
     lines = [
         f"case: level {level_name(case.level)}, {described(case)}",
-        verdict_of(outcome, trajectory),
+        cause(outcome, trajectory),
     ]
     if outcome.margin is not None:
         verb = "fails" if outcome.failed else "does not fail"
@@ -29,44 +28,15 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
     return [*lines, "", *_measures(outcome), "", *motion_lines(trajectory)]
 
 
-def verdict_of(outcome: Outcome, trajectory: Trajectory) -> str:
-    """Return the verdict on an episode as a sentence."""
-    found, place = outcome.measures, outcome.case.scenario.place
-    met, speed = _met(found), found.impact_speed_mps
-    at = f"{found.end.value} at {found.t_end_s:g} s"
-    became = f"{at}, {found.severity}"
-    if speed is not None:
-        became += f" at a relative speed of {speed:.1f} m/s"
-    if found.end is End.COMPLETED:
-        return became
-    if found.end is not End.MERGED:
-        return f"{at}: {message_of(outcome)}"
-    first = "VUT" if found.merged_first == "VUT" else met
-    apart = f"the front bumper of the {first} is {abs(found.dx_m or 0.0):.1f} m ahead at {place}"
-    if met != "POV" and first == "VUT":
-        apart += f" of that of the {met}"
-    if found.lane_share is not None:
-        share = found.lane_share
-        where = "where the lane ends" if share >= 1.0 else f"after {share:.0%} of the lane"
-        apart = f"the VUT merges {where}, {apart}"
-    kind = diagnose(trajectory, found).kind
-    return f"{became}: {apart}{'' if kind is None else f' ({kind}: {kind.meaning})'}"
-
-
-def _met(found: Measures) -> str:
-    """Return the car of the mainline that the measures are of: the nearest at the end."""
-    return "POV" if found.nearest == VEHICLES[POV] else f"car {found.nearest}"
-
-
 def _measures(outcome: Outcome) -> Iterator[str]:
-    found, scenario, met = outcome.measures, outcome.case.scenario, _met(outcome.measures)
-    if met != "POV":
-        yield f"  of the {met}, which is nearest to the VUT at the end:"
+    found, scenario, other = outcome.measures, outcome.case.scenario, met(outcome.measures)
+    if other != "POV":
+        yield f"  of the {other}, which is nearest to the VUT at the end:"
     listed = [
         (text, value, measure.unit)
         for measure in measures_in(scenario)
         if (value := found.value(measure.name)) is not None
-        and (text := measure.label_in(scenario).replace("POV", met))
+        and (text := measure.label_in(scenario).replace("POV", other))
     ]
     width = max([LABEL, *(len(text) for text, _, _ in listed)])
     for text, value, unit in listed:

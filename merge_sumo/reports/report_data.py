@@ -27,12 +27,12 @@ from merge_sumo.scenario.scenario import (
 )
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.studies.explanation import in_words, name_and_unit
 from merge_sumo.studies.surface import Grid, Surface, nodes
 from merge_sumo.system.records import to_plain
 from merge_sumo.verdict.campaign_verdict import shortened
 from merge_sumo.verdict.chance import RunsOfCase
-from merge_sumo.verdict.diagnosis import Diagnosis
 from merge_sumo.verdict.measures import Measure
 from merge_sumo.verdict.score import Outcome, measures_in
 from merge_sumo.verdict.severity import Severity
@@ -48,9 +48,6 @@ COUNT_GRID: Final = (32, 20)
 GRID: Final[dict[int, Grid]] = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
 
-UNKNOWN: Final = Diagnosis(None, None, False, False, None)
-"""Of a case whose motion is lost."""
-
 Axes = tuple[int, int]
 """Places of two coordinates in the pool's order."""
 
@@ -60,13 +57,16 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     scenario, lane_m = model.run.scenario, lane_of(model.run.scenario)
     speeds, offsets = packed(model.motion)
     columns = [m for m in measures_in(scenario) if m.column]
-    rows = [_row(model, o, offsets.get(o.index, 0), columns) for o in model.shown]
+    said = causes(model.run, model.shown)
+    rows = [
+        _row(model, o, offsets.get(o.index, 0), columns) | {"cause": said[o.index]}
+        for o in model.shown
+    ]
     shown = {o.index for o in model.shown}
     others = [o for o in model.cases if o.index not in shown]
     return {
         "dt": DT_S,
         "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
-        "goal": scenario.goal,
         "lane": lane_m,
         "place": "M" if lane_m is None else scenario.place,
         "vehicles": VEHICLES[: scenario.vehicles],
@@ -103,8 +103,8 @@ def page_data(model: ReportModel) -> dict[str, Any]:
 def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]) -> dict[str, Any]:
     """Return a case by column; it has no rows where its motion is not known."""
     motion, measures = model.motion.get(o.index), o.measures
-    avoidance = model.avoidance.get(o.index)
-    row = {
+    avoidance, course = model.avoidance.get(o.index), model.diagnoses.get(o.index)
+    row: dict[str, Any] = {
         "index": o.index,
         "level": o.case.level,
         **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in model.coordinates},
@@ -120,7 +120,8 @@ def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]
         "region": model.regions.get(o.index),
         "last_avoidable_s": _rounded(measures.last_avoidable_s, 1),
         **{m.name: _rounded(measures.value(m.name), 4) for m in columns},
-        **to_plain(model.diagnoses.get(o.index, UNKNOWN)),
+        "vut_brakes_s": course and course.vut_brakes_s,
+        "pov_brakes_s": course and course.pov_brakes_s,
         "kind": model.kinds.get(o.index),
     }
     if model.avoidance:
@@ -152,7 +153,7 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
         ]
         axes = zip(titles, (*known.start, *known.parameters), strict=True)
         found[index] = {
-            "words": list(in_words(known, outcome, model.avoidance.get(index))),
+            "words": list(in_words(known, outcome.case)),
             "axes": [{**to_plain(axis), "name": name, "unit": unit} for (name, unit), axis in axes],
         }
     return found

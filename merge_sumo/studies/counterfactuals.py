@@ -40,10 +40,13 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.sumo.world import World
 from merge_sumo.system.records import Record
+from merge_sumo.system.suggestions import either
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.bodies import CentreLines
+from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.merge import brake_after_mps2
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.process import LOG
 
@@ -84,9 +87,27 @@ class Avoidance(Record, frozen=True):
     latest_takeover_s: EpisodeTime | None
     pov_careful: bool
 
+    @property
+    def clause(self) -> str:
+        """The drivers that would have avoided it, in words."""
+        by = either(self.avoided_by) if self.avoided_by else "no reference driver"
+        text = f"in the place of the VUT {by} would have avoided it"
+        if self.latest_takeover_s is not None:
+            text += f", {TAKES_OVER} by taking over until {self.latest_takeover_s:.1f} s"
+        return f"{text}; so would a careful POV" if self.pov_careful else text
+
 
 AVOIDANCE: Final = StudyFile("avoidance.jsonl", Avoidance)
 """One line per failure; of very many, the worst."""
+
+
+def causes(run: Run, outcomes: Sequence[Outcome]) -> dict[int, str]:
+    """Return by index the causes of cases of a campaign, with the drivers that would help."""
+    known, motions = AVOIDANCE.read_lines(run), run.trajectories(o.index for o in outcomes)
+    clauses = {index: found.clause for index, found in known.items()}
+    return {o.index: cause(o, motions.get(o.index), clauses.get(o.index, "")) for o in outcomes}
+
+
 Failure = tuple[int, Trajectory]
 """The index of a failing case, and its recorded motion."""
 

@@ -29,7 +29,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.coordinates import coordinates, described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
+from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.printable import quoted
@@ -186,10 +186,9 @@ class ExplanationResult(Result):
         return {**to_plain(self.found), "file": str(self.run.folder / EXPLANATIONS.name)}
 
     def lines(self) -> list[str]:
-        """Return the failure, its changes, and a command that runs the smallest."""
+        """Return the failure, its cause, its changes, and a command that runs the smallest."""
         outcome, folder = self.run.outcome(self.found.index), quoted(self.run.folder)
-        avoidance = AVOIDANCE.read_lines(self.run).get(self.found.index)
-        words = in_words(self.found, outcome, avoidance)
+        words = *causes(self.run, [outcome]).values(), *in_words(self.found, outcome.case)
         lines = [f"case {outcome.index}, POV level {level_name(outcome.case.level)}: "]
         lines[0] += described(outcome.case)
         lines += [f"  {sentence}" for sentence in words]
@@ -369,22 +368,16 @@ def pass_of(results: Episodes) -> list[bool]:
     return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
 
 
-def in_words(
-    found: Explanation, outcome: Outcome, avoidance: Avoidance | None = None
-) -> Iterator[str]:
-    """Yield what is known of a failure: axes, levels, and until when something helped.
-
-    `avoidance` says which drivers would have avoided it, where that is known.
-    """
+def in_words(found: Explanation, case: Case) -> Iterator[str]:
+    """Yield the changes of a failure with which it passes: along axes, and at other levels."""
     for axis in found.start:
-        yield _axis_in_words(axis, *name_and_unit(outcome.case, axis.name))
+        yield _axis_in_words(axis, *name_and_unit(case, axis.name))
     for axis in found.parameters:
         yield _axis_in_words(axis, f"the VUT's {axis.name}", "")
     for level, passes in found.levels.items():
         psi = f", psi {PSI:g}" if level == level_name(2) else ""
         verb = "passes" if passes else "does not pass"
         yield f"the same start {verb} at level {level}{psi}"
-    yield from _last_moment(outcome, avoidance)
 
 
 def name_and_unit(case: Case, field: str) -> tuple[str, str]:
@@ -402,20 +395,3 @@ def _axis_in_words(axis: Axis, name: str, unit: str) -> str:
         f"{name} is {text(axis.value)}; passes at {passing} (tried from {text(axis.low)} to "
         f"{text(axis.high)}, every {text(axis.step)})"
     )
-
-
-def _last_moment(outcome: Outcome, avoidance: Avoidance | None) -> Iterator[str]:
-    """Yield until when the VUT could still do something."""
-    measures, scenario = outcome.measures, outcome.case.scenario
-    kept = f"{scenario.dx_crash_m:g} m at {'M' if scenario.place == 'M' else 'this place'}"
-    if measures.last_avoidable_s is not None:
-        yield (
-            f"the last way out closes at {measures.last_avoidable_s:.1f} s: after that neither "
-            f"full braking nor full acceleration of the VUT keeps {kept}, with the POV moving as "
-            "it did, and then at its last speed"
-        )
-    elif measures.avoidable is False:
-        yield f"at no time would full braking or full acceleration of the VUT have kept {kept}"
-    if avoidance is not None and avoidance.latest_takeover_s is not None:
-        until_s = avoidance.latest_takeover_s
-        yield f"the fuzzy safety model can take over until {until_s:.1f} s and avoid it"

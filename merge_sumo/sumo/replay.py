@@ -55,6 +55,7 @@ class Replay(Result):
         rows: rows that were compared.
         diverged_at_s: time of the first row that differs; None where none does.
         detail: in what it differs.
+        words: the case and its cause, as the folder has them.
     """
 
     computed = ("identical",)
@@ -62,6 +63,7 @@ class Replay(Result):
     rows: int
     diverged_at_s: float | None
     detail: str
+    words: tuple[str, ...] = ()
 
     @property
     def identical(self) -> bool:
@@ -69,10 +71,10 @@ class Replay(Result):
         return self.diverged_at_s is None
 
     def lines(self) -> list[str]:
-        """Return whether the replay is identical, in a line."""
+        """Return the case and its cause, and whether the replay is identical."""
         if self.diverged_at_s is None:
-            return [f"identical: {self.rows} rows of x, y, position and speed"]
-        return [f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
+            return [*self.words, f"identical: {self.rows} rows of x, y, position and speed"]
+        return [*self.words, f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
 
 
 def replay(folder: Path) -> Replay:
@@ -95,7 +97,16 @@ def replay(folder: Path) -> Replay:
     name = f"SUMO's replay of {folder}"
     replayed = _rows(received.parse(written, allowed.REPLAYED, name), name)
     fault = _difference(episode, replayed) or _fault_of_record(episode)
-    return Replay(len(episode.rows), *(fault or (None, "")))
+    diverged_at_s, detail = fault or (None, "")
+    return Replay(len(episode.rows), diverged_at_s, detail, _words(episode.labels))
+
+
+def _words(labels: etree._Element | None) -> tuple[str, ...]:
+    """Return the case and its cause, as the labels of lines have them, where there are any."""
+    lines = () if labels is None else labels.iterfind("poi[param]")
+    texts = [str(poi[0].get("value")) for poi in lines if poi.get("id", "").startswith("line")]
+    cause = ". ".join(texts[1:]).replace(":. ", ": ")
+    return (texts[0], f"{cause}.") if cause else ()
 
 
 Rows = dict[tuple[float, str], tuple[float, ...]]

@@ -30,6 +30,7 @@ from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
 from merge_sumo.system.records import to_json
+from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.merge import merged_rows
 from merge_sumo.verdict.score import Outcome
 
@@ -84,9 +85,9 @@ NAMES: Final = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car
 TEXT: Final = "text"
 """Parameter of a point of interest that is shown."""
 INK: Final = "0.1,0.1,0.1"
-LINES: Final = (0.45, 0.40)
+LINES: Final = (0.465, 0.43, 0.395, 0.36)
 """Heights of the lines above the middle of the picture, as shares of its height."""
-LEGEND: Final = 0.36
+LEGEND: Final = 0.325
 """Height of the dots."""
 RAISED: Final = 0.022
 """Height at which a text is drawn above its place, as a share of the picture's height."""
@@ -135,7 +136,7 @@ def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: T
     """
     written = _road(road, folder)
     record = _fcd(written.corridor, trajectory)
-    labels = labels_of(outcome, _picture(written, record))
+    labels = labels_of(outcome, trajectory, _picture(written, record))
     case = to_json(outcome.to_record(), indent=2)
     write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, labels)})
     return folder / CONFIG
@@ -352,11 +353,14 @@ def beside(text: str, *, ahead: bool) -> str:
     return room + text if ahead else text + room
 
 
-def labels_of(outcome: Outcome, picture: Picture) -> etree._Element:
-    """Return the labels of an episode as an additional file."""
+def labels_of(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree._Element:
+    """Return the labels of an episode as an additional file: the case, its cause, the colours."""
     root = etree.Element("additional")
-    lines = (case_line(outcome.case, outcome.index), verdict_line(outcome))
-    for number, (line, height) in enumerate(zip(lines, LINES, strict=True)):
+    words = cause(outcome, trajectory).removesuffix(".")
+    if outcome.measures.end.is_error:
+        words = words.partition(":")[0]  # A message may hold what labels may not.
+    lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
+    for number, (line, height) in enumerate(zip(lines, LINES, strict=False)):
         at = picture.x_m, picture.y_m + height * picture.height_m
         _label(root, f"line{number}", at, line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
@@ -381,16 +385,6 @@ def case_line(case: Case, index: int | None = None) -> str:
     ]
     named = "" if index is None else f"case {index}, "
     return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
-
-
-def verdict_line(outcome: Outcome) -> str:
-    """Return what became of it."""
-    found = outcome.measures
-    severity = "" if found.severity is None else f"{found.severity}, "
-    failed = "fails" if outcome.failed else "does not fail"
-    end = found.end.value.replace("_", " ").lower()
-    place = "" if found.lane_share is None else f", at {found.lane_share:.2f} of the lane"
-    return f"{severity}{failed}: {end} at {found.t_end_s:.1f} s{place}"
 
 
 def _label(

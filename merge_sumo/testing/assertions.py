@@ -7,9 +7,9 @@ from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.run import failures
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.reports.motion import verdict_of
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
+from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.verdict.score import Outcome
 
@@ -47,7 +47,7 @@ def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
     case, index = outcome.case, outcome.index
     return [
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
-        f"    {verdict_of(outcome, run.trajectory(index))}",
+        f"    {causes(run.run, [outcome])[index]}",
         f"    replay it: merge-sumo replay {quoted(run.folder)} {index} --gui",
         f"    run it again: merge-sumo run --case {quoted(run.folder)} {index}"
         f"{named_again(run.settings)}",

@@ -45,10 +45,10 @@ class Kind(StrEnum):
 
     meaning: str
 
-    STALEMATE = "stalemate", "both brake, and arrive together"
+    STALEMATE = "stalemate", "both brake, and the VUT begins while a way out is left"
     SQUEEZE = "squeeze", "neither loses 1 m/s, and both arrive together"
     POV_BRAKES = "only the POV brakes", "the VUT loses less than 1 m/s, and both arrive together"
-    LATE_BRAKE = "late brake", "only the VUT brakes, and begins when no way out is left"
+    LATE_BRAKE = "late brake", "the VUT begins to brake when no way out is left"
     WEAK_BRAKE = "weak brake", "only the VUT brakes, and begins while a way out is left"
 
     def __new__(cls, name: str, meaning: str) -> Self:
@@ -104,10 +104,9 @@ def _gains(v_mps: FloatArray) -> bool:
 def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | None) -> Kind:
     if vut_s is None:
         return Kind.SQUEEZE if pov_s is None else Kind.POV_BRAKES
-    if pov_s is not None:
-        return Kind.STALEMATE
-    late = way_out_until_s is None or vut_s > way_out_until_s
-    return Kind.LATE_BRAKE if late else Kind.WEAK_BRAKE
+    if way_out_until_s is None or vut_s > way_out_until_s:
+        return Kind.LATE_BRAKE
+    return Kind.WEAK_BRAKE if pov_s is None else Kind.STALEMATE
 
 
 @dataclass(frozen=True, slots=True)

@@ -170,7 +170,7 @@ OURS: Final = (
     ),
     _high(
         "pov_slowdown_mps",
-        "speed of the POV at the start minus its lowest speed up to t1",
+        "largest loss of speed of the POV up to t1, from the highest speed that it had before",
         unit="m/s",
         label="slow-down of the POV",
         column="POV slows by",

@@ -138,7 +138,7 @@ class Measures:
             "vut_max_brake_mps2": hardest_mps2[VUT],
             "pov_max_brake_mps2": hardest_mps2[trajectory.nearest],
             "pov_sustained_brake_mps2": sustained_brake_mps2(v_pov_mps),
-            "pov_slowdown_mps": float(v_pov_mps[0] - v_pov_mps.min()),
+            "pov_slowdown_mps": float((np.maximum.accumulate(v_pov_mps) - v_pov_mps).max()),
             "clipped_steps": trajectory.clipped_steps,
             "error": None if trajectory.error is None else as_reason(trajectory.error),
             "nearest": VEHICLES[trajectory.nearest],

@@ -152,10 +152,11 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
             "all => all.map((m) => m.dataset.case)"
         )
         assert sorted(map(int, drawn)) == [0, 3, 4, 6, 9, 11]
-        assert page.inner_text("#case-words").startswith("VUT_ERROR: boom")
+        assert page.inner_text("#case-words").startswith("VUT_ERROR at ")
         page.locator(".list [data-case='3']").click()
         words = page.inner_text("#case-words")
-        assert words.startswith("Timeout: the VUT did not reach the merge point")
+        assert words.startswith("Timeout: the VUT ")
+        assert "the VUT did not reach the merge point in" in words
         verdict = page.locator("#filters [name=verdict]")
         for label, expected in (
             ("boom (2)", [4, 11]),
@@ -182,7 +183,7 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     known = Explanation(first.index, start, {"0": True, "2": False}, (gap,))
     line = json.dumps(to_plain(known))
     (run.folder / EXPLANATIONS.name).write_text(f"{line}\n", encoding="utf-8")
-    words = list(in_words(known, first))
+    words = list(in_words(known, first.case))
     moments = [
         t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None
     ]

@@ -18,7 +18,6 @@ from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.studies.counterfactuals import Avoidance
 from merge_sumo.studies.explanation import (
     EXPLANATIONS,
     Axis,
@@ -241,25 +240,15 @@ class TestTheFile:
 
 def test_words_by_hand(made):
     outcome = next(o for o in made.outcomes if o.failed and o.case.level == 1)
-    measures = replace(outcome.measures, last_avoidable_s=5.2, avoidable=True)
-    outcome = replace(outcome, measures=measures)
     x = Axis("x_pov0_m", -200.04, -340.0, -180.0, 1.0, 1, below=-203.1, above=-199.0)
     v = Axis("v_pov0_mps", 30.0, 25.0, 35.0, 0.06, 2)
     found = Explanation(outcome.index, (x, v), {"0": True, "2": False})
-    avoidance = Avoidance(outcome.index, ("fsm",), 4.9, False)
-    assert list(in_words(found, outcome, avoidance)) == [
+    assert list(in_words(found, outcome.case)) == [
         "x_POV0 is -200.0 m; passes at -199.0 m or -203.1 m (tried from -340.0 m to -180.0 m, "
         "every 1.0 m)",
         "v_POV0 is 30.00 m/s; passes at no other value (tried from 25.00 m/s to 35.00 m/s, "
         "every 0.06 m/s)",
         "the same start passes at level 0",
         "the same start does not pass at level 2, psi 0",
-        "the last way out closes at 5.2 s: after that neither full braking nor full acceleration "
-        "of the VUT keeps 6 m at M, with the POV moving as it did, and then at its last speed",
-        "the fuzzy safety model can take over until 4.9 s and avoid it",
     ]
-    measures = replace(measures, last_avoidable_s=None, avoidable=False)
-    assert list(in_words(found, replace(outcome, measures=measures)))[-1] == (
-        "at no time would full braking or full acceleration of the VUT have kept 6 m at M"
-    )
     assert found.nearest_start == ("x_pov0_m", -199.0)

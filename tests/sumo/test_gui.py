@@ -18,6 +18,7 @@ import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.sumo.replay_folder import COLOURS, LABELS, VIEW
+from merge_sumo.verdict.cause import cause
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2
@@ -120,13 +121,16 @@ def test_the_cars_meet(pictures):
     assert apart[1] < apart[0]
 
 
-def test_the_window_has_the_case_the_verdict_and_the_colours_of_the_report(run, pictures, tmp_path):
+def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pictures, tmp_path):
     outcome = failures(run.outcomes)[0]
     export_case(run, outcome.index, tmp_path / "case")
     labels = etree.parse(tmp_path / "case" / LABELS).getroot()
-    case, verdict, *legend = [str(param.get("value")) for param in labels.iter("param")]
+    case, head, course, way_out, *legend = [
+        str(param.get("value")) for param in labels.iter("param")
+    ]
     assert case.startswith(f"case {outcome.index}, POV level {outcome.case.level}: x_POV0 ")
-    assert verdict.startswith(f"{outcome.measures.severity}, fails: ")
+    said = cause(outcome, run.trajectory(outcome.index))
+    assert f"{head} {course}. {way_out}." == said
     assert legend == ["POV", "VUT"]
     css = (Path(merge_sumo.__file__).parent / "reports" / "templates" / "report.css").read_text()
     for image in pictures:

@@ -125,6 +125,10 @@ class TestTheKind:
         assert measure(trajectory).last_avoidable_s < 7.5
         assert kind(trajectory) is Kind.LATE_BRAKE
 
+    def test_is_a_late_brake_where_the_pov_brakes_too(self):
+        late = phases((7.5, 1.0), (0.5, -4.0))
+        assert kind(meeting(BRAKES, late, gap_m=0.0)) is Kind.LATE_BRAKE
+
     def test_is_none_where_the_cars_are_6_m_apart(self):
         assert kind(meeting(BRAKES, COASTS, gap_m=30.0)) is None
 

@@ -170,16 +170,16 @@ class TestMeasures:
         measures = measure(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0))
         assert measures.pov_sustained_brake_mps2 == pytest.approx(1.5)
 
-    def test_slow_down_is_from_the_start_to_the_lowest_speed(self):
+    def test_slow_down_is_from_the_highest_speed_before(self):
         # 1.5 m/s2 for the 2.5 s and more that the VUT takes for 50 m at 20 m/s.
         trajectory = eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0)
         slowdown_mps = 1.5 * trajectory.t_end_s
         assert measure(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps)
         assert measure(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 0.0)).pov_slowdown_mps == 0.0
-        # Recovering at the end takes nothing back; what was gained before counts for nothing.
+        # Recovering at the end takes nothing back; what was gained before is lost, too.
         v_mps = trajectory.motion[:, POV, 1]
         v_mps[3], v_mps[-1] = 40.0, 29.0
-        assert measure(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps - 0.15)
+        assert measure(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps - 0.15 + 10.0)
 
     def test_a_collision_on_a_long_ramp_was_avoidable_by_waiting_until_late(self):
         # Both constant at 20 m/s, side by side, 100 m before M. Waiting: a stop takes 50 m.

@@ -41,16 +41,8 @@ function title(i) {
   const place = coordinates.filter((c) => cases[c.field][i] !== null).map((c) => `${c.name} ${valueText(c, cases[c.field][i])}`);
   return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
-function conduct(i) { // what both did, by their speeds
-  const met = NAMES[vehicles[cases.nearest[i]]];
-  const of = (brakes, accelerates) => brakes !== null ? `begins to brake at ${fixed(brakes, 1)} s` : accelerates ? "accelerates" : "keeps its speed within 1 m/s";
-  return `The VUT ${of(cases.vut_brakes_s[i], cases.vut_accelerates[i])}, the ${met} ${of(cases.pov_brakes_s[i], cases.pov_accelerates[i])}.`;
-}
-function placeOfMerge(i) { // on an acceleration lane
-  const share = cases.lane_share[i];
-  return share >= 1 ? "where the lane ends" : `after ${fixed(100 * share, 0)} % of the lane`;
-}
 function words(i) {
+<<<<<<< HEAD
   const end = cases.end[i], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
   const met = NAMES[vehicles[cases.nearest[i]]];
   if (end === "MERGED") {
@@ -88,6 +80,10 @@ function words(i) {
   }
   parts.push(runsInWords(i));
   return parts.filter(Boolean).join(" ");
+=======
+  const margin = cases.margin[i] === null ? "" : `${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
+  return [cases.cause[i], margin, runsInWords(i)].filter(Boolean).join(" ");
+>>>>>>> 99834f04 (Say the cause of a case in the same words in every place)
 }
 
 /* ---------- grids: the surrogate's chance ---------- */
