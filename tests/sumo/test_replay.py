@@ -230,7 +230,8 @@ class TestAMergeFromALane:
         folder = self.written(tmp_path / "case", road, trajectory)
         assert_identical(folder, len(trajectory.motion) - 1)
         share = (trajectory.x_vut_m[-1] - scenario.lane_m[0]) / np.ptp(scenario.lane_m)
-        assert f"at {share:.2f} of the lane" in (folder / LABELS).read_text()
+        merges = "where the lane ends" if share >= 1.0 else f"at {share:.2f} of the lane"
+        assert f"the VUT merges {merges}" in (folder / LABELS).read_text()
         lanes = self.lanes(folder / RECORD)
         *before, first = lanes[: len(trajectory.motion)]
         assert {*lanes[len(before) :]} == {first}
