@@ -77,7 +77,12 @@ def expected(trajectory: Trajectory) -> str | None:
 
 @pytest.mark.parametrize(
     ("scenario", "vut"),
-    [("us23", "design1"), ("roundabout", "level0"), ("us23-traffic", "design2")],
+    [
+        ("us23", "design1"),
+        ("roundabout", "level0"),
+        ("us23-traffic", "design2"),
+        ("us23-lane", "sumo:IDM"),
+    ],
 )
 def test_agrees_with_polygons_and_steps(scenario, vut):
     found = named_scenario(scenario)
