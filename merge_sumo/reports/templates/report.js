@@ -42,48 +42,8 @@ function title(i) {
   return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
 function words(i) {
-<<<<<<< HEAD
-  const end = cases.end[i], parts = [], found = severity(i), at = `${fixed(cases.t_end_s[i], 1)} s`;
-  const met = NAMES[vehicles[cases.nearest[i]]];
-  if (end === "MERGED") {
-    const first = cases.dx_m[i] < 0 ? "VUT" : met, kind = cases.kind[i] === null ? "" : ` (${cases.kind[i]})`;
-    if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}${kind}.`);
-    parts.push(`The VUT ${LANE ? `merges at ${at}, ${placeOfMerge(i)}` : `reaches M at ${at}`}; the front bumper of the ${first} is ${fixed(Math.abs(cases.dx_m[i]), 1)} m ahead.`);
-    if (found === "contact") parts.push(`Bodies touch${cases.bumper_gap_m[i] > 0 ? ` after ${PLACE},` : ""} at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
-    else if (cases.brake_after_mps2[i] === null) parts.push("No braking of the car behind is in time.");
-    else if (cases.brake_after_mps2[i] < 0.1) parts.push(`The car behind has to brake at less than 0.1 m/s² after ${PLACE}.`);
-    else parts.push(`The car behind has to brake at ${fixed(cases.brake_after_mps2[i], 1)} m/s² after ${PLACE}.`);
-  } else if (end === "COMPLETED") {
-    if (found !== null) parts.push(`${found[0].toUpperCase()}${found.slice(1)}.`);
-    parts.push(`The episode ends at ${at}.`);
-    if (cases.impact_speed_mps[i] !== null) parts.push(`Bodies touch at a relative speed of ${fixed(cases.impact_speed_mps[i], 1)} m/s.`);
-  } else if (end === "TIMEOUT") {
-    parts.push(`Timeout: the VUT did not reach ${data.goal} in ${fixed(cases.t_end_s[i], 0)} s.`);
-  } else {
-    parts.push(`${end}: ${(cases.error[i] || "no reason given").replace(/\.?$/, ".")}`);
-  }
-  if (LANE && cases.stood_s[i] > 0) parts.push(`The VUT stood on the lane for ${fixed(cases.stood_s[i], 1)} s.`);
-  if (cases.margin[i] !== null) {
-    parts.push(`${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`);
-  }
-  if (cases.rows[i] && (tested(i) || end === "TIMEOUT")) parts.push(conduct(i));
-  if (cases.kind[i] !== null) {
-    const until = cases.last_avoidable_s[i];
-    const none = LANE ? `Neither full braking nor full acceleration of the VUT would ever have kept ${fixed(CRASH, 0)} m at this place.` : "There never was a way out for the VUT.";
-    parts.push(until === null ? none : `Full braking or full acceleration of the VUT would have kept ${fixed(data.crash_m, 0)} m at ${LANE ? "this place" : "M"} until ${fixed(until, 1)} s.`);
-  }
-  if (cases.avoided_by && cases.avoided_by[i] !== null) {
-    const by = cases.avoided_by[i], until = cases.latest_takeover_s[i];
-    parts.push(by.length ? `In the VUT's place ${by.join(", ")} would have avoided it.` : "No reference driver in the VUT's place would have avoided it.");
-    if (until !== null) parts.push(`The last time at which the fuzzy safety model (fsm) can take over and avoid it is ${fixed(until, 1)} s.`);
-    if (cases.pov_careful[i]) parts.push("A careful driver in the POV's place avoids it, too.");
-  }
-  parts.push(runsInWords(i));
-  return parts.filter(Boolean).join(" ");
-=======
   const margin = cases.margin[i] === null ? "" : `${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
   return [cases.cause[i], margin, runsInWords(i)].filter(Boolean).join(" ");
->>>>>>> 99834f04 (Say the cause of a case in the same words in every place)
 }
 
 /* ---------- grids: the surrogate's chance ---------- */
