@@ -8,20 +8,18 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.campaigns.stopping import LITTLE, WINDOW
 from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import STARTS_THAT_FAIL, Fact, facts_of, table_lines
+from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.motion import lines_of
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.studies.comparison import Change, Comparison, compare_against
-from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.printable import printable
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.campaign_verdict import (
@@ -46,16 +44,8 @@ VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
 `outcomes.jsonl`."""
 
 
-TOLD: Final = {
-    "a case fails when",
-    "cases with contact that are no failures",
-    "cases that ran more than once",
-    "failures that ran too seldom to tell",
-    "failures that reference drivers drove",
-    "failures that driver careful avoids",
-    "failures that a careful POV avoids",
-}
-"""Facts of a campaign as a whole that the terminal lists, too."""
+TOLD: Final = "cases that ran more than once", "failures that ran too seldom to tell"
+"""Facts that the terminal lists beside the headline, where there are any."""
 
 
 class Table(list[dict[str, Any]]):
@@ -173,8 +163,7 @@ class CampaignRun(Result):
     @property
     def converged(self) -> bool:
         """Whether the search ended before its number of cases, as little new was found."""
-        settings = self._run.settings
-        return settings.stop_when_converged and len(self._run.outcomes) < settings.cases
+        return self._run.converged
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
@@ -209,35 +198,22 @@ class CampaignRun(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return the verdict, the facts of each level, and the paths of report and worst case."""
+        """Return the headline, what else is to be known, and the path of the report."""
         run = self._run
         told = [fact for fact in self.facts if fact.level is None and fact.name in TOLD]
+        tested, *found = headline(run, self.facts)
         optional = [
-            self._converged_line() if self.converged else None,
             unrepeatable(self.repeats),
-            self.verdict.counts,
+            tested,
             *self.verdict.trouble_lines(),
-            *table_lines(self.facts),
-            self._shares_line(),
-            *(f"  {fact.name}: {fact.shown}" for fact in told),
-            f"  {run.ran_again_in_words}" if run.settings.ran_again else None,
-            *(f"  note: {note}" for note in doubts(run.cases, run.criterion)),
+            *found,
+            *(f"{fact.name}: {fact.shown}" for fact in told),
+            run.ran_again_in_words if run.settings.ran_again else None,
+            *(f"note: {note}" for note in doubts(run.cases, run.criterion)),
             *self._against_lines(),
             f"report: {self.report_file}",
         ]
-        for outcome in failures(run.cases)[:1]:
-            folder = quoted(run.folder / SCENARIOS / case_name(outcome.index))
-            optional.append(f"worst case: merge-sumo replay {folder} --gui")
-        if again := named_again(self.settings):
-            optional.append(f"run it again: merge-sumo rerun {quoted(self.folder)}{again}")
         return [line for line in optional if line is not None]
-
-    def _shares_line(self) -> str | None:
-        """Return how to measure the share of starts that fail, where that is not known."""
-        if any(fact.name == STARTS_THAT_FAIL for fact in self.facts):
-            return None
-        measure = f"merge-sumo probability {quoted(self.folder)}{named_again(self.settings)}"
-        return f"  {STARTS_THAT_FAIL}: not measured; {measure}"
 
     def _against_lines(self) -> list[str]:
         if self.against is None:
@@ -258,13 +234,6 @@ class CampaignRun(Result):
         """Return what decided whether the campaign passed: the gates, and whether it tested."""
         untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
         return [*(gate.sentence for gate in self.gates), *untested]
-
-    def _converged_line(self) -> str:
-        return (
-            f"stopped after {len(self._run.outcomes)} of {self._run.settings.cases} cases: the "
-            f"last {WINDOW} added less than {LITTLE:.0%} to the coverage of all levels together "
-            "(this says nothing of regions that no case has come near)"
-        )
 
     def __repr__(self) -> str:
         return f"<campaign {self.folder}: {self.verdict.counts}>"

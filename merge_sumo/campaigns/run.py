@@ -28,6 +28,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.coverage.fmc import regions
 from merge_sumo.errors import UserError
 from merge_sumo.options import Search
@@ -167,6 +168,12 @@ class Run:
     def pov(self) -> str:
         """The name of a POV of the tester's own, fit to be shown anywhere."""
         return printable(str(self.settings.pov)[:NAME_CHARACTERS])
+
+    @property
+    def converged(self) -> bool:
+        """Whether the search ended before its number of cases, as little new was found."""
+        may_stop = self.settings.stop_when_converged and len(self.outcomes) < self.settings.cases
+        return may_stop and has_converged(self.outcomes, self.tolerated)
 
     @property
     def interruption(self) -> str:

@@ -7,11 +7,13 @@ take their lines from them. What no study has left in the folder is no fact.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Final
 
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.campaigns.settings import named_again
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.scenario.scenario import lane_of, level_name
@@ -19,8 +21,9 @@ from merge_sumo.studies.counterfactuals import AVOIDANCE
 from merge_sumo.studies.probability import PROBABILITY
 from merge_sumo.studies.share import SHARES
 from merge_sumo.studies.stress import STRESS
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.verdict.campaign_verdict import Verdict
+from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.chance import MOST_RUNS, by_case, is_decided
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.summary import LevelSummary, Summary
@@ -28,8 +31,17 @@ from merge_sumo.verdict.summary import LevelSummary, Summary
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"
 STARTS_THAT_FAIL: Final = "starts that fail"
-TABLE: Final = (STARTS_THAT_FAIL, "cases", "without a verdict", "failures", "regions", "FMC", PLACE)
-"""Facts of levels that stand in the table of a terminal."""
+RULE: Final = "a case fails when"
+AT_MOST: Final = "cases at most; the search converged before"
+TOUCH: Final = "cases with contact that are no failures"
+DRIVEN: Final = "failures that reference drivers drove"
+AVOIDED: Final = "failures that driver {} avoids"
+AVOIDED_BY_POV: Final = "failures that a careful POV avoids"
+WORST: Final = "worst case"
+KIND: Final = "kind of the worst case"
+SCATTERED: Final = "scattered"
+MANY: Final = 10
+"""Failures from which on more than half as many regions are said to be scattered."""
 FAILING: Final = "margin < 0"
 """By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
 
@@ -98,17 +110,71 @@ def by_level(facts: Iterable[Fact]) -> tuple[list[Fact], list[tuple[int, list[Fa
     return columns, [(level, [row.get(c.name) for c in columns]) for level, row in rows.items()]
 
 
-def table_lines(facts: Sequence[Fact]) -> list[str]:
-    """Return the facts of levels as the lines of a table for a terminal."""
-    columns, rows = by_level(fact for fact in facts if fact.name in TABLE)
-    lines = [["level", *(column.name for column in columns)]]
-    for level, row in rows:
-        lines.append([level_name(level), *("-" if fact is None else fact.shown for fact in row)])
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
+    """Return the lines that a person reads first of a campaign; each number is that of a fact."""
+    of = {fact.name: fact for fact in facts if fact.level is None}
+    cases = _counted(of["cases"], "case")
+    if AT_MOST in of:
+        cases = f"{of['cases'].shown} of {of[AT_MOST].shown} cases, converged"
     return [
-        "  " + "  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True))
-        for line in lines
+        f"{of['VUT'].shown}: {RULE} {of[RULE].shown}; {cases}",
+        *_level_lines(facts),
+        *_not_said(run, of, {fact.name for fact in facts}),
+        *_how_bad(run, of),
     ]
+
+
+def _counted(fact: Fact, one: str, several: str = "") -> str:
+    return f"{fact.shown} {one if fact.value == 1 else several or f'{one}s'}"
+
+
+def _level_lines(facts: Iterable[Fact]) -> list[str]:
+    """Return a line for each level, aligned."""
+    lines = []
+    for level, row in by_level(facts)[1]:
+        of = {fact.name: fact for fact in row if fact is not None}
+        share, failures = of.get(STARTS_THAT_FAIL), of.get("failures")
+        cells = [
+            f"level {level_name(level)}",
+            "" if share is None else f"{share.shown} of all starts fail",
+            "nothing tested" if failures is None else f"{_counted(failures, 'failure')} found",
+        ]
+        if failures is not None and failures.value:
+            regions = of["regions"]
+            cells.append(SCATTERED if regions.value == SCATTERED else _counted(regions, "region"))
+            cells.append(f"FMC {of['FMC'].shown}")
+        lines.append(cells)
+    widths = [max(map(len, column)) for column in zip_longest(*lines, fillvalue="")]
+    return [
+        "  ".join(["", *(cell.rjust(w) for cell, w in zip(cells, widths, strict=False) if w)])
+        for cells in lines
+    ]
+
+
+def _not_said(run: Run, of: Mapping[str, Fact], known: set[str]) -> Iterator[str]:
+    """Yield what the failures do not say: contacts under another rule, the share of starts."""
+    parts = []
+    if TOUCH in of:
+        more = _counted(of[TOUCH], "more case touches", "more cases touch")
+        where = run.scenario.said(" after M") if run.criterion.is_papers else ""
+        parts.append(f"{more}{where}, which this rule does not count: `fail_when` unsafe")
+    if STARTS_THAT_FAIL not in known:
+        measure = f"merge-sumo probability {quoted(run.folder)}{named_again(run.record)}"
+        parts.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
+    if parts:
+        yield "; ".join(parts)
+
+
+def _how_bad(run: Run, of: Mapping[str, Fact]) -> Iterator[str]:
+    """Yield how many failures other drivers avoid, and the command that shows the worst."""
+    if AVOIDED_BY_POV in of:
+        by = ", ".join(f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCES)
+        failures = _counted(of.get(DRIVEN, of["failures"]), "failure")
+        pov = of[AVOIDED_BY_POV].shown
+        yield f"avoided of {failures}: by driver {by}, by a careful POV {pov}"
+    if WORST in of:
+        replay = f"merge-sumo replay {quoted(run.folder)} {of[WORST].value} --gui"
+        yield f"{WORST} ({of[KIND].shown}): {replay}"
 
 
 def _tested(run: Run) -> Iterator[Fact]:
@@ -118,9 +184,9 @@ def _tested(run: Run) -> Iterator[Fact]:
     key = "fail_when" if criterion.require is None else "require"
     words = criterion.words
     if criterion.is_papers:
-        place = run.scenario.place
-        words = f"front bumpers within {run.scenario.dx_crash_m:g} m at {place} ({words})"
-    yield Fact("a case fails when", words, "", SETTINGS, key)
+        limit_m = run.scenario.dx_crash_m
+        words = f"front bumpers are within {limit_m:g} m as the VUT reaches {run.scenario.place}"
+    yield Fact(RULE, words, "", SETTINGS, key)
     sampler = f"{settings.sampler}, seed {settings.seed}"
     yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
 
@@ -137,6 +203,8 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
         return Fact(name, number, "", OUTCOMES, key)
 
     yield counted("cases", summary.cases, "lines")
+    if run.converged:
+        yield Fact(AT_MOST, run.settings.cases, "", SETTINGS, "cases")
     if verdict.errors:
         yield counted("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
     if verdict.timeouts:
@@ -145,7 +213,7 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
     if summary.failures:
         yield counted("failures with contact", verdict.contacts, f"{FAILING}, severity: contact")
     for severity, about in (
-        (Severity.CONTACT, "cases with contact that are no failures"),
+        (Severity.CONTACT, TOUCH),
         (Severity.CONFLICT, "cases with a conflict that are no failures"),
         (Severity.HARSH, "cases with harsh braking after the merge that are no failures"),
     ):
@@ -163,7 +231,9 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         yield fact("without a verdict", found.cases - found.tested, "end")
     if found.tested or not found.cases:
         yield fact("failures", found.failures, FAILING)
-        yield fact("regions", found.regions, f"{FAILING}: starts")
+        scattered = found.failures >= MANY and 2 * found.regions > found.failures
+        regions = SCATTERED if scattered else found.regions
+        yield Fact("regions", regions, "", OUTCOMES, f"{FAILING}: starts", level)
         radius = radius_for(len(run.scenario.dimensions(level)))
         yield fact("FMC", found.fmc, f"{FAILING}: starts within {radius:.2g}")
     if lane_of(run.scenario) is not None:
@@ -219,7 +289,11 @@ def _motion(run: Run) -> Iterator[Fact]:
     yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
     if not worst:
         return
-    yield Fact("worst case", worst[0].index, "", OUTCOMES, "lowest margin")
+    yield Fact(WORST, worst[0].index, "", OUTCOMES, "lowest margin")
+    motion = run.trajectories([worst[0].index]).get(worst[0].index)
+    kind, _, _ = cause(worst[0], motion).partition(":")
+    key = "severity, impact_speed_mps; by its motion"
+    yield Fact(KIND, kind[0].lower() + kind[1:], "", OUTCOMES, key)
     known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     if known:
         name = "failures that full braking or full acceleration of the VUT avoids"
@@ -238,17 +312,17 @@ def _avoided(run: Run) -> Iterator[Fact]:
     if not known:
         return
     if len(known) < sum(outcome.failed for outcome in run.cases):
-        yield Fact("failures that reference drivers drove", len(known), "", AVOIDANCE.name, "lines")
+        yield Fact(DRIVEN, len(known), "", AVOIDANCE.name, "lines")
     for name in REFERENCES:
         number = sum(name in one.avoided_by for one in known)
-        yield Fact(f"failures that driver {name} avoids", number, "", AVOIDANCE.name, "avoided_by")
+        yield Fact(AVOIDED.format(name), number, "", AVOIDANCE.name, "avoided_by")
     times = [one.latest_takeover_s for one in known if one.latest_takeover_s is not None]
     if times:
         middle = statistics.median_low(times)
         name = "last time at which driver fsm may take over, in the median"
         yield Fact(name, middle, "s", AVOIDANCE.name, "latest_takeover_s")
     number = sum(one.pov_careful for one in known)
-    yield Fact("failures that a careful POV avoids", number, "", AVOIDANCE.name, "pov_careful")
+    yield Fact(AVOIDED_BY_POV, number, "", AVOIDANCE.name, "pov_careful")
 
 
 def _studies(run: Run) -> Iterator[Fact]:

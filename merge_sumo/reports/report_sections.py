@@ -11,7 +11,7 @@ from markupsafe import Markup
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
-from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level
+from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_data import pairs_of
 from merge_sumo.reports.report_model import ReportModel
@@ -54,6 +54,7 @@ def shared(model: ReportModel) -> dict[str, Any]:
         "traffic": scenario.vehicles > 2,
         "meanings": meanings,
         "by_level": by_level,
+        "headline": headline(model.run, model.facts),
         "starts_that_fail": STARTS_THAT_FAIL,
         "pairs_of": pairs_of,
         "radius_for": radius_for,
@@ -62,7 +63,8 @@ def shared(model: ReportModel) -> dict[str, Any]:
     }
 
 
-OURS: Final = ["untested", "facts", "where", "against", "words", "stress", "cases", "all", "about"]
+FIRST: Final = ["untested", "headline", "facts"]
+OURS: Final = [*FIRST, "where", "against", "words", "stress", "cases", "all", "about"]
 """The templates in `templates/sections/`, in their order on the page."""
 
 SECTIONS: Final[Registry[ReportSection]] = Registry(

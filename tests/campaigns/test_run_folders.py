@@ -130,8 +130,10 @@ class TestARunFolder:
         given = ("--vut", SPEC, "--level", 0, "--cases", 4, "--sampler", "uniform", "-q")
         code, out, _ = command_line("campaign", *given, "--gate", "errors", "--out", "new")
         assert code == 0
-        (again,) = [line for line in out.splitlines() if line.startswith("run it again: ")]
-        assert command_line(*shlex.split(again.partition("merge-sumo ")[2]), "-q")[0] == 0
+        (line,) = [line for line in out.splitlines() if "not measured: " in line]
+        command, *again = shlex.split(line.partition("not measured: merge-sumo ")[2])
+        assert command == "probability"
+        assert command_line("rerun", *again, "-q")[0] == 0
 
 
 class TestAChangedController:

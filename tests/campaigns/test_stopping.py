@@ -72,7 +72,7 @@ def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may
     run = api.campaign("design1", **plan, out=tmp_path / "run")
     assert run.converged
     assert 20 < len(run.run.outcomes) < DEFAULT_CASES
-    assert any("stopped after" in line for line in run.lines())
+    assert run.lines()[0].endswith(f"; {len(run.run.outcomes)} of 800 cases, converged")
     more = api.resume(run, cases=len(run.run.outcomes) + 40, progress=False)
     whole = api.campaign("design1", cases=len(more.run.outcomes), **plan, out=tmp_path / "whole")
     assert not more.converged

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from calling import invoke
 from handmade import write_run
 from lxml import html
 
+from merge_sumo import api
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.reports.facts import Fact
+from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.report import report_page
 from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 
@@ -87,13 +89,73 @@ def test_are_all_in_the_report_and_in_its_json(made, facts):
     assert [Fact(**row) for row in said["facts"]] == list(facts.values())
 
 
-def test_stand_once_in_the_terminal_too(made, facts):
-    text = str(CampaignRun(made))
-    number = facts["failures", None].value
-    assert text.startswith(f"1 error, 2 timeouts and {number} failures (")
-    assert text.count(f"{number} failures") == 1
-    for line in text.splitlines()[1:]:
-        if line.startswith(("      0 ", "      1 ", "      2 ")):
-            level, cases, untested, *_ = line.split()
-            assert cases == "60"
-            assert untested == facts["without a verdict", int(level)].shown
+def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
+    of = {name: fact.shown for (name, level), fact in facts.items() if level is None}
+    of |= {f"{name} {level}": f.shown for (name, level), f in facts.items() if level is not None}
+    first, *levels, unknown, avoided, worst = headline(made, CampaignRun(made).facts)
+    rule = "front bumpers are within 6 m as the VUT reaches M"
+    assert first == f"handmade: a case fails when {rule}; 180 cases"
+    found = [
+        ["level", str(level), of[f"failures {level}"], "failures", "found"]
+        + ([] if of[f"regions {level}"] == "scattered" else [of[f"regions {level}"]])
+        + [{"1": "region", "scattered": "scattered"}.get(of[f"regions {level}"], "regions")]
+        + ["FMC", of[f"FMC {level}"]]
+        for level in (0, 1, 2)
+    ]
+    assert [line.split() for line in levels] == found
+    assert len({line.find(" failures") for line in levels}) == 1
+    measure = f"merge-sumo probability {made.folder} --vut handmade"
+    assert unknown == f"starts that fail are not measured: {measure}"
+    assert avoided == (
+        f"avoided of {of['failures']} failures: by driver careful 1, fsm 0, reg157 0, rss 1, "
+        "by a careful POV 1"
+    )
+    command = f"merge-sumo replay {made.folder} {of['worst case']} --gui"
+    assert worst == f"worst case ({of['kind of the worst case']}): {command}"
+    assert "contact at a relative speed of " in of["kind of the worst case"]
+
+
+@pytest.mark.parametrize(
+    ("number", "touch"), [(1, "1 more case touches"), (51, "51 more cases touch")]
+)
+def test_of_contacts_under_another_rule_say_which(made, number, touch):
+    contacts = Fact("cases with contact that are no failures", number, "", "outcomes.jsonl", "")
+    lines = headline(made, [*CampaignRun(made).facts, contacts])
+    said = f"{touch} after M, which this rule does not count: `fail_when` unsafe; starts that fail "
+    assert sum(line.startswith(said) for line in lines) == 1
+
+
+def test_of_the_headline_begin_terminal_and_report(made):
+    lines = headline(made, CampaignRun(made).facts)
+    printed = CampaignRun(made).lines()
+    assert [line for line in printed if line in lines] == lines
+    assert printed[1:3] == [
+        "  1 VUT_ERROR, the first in case 3: boom",
+        "  2 TIMEOUT, the first in case 4: the VUT did not reach the merge point in 12 s",
+    ]
+    assert printed[-1] == f"report: {made.folder / 'report.html'}"
+    page: Any = html.fromstring(report_page(made))
+    (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
+    assert card.text == "\n".join(lines).replace("`", "")
+
+
+def test_of_no_failure_are_short(tmp_path):
+    run = api.campaign("fsm", level="0", cases=4, seed=1, out=tmp_path / "run", progress=False)
+    rule = "front bumpers are within 6 m as the VUT reaches M"
+    assert run.lines() == [
+        f"fsm: a case fails when {rule}; 4 cases",
+        "  level 0  less than 0.15 % of all starts fail  0 failures found",
+        f"report: {run.report_file}",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("failures", "regions", "shown"),
+    [(9, 9, "9"), (10, 5, "5"), (10, 6, "scattered"), (78, 73, "scattered"), (1, 1, "1")],
+)
+def test_of_many_regions_for_few_failures_are_one_word(made, failures, regions, shown):
+    run = CampaignRun(made)
+    level = replace(run.summary.levels[0], failures=failures, regions=regions)
+    summary = replace(run.summary, levels={0: level})
+    (fact,) = (f for f in facts_of(made, summary, run.verdict) if f.name == "regions")
+    assert fact.shown == shown

@@ -152,7 +152,7 @@ class TestWhatWasNotTested:
         lines = [f"line {n} </pre><script>" for n in range(1000)]
         (run.folder / LOG).write_text("\x1b[31m" + "\n".join(lines), encoding="utf-8")
         page = report_page(run)
-        (shown,) = root_of(page).xpath("//pre")
+        (shown,) = root_of(page).xpath("//section[@aria-labelledby='about']//pre")
         assert shown.text.splitlines() == lines[-LINES:]
         (run.folder / LOG).unlink()
         (run.folder / LOG).symlink_to(tmp_path / "run" / "campaign.json")
