@@ -247,8 +247,10 @@ class TestTheCause:
                 assert text.startswith(f"{outcome.measures.end} at ")
                 continue
             check_cause(text, outcome, told := Told(campaign.trajectory(index)))
-            slows = (outcome.measures.pov_slowdown_mps or 0.0) >= BRAKED_MPS - 1e-6
-            assert slows == (told.braking_s(told.pov) is not None)
+            slows_mps = outcome.measures.pov_slowdown_mps or 0.0
+            brakes_mps2 = outcome.measures.pov_sustained_brake_mps2 or 0.0
+            assert (slows_mps >= BRAKED_MPS - 1e-6) == (told.braking_s(told.pov) is not None)
+            assert slows_mps >= 1.6 * brakes_mps2 - 1e-6
 
     def test_is_what_the_page_says(self, campaign):
         model = ReportModel(campaign, learns=False)
