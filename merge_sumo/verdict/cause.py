@@ -38,7 +38,7 @@ def _happened(outcome: Outcome, trajectory: Trajectory | None) -> str:
     became += found.became.lower()
     if found.impact_speed_mps is not None:
         became += f" at a relative speed of {found.impact_speed_mps:.1f} m/s"
-    conduct = "" if course is None else f"{_conduct(course, met(found))}, "
+    conduct = "" if course is None else f"{_conduct(course, met(found))}, and "
     if found.end is End.COMPLETED:
         return f"{became}: {conduct}the episode ends at {at}"
     if found.end is End.TIMEOUT:

@@ -156,7 +156,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         page.locator(".list [data-case='3']").click()
         words = page.inner_text("#case-words")
         assert words.startswith("Timeout: the VUT ")
-        assert "the VUT did not reach the merge point in" in words
+        assert "and the VUT did not reach the merge point in" in words
         verdict = page.locator("#filters [name=verdict]")
         for label, expected in (
             ("boom (2)", [4, 11]),

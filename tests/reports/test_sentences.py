@@ -49,7 +49,7 @@ NUMBER = r"(-?\d+(?:\.\d+)?)"
 DOES = rf"(begins to brake at {NUMBER} s|accelerates|keeps its speed within 1 m/s)".replace(
     "(-", "(?:-"
 )
-CONDUCT = f"the VUT {DOES}, the POV {DOES}"
+CONDUCT = f"the VUT {DOES}, the POV {DOES}, and the VUT"
 GOAL = "the (?:merge point|mainline)"
 OTHERS = "in the place of the VUT .+ would have avoided it.*"
 """Of other drivers, which test_avoidance.py checks."""
@@ -150,7 +150,7 @@ def near(said: str, value: float, digits: int = 1) -> None:
 def check_cause(text: str, outcome: Outcome, told: Told) -> None:
     """Check all that a cause says."""
     if outcome.measures.end is End.TIMEOUT:
-        found = re.fullmatch(rf"Timeout: {CONDUCT}, the VUT did not reach {GOAL} in (.+) s\.", text)
+        found = re.fullmatch(rf"Timeout: {CONDUCT} did not reach {GOAL} in (.+) s\.", text)
         assert found is not None, text
         vut, pov, after = found.groups()
         assert not told.arrived
@@ -159,7 +159,7 @@ def check_cause(text: str, outcome: Outcome, told: Told) -> None:
         return
     found = re.fullmatch(
         rf"([A-Za-z ]+)(?:, (contact|conflict))?(?: at a relative speed of {NUMBER} m/s)?: "
-        rf"{CONDUCT}, the VUT (?:reaches M|merges (where the lane ends|at {NUMBER} of the lane)) "
+        rf"{CONDUCT} (?:reaches M|merges (where the lane ends|at {NUMBER} of the lane)) "
         rf"at {NUMBER} s, its front bumper {NUMBER} m (ahead of|behind) that of the POV\."
         r"(?: (.+)\.)?",
         text,

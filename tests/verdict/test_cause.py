@@ -13,7 +13,7 @@ from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.score import Outcome, measure
 
 LATE = phases((7.5, 1.0), (0.5, -4.0))
-AHEAD = "the VUT reaches M at 8 s, its front bumper 1.0 m behind that of the POV."
+AHEAD = "and the VUT reaches M at 8 s, its front bumper 1.0 m behind that of the POV."
 OPEN = "The last way out, full braking or full acceleration of the VUT, closes at"
 
 
@@ -54,7 +54,7 @@ def test_of_a_failure_without_a_way_out_says_so():
 
 def test_of_another_case_is_the_motion_alone():
     trajectory = meeting(BRAKES, COASTS, gap_m=-30.0)
-    course = "the VUT accelerates, the POV begins to brake at 3.0 s, the VUT reaches M at 8 s"
+    course = "the VUT accelerates, the POV begins to brake at 3.0 s, and the VUT reaches M at 8 s"
     assert said(trajectory) == f"Safe: {course}, its front bumper 30.0 m ahead of that of the POV."
 
 
