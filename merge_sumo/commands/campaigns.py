@@ -205,7 +205,7 @@ def replay(
 ) -> None:
     """Replay a scenario in SUMO and check every position and speed against its record.
 
-    A case of a campaign is exported first. Says "identical" (exit code 0) or
+    A case of a campaign is exported first. Says what happened, then "identical" (exit code 0) or
     "diverged at t = ..." (exit code 1).
 
     Example:  merge-sumo replay scenarios/stalemate --gui
