@@ -44,7 +44,7 @@ VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
 `outcomes.jsonl`."""
 
 
-TOLD: Final = "cases that ran more than once", "failures that ran too seldom to tell"
+TOLD: Final = ("cases that ran more than once",)
 """Facts that the terminal lists beside the headline, where there are any."""
 
 
@@ -125,7 +125,7 @@ class CampaignRun(Result):
     @cached_property
     def verdict(self) -> Verdict:
         """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self._run.cases)
+        return judge(self._run.outcomes, self._run.tolerated)
 
     @cached_property
     def summary(self) -> Summary:

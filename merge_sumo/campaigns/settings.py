@@ -77,6 +77,8 @@ class CampaignSettings(Search, Limits):
         if self.seed < 0:
             raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
         check_tolerated(self.tolerated)
+        if not self.may_vary:  # a case fails in all of its runs or in none
+            object.__setattr__(self, "tolerated", 0.0)
         if isinstance(self.repeat, int) and self.repeat > self.cases:
             raise UserError(
                 f"`repeat` is {self.repeat} and `cases` is {self.cases}: runs of a case are among "

@@ -48,7 +48,7 @@ def comparison_page(compared: Comparison, runs: Sequence[Run | None]) -> str:
         "comparison.html.jinja",
         styles=STYLES,
         compared=compared,
-        counts=[judge(version.cases).counts for version in compared.versions],
+        counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
         steps=[(step, _maps(step), _sections(step, runs)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
         most=MOST_REGIONS,

@@ -24,13 +24,14 @@ from merge_sumo.studies.stress import STRESS
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.verdict.campaign_verdict import Verdict
 from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.chance import MOST_RUNS, by_case, is_decided
+from merge_sumo.verdict.chance import by_case, undecided
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.summary import LevelSummary, Summary
 
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"
 STARTS_THAT_FAIL: Final = "starts that fail"
+UNDECIDED: Final = "undecided"
 RULE: Final = "a case fails when"
 AT_MOST: Final = "cases at most; the search converged before"
 TOUCH: Final = "cases with contact that are no failures"
@@ -83,6 +84,7 @@ def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
 
     Raises `UserError` where a file of a study is not as it was written.
     """
+    unsure = undecided(run.outcomes, run.tolerated)
     return [
         *_tested(run),
         *_shares(run),
@@ -93,8 +95,8 @@ def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
             for fact in _of_level(run, level, found, untested=verdict.tested < verdict.cases)
         ),
         *_repeats(run),
-        *_motion(run),
-        *_avoided(run),
+        *_motion(run, unsure),
+        *_avoided(run, unsure),
         *_studies(run),
     ]
 
@@ -134,12 +136,16 @@ def _level_lines(facts: Iterable[Fact]) -> list[str]:
     for level, row in by_level(facts)[1]:
         of = {fact.name: fact for fact in row if fact is not None}
         share, failures = of.get(STARTS_THAT_FAIL), of.get("failures")
+        unsure = of.get(UNDECIDED)
+        more = f", {unsure.shown} undecided" if unsure is not None and unsure.value else ""
         cells = [
             f"level {level_name(level)}",
             "" if share is None else f"{share.shown} of all starts fail",
-            "nothing tested" if failures is None else f"{_counted(failures, 'failure')} found",
+            "nothing tested"
+            if failures is None
+            else f"{_counted(failures, 'failure')} found{more}",
         ]
-        if failures is not None and failures.value:
+        if failures is not None and of["FMC"].value:
             regions = of["regions"]
             cells.append(SCATTERED if regions.value == SCATTERED else _counted(regions, "region"))
             cells.append(f"FMC {of['FMC'].shown}")
@@ -210,6 +216,8 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
     if verdict.timeouts:
         yield counted("timeouts", verdict.timeouts, "end: TIMEOUT")
     yield counted("failures", summary.failures, FAILING)
+    if run.tolerated:
+        yield counted(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
         yield counted("failures with contact", verdict.contacts, f"{FAILING}, severity: contact")
     for severity, about in (
@@ -231,7 +239,10 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         yield fact("without a verdict", found.cases - found.tested, "end")
     if found.tested or not found.cases:
         yield fact("failures", found.failures, FAILING)
-        scattered = found.failures >= MANY and 2 * found.regions > found.failures
+        if run.tolerated:
+            yield fact(UNDECIDED, found.undecided, "draw")
+        failing = found.failures + found.undecided
+        scattered = failing >= MANY and 2 * found.regions > failing
         regions = SCATTERED if scattered else found.regions
         yield Fact("regions", regions, "", OUTCOMES, f"{FAILING}: starts", level)
         radius = radius_for(len(run.scenario.dimensions(level)))
@@ -263,19 +274,11 @@ def _repeats(run: Run) -> Iterator[Fact]:
     if not (tolerated or repeated):
         return
     varied = [one for one in repeated if one.varies]
-    untold = [
-        one
-        for one in cases
-        if one.share > tolerated
-        and one.runs < MOST_RUNS
-        and not is_decided(one.failures, one.runs, tolerated)
-    ]
     for name, number in (
         ("runs", sum(one.runs for one in cases)),
         ("cases that ran more than once", len(repeated)),
         ("of these, cases whose runs differ", len(varied)),
         ("of these, cases that both fail and pass", sum(0 < v.failures < v.runs for v in varied)),
-        ("failures that ran too seldom to tell", len(untold) if tolerated else 0),
     ):
         yield Fact(name, number, "", OUTCOMES, "draw")
     if tolerated:
@@ -283,7 +286,7 @@ def _repeats(run: Run) -> Iterator[Fact]:
         yield Fact(name, 100.0 * tolerated, PERCENT, SETTINGS, "tolerated")
 
 
-def _motion(run: Run) -> Iterator[Fact]:
+def _motion(run: Run, unsure: set[int]) -> Iterator[Fact]:
     worst = failures(run.cases)
     driven_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
     yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
@@ -294,6 +297,7 @@ def _motion(run: Run) -> Iterator[Fact]:
     kind, _, _ = cause(worst[0], motion).partition(":")
     key = "severity, impact_speed_mps; by its motion"
     yield Fact(KIND, kind[0].lower() + kind[1:], "", OUTCOMES, key)
+    worst = [outcome for outcome in worst if outcome.index not in unsure]
     known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     if known:
         name = "failures that full braking or full acceleration of the VUT avoids"
@@ -307,11 +311,11 @@ def _motion(run: Run) -> Iterator[Fact]:
             yield Fact(name, max(values), unit, OUTCOMES, f"{FAILING}: {measure}")
 
 
-def _avoided(run: Run) -> Iterator[Fact]:
-    known = list(AVOIDANCE.read_lines(run).values())
+def _avoided(run: Run, unsure: set[int]) -> Iterator[Fact]:
+    known = [one for index, one in AVOIDANCE.read_lines(run).items() if index not in unsure]
     if not known:
         return
-    if len(known) < sum(outcome.failed for outcome in run.cases):
+    if len(known) < sum(outcome.failed for outcome in run.cases) - len(unsure):
         yield Fact(DRIVEN, len(known), "", AVOIDANCE.name, "lines")
     for name in REFERENCES:
         number = sum(name in one.avoided_by for one in known)

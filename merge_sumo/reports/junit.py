@@ -1,8 +1,8 @@
 """A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others.
 
-Every case is a test case, in a test suite per POV level, so that a CI system shows the share that
-passes: what the criterion calls a failure and a timeout are a `failure`, an error of the VUT or of
-the simulation an `error`. The type of a failure is its severity: contact, conflict, harsh or safe.
+Every case is a test case, in a test suite per POV level: what the criterion calls a failure and a
+timeout are a `failure`, an error of the VUT or of the simulation an `error`, and a case that is
+undecided is `skipped`. The type of a failure is its severity: contact, conflict, harsh or safe.
 A first suite has the gates, whether anything was tested, and the facts as properties. A campaign
 against an earlier version of the VUT has a suite of the cases that one of both fails, in which what
 broke is a `failure`. Times are simulated seconds.
@@ -26,7 +26,7 @@ from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
 from merge_sumo.verdict.campaign_verdict import GateResult, Verdict
-from merge_sumo.verdict.chance import by_case
+from merge_sumo.verdict.chance import by_case, undecided
 from merge_sumo.verdict.score import Outcome
 
 CLASS: Final = "merge-sumo"
@@ -58,13 +58,17 @@ def write_junit(
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
         _step(root, f"against {earlier}", compared.steps[0])
     repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
+    unsure = undecided(run.outcomes, run.tolerated)
     shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
     said = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
     for level, _ in by_level(facts)[1]:
         suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
         for outcome in run.cases:
             if outcome.case.level == level:
-                _case(suite, outcome, shares.get(outcome.index, ""), said.get(outcome.index))
+                runs, cause = shares.get(outcome.index, ""), said.get(outcome.index)
+                _case(suite, outcome, runs, cause, is_unsure=outcome.index in unsure)
+        if unsure:
+            suite.set("skipped", str(len(list(suite.iter("skipped")))))
     _write(path, root)
 
 
@@ -117,12 +121,16 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
                 _wrong(test, "failure", REGRESSION, one.became)
 
 
-def _case(suite: etree._Element, outcome: Outcome, runs: str, cause: str | None) -> None:
+def _case(
+    suite: etree._Element, outcome: Outcome, runs: str, cause: str | None, *, is_unsure: bool
+) -> None:
     """Add a case; it has a cause where it did not pass."""
     case, measures = outcome.case, outcome.measures
     name = f"case {outcome.index}: {described(case)}{runs}"
     test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
-    if cause is not None:
+    if is_unsure:
+        etree.SubElement(test, "skipped", message=f"undecided: {cause}")
+    elif cause is not None:
         tag = "error" if measures.end.is_error else "failure"
         kind = (measures.severity or FAILED) if outcome.is_tested else measures.end
         _wrong(test, tag, kind, cause)

@@ -205,14 +205,14 @@ class CampaignBars(Bars):
     def _say_where(self) -> None:
         """Say where the failures so far lie, in the largest region of each level."""
         cases = one_per_case(self._outcomes, self._tolerated)
-        self.say(f"so far {judge(cases).counts}")
+        self.say(f"so far {judge(self._outcomes, self._tolerated).counts}")
         for level in sorted({outcome.case.level for outcome in cases}):
             for box in failure_boxes(cases, level)[:1]:
                 inside = f"{box.failures} of {counted(box.cases, 'case')} fail"
                 self.say(f"  POV level {level_name(level)}, {box.where}: {inside}")
 
     def _found(self) -> str:
-        return ", ".join(judge(one_per_case(self._outcomes, self._tolerated)).found)
+        return ", ".join(judge(self._outcomes, self._tolerated).found)
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Stop the bars, and the rewriting of a report that nobody will finish."""

@@ -67,6 +67,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     return {
         "dt": DT_S,
         "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
+        "varies": model.varies,
         "lane": lane_m,
         "place": "M" if lane_m is None else scenario.place,
         "vehicles": VEHICLES[: scenario.vehicles],
@@ -130,6 +131,8 @@ def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]
         row["pov_careful"] = avoidance and avoidance.pov_careful
     if model.repeated:
         row["runs"] = _runs(model.repeated.get(o.index))
+    if model.undecided:
+        row["undecided"] = o.index in model.undecided
     return row
 
 

@@ -21,7 +21,7 @@ from merge_sumo.studies.explanation import EXPLANATIONS
 from merge_sumo.studies.stress import STRESS
 from merge_sumo.studies.surface import Surface, learn_surface
 from merge_sumo.verdict.campaign_verdict import Trouble, judge
-from merge_sumo.verdict.chance import by_case
+from merge_sumo.verdict.chance import by_case, undecided
 from merge_sumo.verdict.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.verdict.plausibility import doubts
 from merge_sumo.verdict.score import Outcome
@@ -45,6 +45,8 @@ class ReportModel:
         road: its road, to be drawn.
         cases: the run that stands for each case.
         repeated: by its index, all runs of a case that ran more than once.
+        varies: whether runs of a case differ: then chance decides.
+        undecided: cases that fail and ran too seldom to tell, by that index.
         facts: the facts of the campaign.
         levels: POV levels.
         surfaces: surrogate of each level; None where there is none.
@@ -72,8 +74,10 @@ class ReportModel:
         self.cases = run.cases
         runs = [one for one in by_case(run.outcomes) if one.runs > 1]
         self.repeated = {one.deciding(run.tolerated).index: one for one in runs}
+        self.varies = any(one.varies for one in runs)
         self.summary = summary or summarise(run.outcomes, run.levels, run.tolerated)
-        self.verdict = judge(self.cases)
+        self.verdict = judge(run.outcomes, run.tolerated)
+        self.undecided = undecided(run.outcomes, run.tolerated)
         self.facts = facts_of(run, self.summary, self.verdict)
         self.levels = list(self.summary.levels)
         self.surfaces: dict[int, Surface | None] = dict.fromkeys(self.levels)

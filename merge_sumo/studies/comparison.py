@@ -243,7 +243,7 @@ class Version:
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
         levels = {level_name(level): to_plain(self.at[level]) for level in self.levels}
-        counts = judge(self.cases).to_record()
+        counts = judge(self.outcomes, self.tolerated).to_record()
         return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
 
 
@@ -347,7 +347,7 @@ class Comparison(Result):
         """Return the numbers, version by version and step by step, and the first of the cases."""
         text = [self.headline, self.source]
         for number, version in enumerate(self.versions, start=1):
-            verdict = judge(version.cases)
+            verdict = judge(version.outcomes, version.tolerated)
             place = f"{version.folder} " if version.folder else "now "
             text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
             text += verdict.trouble_lines()

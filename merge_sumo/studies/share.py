@@ -72,16 +72,21 @@ def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lamb
     """
     if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
         return
-    pool = Pool(levels=tuple(run.levels), scenario=run.scenario)
-    kinematic = plan.for_verdicts().with_engine(None)
     levels = []
     for level in run.levels:
-        rng = np.random.default_rng([run.settings.seed, STREAM, level])
-        points = rng.random((CASES, len(run.scenario.dimensions(level))))
-        ran = evaluate(kinematic, CasesAt(pool, level, points), THIS_PROCESS, fails_of)
-        levels.append(LevelShare(level, CASES, sum(fails for _, fails in ran)))
+        levels.append(share_at(plan, level, CASES, run.settings.seed))
         check()
     SHARES.write(run.folder, Shares(tuple(levels)))
+
+
+def share_at(plan: SimulationPlan, level: int, cases: int, seed: int) -> LevelShare:
+    """Return the share of uniform cases of a level that fail, by the equations of motion."""
+    rng = np.random.default_rng([seed, STREAM, level])
+    points = rng.random((cases, len(plan.scenario.dimensions(level))))
+    pool = Pool(levels=(level,), scenario=plan.scenario)
+    kinematic = plan.for_verdicts().with_engine(None)
+    ran = evaluate(kinematic, CasesAt(pool, level, points), THIS_PROCESS, fails_of)
+    return LevelShare(level, cases, sum(fails for _, fails in ran))
 
 
 def fails_of(results: Episodes) -> list[bool]:

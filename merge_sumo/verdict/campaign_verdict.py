@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,6 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import Scenario, level_name
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.printable import counted, printable
+from merge_sumo.verdict.chance import one_per_case, undecided
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.summary import Summary
@@ -55,7 +56,8 @@ class Verdict:
 
     Attributes:
         cases: cases that ran.
-        failures: cases that fail under the criterion.
+        failures: cases that fail under the criterion, but for those that are undecided.
+        undecided: failing cases that ran too seldom to tell: see `chance.undecided`.
         contacts: failures in which bodies touch.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
@@ -65,6 +67,7 @@ class Verdict:
 
     cases: int
     failures: int
+    undecided: int
     contacts: int
     errors: int
     timeouts: int
@@ -85,16 +88,21 @@ class Verdict:
     @property
     def found(self) -> list[str]:
         """The numbers in words: errors and timeouts, where there are any, then failures."""
+        return self._found("")
+
+    def _found(self, of_failures: str) -> list[str]:
         wrong = ((self.errors, "error"), (self.timeouts, "timeout"))
-        return [*(counted(n, what) for n, what in wrong if n), counted(self.failures, "failure")]
+        failures = counted(self.failures, "failure") + of_failures
+        unsure = [f"{self.undecided} undecided"] if self.undecided else []
+        return [*(counted(n, what) for n, what in wrong if n), failures, *unsure]
 
     @property
     def counts(self) -> str:
         """The result in a line."""
-        *wrong, failures = self.found
-        counts = f"{', '.join(wrong)} and {failures}" if wrong else failures
         contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
-        return f"{counts}{contacts} in {counted(self.cases, 'case')}"
+        *others, last = self._found(contacts)
+        counts = f"{', '.join(others)} and {last}" if others else last
+        return f"{counts} in {counted(self.cases, 'case')}"
 
     def trouble_lines(self) -> list[str]:
         """Return lines on errors and timeouts by message; none where there are none."""
@@ -122,10 +130,10 @@ class Verdict:
         }
 
 
-def judge(outcomes: Iterable[Outcome]) -> Verdict:
-    """Return the verdict on outcomes."""
-    ran = list(outcomes)
-    failed = [o for o in ran if o.failed]
+def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
+    """Return the verdict on outcomes; a case counts once, as in `summarise`."""
+    ran, unsure = one_per_case(outcomes, tolerated), undecided(outcomes, tolerated)
+    failed = [o for o in ran if o.failed and o.index not in unsure]
     wrong = [o for o in ran if not o.is_tested]
     errors = sum(o.measures.end.is_error for o in wrong)
     groups: dict[tuple[End, str], list[Outcome]] = {}
@@ -139,6 +147,7 @@ def judge(outcomes: Iterable[Outcome]) -> Verdict:
     return Verdict(
         cases=len(ran),
         failures=len(failed),
+        undecided=len(unsure),
         contacts=sum(o.measures.severity == Severity.CONTACT for o in failed),
         errors=errors,
         timeouts=len(wrong) - errors,
@@ -198,6 +207,10 @@ class Gate:
             most = by_level.get(level, 0.0)
             said = f"FMC {most:.4f} at level {level_name(level)}"
             return GateResult(self.name, most > self.above, said)
+        if self.what == "failures":  # one that is undecided may be a failure
+            met = verdict.failures + verdict.undecided > 0
+            unsure = f" and {verdict.undecided} undecided" if verdict.undecided else ""
+            return GateResult(self.name, met, counted(verdict.failures, "failure") + unsure)
         number = regressions if self.what == REGRESSIONS else getattr(verdict, self.what)
         return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
 

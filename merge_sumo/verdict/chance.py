@@ -121,6 +121,22 @@ def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Ou
     return [outcome for _, outcome in sorted(shown + errors, key=itemgetter(0))]
 
 
+def undecided(outcomes: Iterable[Outcome], tolerated: float) -> set[int]:
+    """Return the deciding runs, by index, of failing cases that ran too seldom to tell.
+
+    None where cases ran more than once and no two runs of one differ: chance decides on nothing.
+    """
+    cases = by_case(outcomes) if tolerated else []
+    again = [one for one in cases if one.runs > 1]
+    if again and not any(one.varies for one in again):
+        return set()
+    return {
+        one.deciding(tolerated).index
+        for one in cases
+        if one.share > tolerated and runs_needed(one.failures, one.runs, tolerated)
+    }
+
+
 @cache
 def is_decided(failures: int, runs: int, tolerated: float) -> bool:
     """Return whether runs show if a case fails in more than a tolerated share of its runs.

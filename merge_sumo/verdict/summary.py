@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from merge_sumo.coverage.fmc import fmc, regions
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.chance import one_per_case
+from merge_sumo.verdict.chance import one_per_case, undecided
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 
@@ -21,11 +21,12 @@ class LevelSummary:
     Attributes:
         cases: cases that ran.
         tested: cases in which the VUT reached the merge point.
-        failures: cases that fail under the criterion.
+        failures: cases that fail under the criterion, but for those that are undecided.
         severities: cases by severity, those that occur.
-        fmc: failure mode coverage in the level's unit cube; M(s, 0.05, -500) under the paper's
-            criterion and in up to three coordinates.
-        regions: groups of failures that are linked at the radius of FMC.
+        fmc: failure mode coverage of failing cases, undecided or not, in the level's unit cube;
+            M(s, 0.05, -500) under the paper's criterion and in up to three coordinates.
+        regions: groups of these that are linked at the radius of FMC.
+        undecided: failing cases that ran too seldom to tell: see `chance.undecided`.
     """
 
     cases: int
@@ -34,6 +35,7 @@ class LevelSummary:
     severities: dict[str, int]
     fmc: float
     regions: int
+    undecided: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +47,7 @@ class Summary:
     ends: dict[str, int]
     severities: dict[str, int]
     levels: dict[int, LevelSummary]
+    undecided: int = 0
 
 
 def summarise(
@@ -55,14 +58,16 @@ def summarise(
     A case counts once, by the run that stands for it where a share of its runs is `tolerated`.
     """
     every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
+    unsure = undecided(outcomes, tolerated)
     outcomes = one_per_case(outcomes, tolerated)
     ends = Counter(outcome.measures.end for outcome in outcomes)
     return Summary(
         cases=len(outcomes),
-        failures=sum(outcome.failed for outcome in outcomes),
+        failures=sum(outcome.failed for outcome in outcomes) - len(unsure),
         ends={end.value: ends[end] for end in End if ends[end]},
         severities=_severities(outcomes),
-        levels={level: _level(outcomes, level) for level in every},
+        levels={level: _level(outcomes, level, unsure) for level in every},
+        undecided=len(unsure),
     )
 
 
@@ -72,14 +77,16 @@ def _severities(outcomes: Sequence[Outcome]) -> dict[str, int]:
     return {severity.value: counts[severity] for severity in Severity if counts[severity]}
 
 
-def _level(outcomes: Sequence[Outcome], level: int) -> LevelSummary:
+def _level(outcomes: Sequence[Outcome], level: int, unsure: set[int]) -> LevelSummary:
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
+    unsure_here = sum(outcome.index in unsure for outcome in at_level)
     points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
     return LevelSummary(
         cases=len(at_level),
         tested=sum(outcome.is_tested for outcome in at_level),
-        failures=len(points),
+        failures=len(points) - unsure_here,
         severities=_severities(at_level),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
+        undecided=unsure_here,
     )

@@ -21,6 +21,7 @@ from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.imperfection import Sensing
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
+from merge_sumo.system.printable import counted
 from merge_sumo.testing.contracts import SamplerContract, play, play_case
 from merge_sumo.verdict.chance import by_case, failing_cases, is_decided
 from merge_sumo.verdict.score import Measures, Outcome
@@ -194,19 +195,26 @@ class TestACampaign:
         run_campaign(self.settings(tmp_path), tmp_path / "run")
         opened = api.results.CampaignRun(tmp_path / "run", gates=["failures"])
         failing = failing_cases(opened.run.outcomes, 0.3)
-        assert opened.summary.failures == opened.verdict.failures == len(failing)
+        assert opened.summary.failures == opened.verdict.failures
+        assert opened.summary.undecided == opened.verdict.undecided > 0
+        assert opened.summary.failures + opened.summary.undecided == len(failing)
         assert opened.verdict.cases == len(by_case(opened.run.outcomes))
         facts = {fact.name: fact.value for fact in opened.facts}
         assert facts["runs"] == 60
         assert facts["share of its runs in which a case may fail"] == 30.0
         assert len(opened.failures) == len(failing)
-        assert opened.gates[0].found.startswith(f"{len(failing)} failure")
+        gate = opened.gates[0]
+        counts = f"{counted(opened.summary.failures, 'failure')} and {opened.summary.undecided}"
+        assert (gate.met, gate.found) == (True, f"{counts} undecided")
 
 
 def test_the_package_s_own_vuts_repeat_nothing_without_noise():
-    settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=US23)
+    known = {"vut": "design2", "levels": (0,), "repeat": "auto", "tolerated": 0.2}
+    settings = CampaignSettings(**known, scenario=US23)
+    assert settings.tolerated == 0.0, "each run of a case is the same"
     sampler = settings.new_sampler()
     assert settings.with_repeats(sampler) is sampler
     noisy = replace(US23, sense=Sensing(noise_x_m=1.0))
-    settings = CampaignSettings(vut="design2", levels=(0,), repeat="auto", scenario=noisy)
+    settings = CampaignSettings(**known, scenario=noisy)
+    assert settings.tolerated == 0.2
     assert isinstance(settings.with_repeats(sampler), RepeatedWhereItMatters)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import signal
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from calling import invoke
 from campaigning import campaign_settings, run_campaign
 from handmade import write_run
 from lxml import etree
+from test_chance import CASE, outcomes
 from typer.testing import Result
 
 import merge_sumo as ms
@@ -26,6 +28,7 @@ from merge_sumo.verdict.campaign_verdict import Gate, judge, parse_gates
 from merge_sumo.verdict.summary import LevelSummary, Summary, summarise
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
+CHANCE = f"{Path(__file__).parents[2]}/tools/chance_vuts.py:Slope"
 VUTS = {
     "raises": "raise RuntimeError('boom')",
     "stops": "return -4.0",
@@ -166,6 +169,31 @@ class TestJUnit:
             check_junit(tmp_path / "no" / "junit.xml", folder)
         check_junit(folder / "junit.xml", folder)  # the campaign makes that folder
         check_junit(tmp_path / "junit.xml", folder)
+
+
+def test_a_case_that_ran_too_seldom_to_tell_is_no_failure_and_meets_the_gate():
+    """Two failures of two runs decide, one of one does not (posterior of Jeffreys' prior)."""
+    told = outcomes(
+        [(CASE, 0, -600.0), (CASE, 1, -700.0), (replace(CASE, level=0, svo_rad=None), 0, -600.0)]
+    )
+    found, summary = judge(told, 0.2), summarise(told, (0, 2), 0.2)
+    assert found.counts == "1 failure (0 contacts) and 1 undecided in 2 cases"
+    assert (summary.failures, summary.undecided) == (found.failures, found.undecided) == (1, 1)
+    assert [(of.failures, of.undecided) for of in summary.levels.values()] == [(0, 1), (1, 0)]
+    assert all(of.fmc > 0.0 and of.regions == 1 for of in summary.levels.values())
+    gate = Gate("failures").check(judge(told[2:], 0.2), summarise(told[2:], (0,), 0.2))
+    assert gate.sentence == "gate failures: met (0 failures and 1 undecided)"
+
+
+def test_an_undecided_case_is_skipped_in_junit(tmp_path):
+    settings = campaign_settings(vut=CHANCE, cases=40, seed=100, tolerated=0.5, repeat=1)
+    opened = ms.open_run(run_campaign(settings, tmp_path / "run").folder)
+    number = opened.verdict.undecided
+    assert number == len(failures(opened.run.outcomes)) > 0, "each case ran once"
+    write_junit(tmp_path / "junit.xml", opened.run, opened.facts, opened.verdict, [])
+    root = read_junit(tmp_path / "junit.xml")
+    assert (root.get("failures"), root[1].get("skipped")) == ("0", str(number))
+    assert all(one.get("message").startswith("undecided: ") for one in root.iter("skipped"))
 
 
 class TestACampaignThatTestedNothing:

@@ -22,6 +22,7 @@ from merge_sumo.verdict.chance import (
     is_decided,
     one_per_case,
     runs_needed,
+    undecided,
 )
 from merge_sumo.verdict.score import Measures, Outcome
 
@@ -127,3 +128,13 @@ def test_a_case_is_decided_by_the_posterior_of_its_runs():
     assert (runs_needed(1, 1, 0.2), runs_needed(0, 7, 0.2), runs_needed(1, 8, 0.2)) == (1, 2, 2)
     assert (runs_needed(4, 19, 0.2), runs_needed(4, 20, 0.2)) == (1, 0)
     assert [runs_needed(failures, 5, 0.0) for failures in (0, 1)] == [1, 0]
+
+
+def test_a_failing_case_is_undecided_until_its_runs_tell_unless_no_two_runs_ever_differ():
+    once, twice, passes = (replace(CASE, x_pov0_m=-200.0 - n) for n in range(3))
+    runs = [(once, 0, FAILS), (passes, 0, PASSES), (twice, 0, FAILS), (twice, 1, FAILS - 1.0)]
+    assert undecided(outcomes(runs), 0.2) == {0}, "two of two decide"
+    assert undecided(outcomes(runs[:3]), 0.2) == {0, 2}
+    assert undecided(outcomes(runs), 0.0) == set()
+    same = [*runs[:3], (twice, 1, FAILS)]
+    assert undecided(outcomes(same), 0.2) == set(), "chance was looked for, and not seen"

@@ -5,6 +5,7 @@ const place = new Map(cases.index.map((index, i) => [index, i]));
 
 /* ---------- cases ---------- */
 const failed = (i) => cases.failed[i];
+const undecided = (i) => cases.undecided?.[i] ?? false; // it fails, and ran too seldom to tell
 let matching = null; // the cases that the filters let through; null without a filter
 const wanted = (i) => matching === null || matching.has(i);
 function avoidedBy(i, who) { // a driver, "pov" or "none"
@@ -42,7 +43,7 @@ function title(i) {
   return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
 function words(i) {
-  const margin = cases.margin[i] === null ? "" : `${failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
+  const margin = cases.margin[i] === null ? "" : `${undecided(i) ? "Undecided" : failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
   return [cases.cause[i], margin, runsInWords(i)].filter(Boolean).join(" ");
 }
 
@@ -60,7 +61,7 @@ function slice(grid, at) { // `at` a share of the third coordinate; null for all
   for (let n = 0; n < size; n++) out[n] = (1 - share) * values[low * size + n] + share * values[(low + 1) * size + n];
   return out;
 }
-function shade(svg, values, nx, ny, box) {
+function shade(svg, values, nx, ny, box, clip) {
   const canvas = document.createElement("canvas");
   canvas.width = nx; canvas.height = ny;
   const context = canvas.getContext("2d"), image = context.createImageData(nx, ny);
@@ -70,7 +71,7 @@ function shade(svg, values, nx, ny, box) {
   }
   context.putImageData(image, 0, 0);
   const [x, y, w, h] = box, dx = w / (nx - 1), dy = h / (ny - 1);
-  draw(svg, "image", { href: canvas.toDataURL(), x: x - dx / 2, y: y - dy / 2, width: w + dx, height: h + dy, preserveAspectRatio: "none", "clip-path": "url(#clip)" });
+  draw(svg, "image", { href: canvas.toDataURL(), x: x - dx / 2, y: y - dy / 2, width: w + dx, height: h + dy, preserveAspectRatio: "none", "clip-path": `url(#${clip})` });
 }
 
 /* ---------- maps ---------- */
@@ -91,6 +92,12 @@ function FailureMap(figure) {
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
   const near = (i) => all || apart(i) <= third.near;
 
+  const ball = (parent, { i, x, y }, radius) => { // the slice of a ball around a case
+    const off = all ? 0 : apart(i) / (third.high - third.low);
+    if (off >= radius) return;
+    const r = Math.sqrt(radius ** 2 - off ** 2);
+    draw(parent, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
+  };
   const place = () => {
     axes = of.pairs[pair].map((k) => coordinates[k]);
     const [across, up] = axes;
@@ -103,7 +110,11 @@ function FailureMap(figure) {
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
-    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX);
+    if (chance && data.varies) { // further from cases that ran more than once the surrogate says too much
+      const known = draw(clip.parentNode, "clipPath", { id: `known${level}`, "clip-path": "url(#clip)" });
+      for (const mark of marks) if (runsOf(mark.i)) ball(known, mark, of.radius / 2);
+    }
+    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX, data.varies ? `known${level}` : "clip");
     for (const [n, c] of axes.entries()) {
       const vertical = n === 0, span = c.high - c.low;
       const step = ticks(span / (vertical ? 4 : 5));
@@ -118,12 +129,7 @@ function FailureMap(figure) {
     draw(svg, "text", { transform: `translate(12 ${top + height / 2}) rotate(-90)`, "text-anchor": "middle" }, up);
     counts();
     const balls = draw(svg, "g", { class: "balls", "clip-path": "url(#clip)" });
-    for (const { i, x, y } of of.radius === null ? [] : marks) if (failed(i)) {
-      const off = all ? 0 : apart(i) / (third.high - third.low);
-      if (off >= of.radius) continue;
-      const r = Math.sqrt(of.radius ** 2 - off ** 2); // the slice of the ball here
-      draw(balls, "ellipse", { cx: x, cy: y, rx: r * width, ry: r * height });
-    }
+    for (const mark of marks) if (failed(mark.i)) ball(balls, mark, of.radius ?? 0);
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
       const faint = near(i) && wanted(i) ? "" : " faint";
@@ -396,7 +402,7 @@ for (const table of document.querySelectorAll(".list")) {
 }
 
 /* ---------- all cases ---------- */
-const verdict = (i) => (failed(i) ? "failure" : tested(i) ? "no failure" : cases.end[i]);
+const verdict = (i) => (undecided(i) ? "undecided" : failed(i) ? "failure" : tested(i) ? "no failure" : cases.end[i]);
 function allCases() { // gives what shows the cases that the filters let through
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
   const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
