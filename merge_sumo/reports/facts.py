@@ -137,7 +137,9 @@ def _level_lines(facts: Iterable[Fact]) -> list[str]:
         of = {fact.name: fact for fact in row if fact is not None}
         share, failures = of.get(STARTS_THAT_FAIL), of.get("failures")
         unsure = of.get(UNDECIDED)
-        more = f", {unsure.shown} undecided" if unsure is not None and unsure.value else ""
+        found = "nothing tested" if failures is None else f"{_counted(failures, 'failure')} found"
+        if unsure is not None and unsure.value:
+            found += f", {unsure.shown} undecided"
         cells = [
             f"level {level_name(level)}",
             "" if share is None else f"{share.shown} of all starts fail",
