@@ -84,7 +84,8 @@ def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated
         case = replace(fails.case, draw=draw)
         bars.case_ended(replace(fails, index=draw, case=case, measures=measures, margin=None))
     found = [line.split("  ")[1] for line in out.getvalue().splitlines()]
-    assert found == ["1 failure", "0 failures", "1 failure", "1 failure"]
+    unsure = "0 failures, 1 undecided"
+    assert found == [unsure, "0 failures", unsure, unsure], "half of the runs is not more"
 
 
 @pytest.mark.parametrize(
