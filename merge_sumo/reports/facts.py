@@ -143,9 +143,7 @@ def _level_lines(facts: Iterable[Fact]) -> list[str]:
         cells = [
             f"level {level_name(level)}",
             "" if share is None else f"{share.shown} of all starts fail",
-            "nothing tested"
-            if failures is None
-            else f"{_counted(failures, 'failure')} found{more}",
+            found,
         ]
         if failures is not None and of["FMC"].value:
             regions = of["regions"]
