@@ -7,6 +7,7 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ class TestACampaign:
 
 
 def test_the_package_s_own_vuts_repeat_nothing_without_noise():
-    known = {"vut": "design2", "levels": (0,), "repeat": "auto", "tolerated": 0.2}
+    known: dict[str, Any] = {"vut": "design2", "levels": (0,), "repeat": "auto", "tolerated": 0.2}
     settings = CampaignSettings(**known, scenario=US23)
     assert settings.tolerated == 0.0, "each run of a case is the same"
     sampler = settings.new_sampler()
