@@ -175,9 +175,9 @@ def _how_bad(run: Run, of: Mapping[str, Fact]) -> Iterator[str]:
     """Yield how many failures other drivers avoid, and the command that shows the worst."""
     if AVOIDED_BY_POV in of:
         by = ", ".join(f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCES)
-        failures = _counted(of.get(DRIVEN, of["failures"]), "failure")
-        pov = of[AVOIDED_BY_POV].shown
-        yield f"avoided of {failures}: by driver {by}, by a careful POV {pov}"
+        some = f"{of[DRIVEN].shown} of " if DRIVEN in of else ""
+        failures, pov = _counted(of["failures"], "failure"), of[AVOIDED_BY_POV].shown
+        yield f"avoided of {some}{failures}: by driver {by}, by a careful POV {pov}"
     if WORST in of:
         replay = f"merge-sumo replay {quoted(run.folder)} {of[WORST].value} --gui"
         yield f"{WORST} ({of[KIND].shown}): {replay}"

@@ -125,6 +125,13 @@ def test_of_contacts_under_another_rule_say_which(made, number, touch):
     assert sum(line.startswith(said) for line in lines) == 1
 
 
+def test_of_more_failures_than_were_driven_again_say_how_many(made, facts):
+    driven = Fact("failures that reference drivers drove", 3, "", "avoidance.jsonl", "lines")
+    lines = headline(made, [*CampaignRun(made).facts, driven])
+    begins = f"avoided of 3 of {facts['failures', None].shown} failures: by driver careful 1, "
+    assert sum(line.startswith(begins) for line in lines) == 1
+
+
 def test_of_the_headline_begin_terminal_and_report(made):
     lines = headline(made, CampaignRun(made).facts)
     printed = CampaignRun(made).lines()
