@@ -198,19 +198,18 @@ def test_an_undecided_case_is_skipped_in_junit(tmp_path):
 
 class TestACampaignThatTestedNothing:
     @pytest.mark.parametrize(
-        ("name", "counts", "message"),
+        ("name", "message"),
         [
-            ("raises", "20 errors and 0 failures in 20 cases", "20 VUT_ERROR, the first in case 0"),
-            ("stops", "20 timeouts and 0 failures in 20 cases", "20 TIMEOUT, the first in case 0"),
+            ("raises", "20 VUT_ERROR, the first in case 0"),
+            ("stops", "20 TIMEOUT, the first in case 0"),
         ],
     )
-    def test_exits_with_1_and_says_why_first(self, vuts, tmp_path, name, counts, message):
+    def test_exits_with_1_and_says_why_first(self, vuts, tmp_path, name, message):
         said = campaign(vuts[name], tmp_path / "run")
         assert said.exit_code == 1
-        first, second, _, level, *_ = said.stdout.splitlines()
-        assert first == counts
+        first, second, *_ = said.stdout.splitlines()
+        assert first.endswith("20 cases")
         assert second.strip().startswith(message)
-        assert level.split()[:3] == ["0", "20", "20"]
         without = " without an error" if name == "raises" else ""
         assert said.stderr.endswith(f"the VUT reached the merge point{without} in no case\n")
         assert "Nothing was tested." in (tmp_path / "run" / "report.html").read_text()
