@@ -16,6 +16,7 @@ from msgspec import Meta
 from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record
@@ -67,14 +68,17 @@ SHARES: Final = StudyFile("shares.json", Shares)
 def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lambda: None) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.
 
-    Nothing is written for drivers that need SUMO, where it takes long (`probability`), nor where a
-    case may fail in some of its runs. `check` is called after each level, and may raise.
+    Nothing is written for drivers that need SUMO, where it takes long (`probability`), where a case
+    ends otherwise in SUMO than by eq. (4), nor where one may fail in some of its runs. `check` is called after each level, and may raise.
     """
     if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
         return
     levels = []
     for level in run.levels:
-        levels.append(share_at(plan, level, CASES, run.settings.seed))
+        try:
+            levels.append(share_at(plan, level, CASES, run.settings.seed))
+        except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
+            return
         check()
     SHARES.write(run.folder, Shares(tuple(levels)))
 
