@@ -69,7 +69,8 @@ def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lamb
     """Measure the share that fails at each level of a campaign that has just ended.
 
     Nothing is written for drivers that need SUMO, where it takes long (`probability`), where a case
-    ends otherwise in SUMO than by eq. (4), nor where one may fail in some of its runs. `check` is called after each level, and may raise.
+    ends otherwise in SUMO than by eq. (4), nor where one may fail in some of its runs. `check` is
+    called after each level, and may raise.
     """
     if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
         return
