@@ -1,4 +1,4 @@
-"""How severe an encounter is, by geometry alone: contact, conflict, harsh or safe.
+"""How severe an encounter is, by its motion alone: contact, conflict, harsh or safe.
 
 The four words are the same in records, terminal, report, history, exports and documentation. They
 follow from the simulated motion at M and behind it: where bodies are, and how hard a car brakes;
@@ -28,11 +28,10 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
     if not isinstance(scenario, MergeScenario):
         return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
     soon = f"within {scenario.follow_up_s:g} s after"
-    brakes = f"a car behind brakes harder than {HARSH_MPS2:g} m/s² {soon} M"
     found = {
         Severity.CONTACT: f"bodies touch at M or {soon} it",
         Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
-        Severity.HARSH: f"none of these, and {brakes}",
+        Severity.HARSH: f"a car behind brakes harder than {HARSH_MPS2:g} m/s² {soon} M",
         Severity.SAFE: "none of these",
     }
     if not scenario.follow_up_s:
