@@ -32,7 +32,7 @@ from merge_sumo.verdict.campaign_verdict import (
 )
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.plausibility import doubts
+from merge_sumo.verdict.plausibility import doubts, mostly_clipped
 from merge_sumo.verdict.score import Measures, Outcome
 from merge_sumo.verdict.summary import Summary, summarise
 
@@ -190,7 +190,7 @@ class CampaignRun(Result):
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
             "fail_when": criterion.text,
-            "notes": doubts(outcomes, criterion),
+            "notes": [*filter(None, [mostly_clipped(outcomes)]), *doubts(outcomes, criterion)],
             **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
             "repeats": to_plain(self.repeats),
             "run": str(self.folder),
@@ -205,6 +205,7 @@ class CampaignRun(Result):
         optional = [
             unrepeatable(self.repeats),
             tested,
+            mostly_clipped(run.cases),
             *self.verdict.trouble_lines(),
             *found,
             *(f"{fact.name}: {fact.shown}" for fact in told),
@@ -222,7 +223,7 @@ class CampaignRun(Result):
         return [
             f"against {earlier}: {self.against.headline}",
             *self.against.steps[0].table_lines(),
-            f"what broke: {self.folder / AGAINST_PAGE}",
+            f"both motions in one picture: {self.folder / AGAINST_PAGE}",
         ]
 
     @property

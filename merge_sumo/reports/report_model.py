@@ -23,7 +23,7 @@ from merge_sumo.studies.surface import Surface, learn_surface
 from merge_sumo.verdict.campaign_verdict import Trouble, judge
 from merge_sumo.verdict.chance import by_case, undecided
 from merge_sumo.verdict.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.verdict.plausibility import doubts
+from merge_sumo.verdict.plausibility import doubts, mostly_clipped
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.summary import Summary, summarise
 from merge_sumo.vuts.process import LOG, end_of
@@ -147,6 +147,11 @@ class ReportModel:
     def notes(self) -> list[str]:
         """Doubts about the outcomes, in sentences."""
         return doubts(self.cases, self.run.criterion)
+
+    @property
+    def mostly_clipped(self) -> str | None:
+        """A sentence on a VUT that drove at its limits in most steps; None for others."""
+        return mostly_clipped(self.cases)
 
     @property
     def unrepeatable(self) -> str | None:

@@ -15,6 +15,8 @@ from merge_sumo.verdict.score import Outcome
 KMH_PER_MPS: Final = 3.6
 CLIPPED_SHARE: Final = 0.01
 """Share of the steps from which on it is said that accelerations were clipped."""
+MOSTLY_CLIPPED: Final = 0.5
+"""Share of the steps above which it is a headline: the limits drove, and not the VUT."""
 _THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
 """A measure, and the number that it is compared with."""
 
@@ -24,19 +26,28 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
 
     Of a criterion that says the same of all cases, a neighbour that would not.
     """
-    return [*_clipped(outcomes), *_one_verdict(outcomes, criterion)]
+    clipped = _clipped(outcomes, CLIPPED_SHARE)
+    often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
+    return [*often, *_one_verdict(outcomes, criterion)]
 
 
-def _clipped(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield in how many steps a VUT asked for more than its limits, where that is often."""
+def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:
+    """Return a sentence on a VUT that drove at its limits in most steps; None for others."""
+    clipped = _clipped(outcomes, MOSTLY_CLIPPED)
+    return clipped and f"not driven as asked: {clipped}; check the unit and the sign of its answers"
+
+
+def _clipped(outcomes: Sequence[Outcome], share: float) -> str | None:
+    """Return in how many steps a VUT asked for more than its limits; None up to a share of them."""
     clipped = sum(outcome.measures.clipped_steps for outcome in outcomes)
     steps = sum(round(outcome.measures.t_end_s / DT_S) for outcome in outcomes)
-    if clipped and clipped >= CLIPPED_SHARE * steps:
-        scenario = outcomes[0].case.scenario
-        yield (
-            f"in {clipped} of {steps} steps the VUT asks for an acceleration outside "
-            f"{scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped"
-        )
+    if clipped <= share * steps:
+        return None
+    scenario = outcomes[0].case.scenario
+    return (
+        f"in {clipped} of {steps} steps the VUT asks for an acceleration outside "
+        f"{scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped"
+    )
 
 
 def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[str]:
