@@ -71,6 +71,13 @@ def _out(help: str, shown: str | None = None, **more: Any) -> Any:
     return option(None, Path, help, WHERE, shown=shown, **more)
 
 
+def _page() -> Any:
+    return _out(
+        "New HTML page to write: what changed, and in each such case both motions in one picture.",
+        metavar="FILE",
+    )
+
+
 def _junit() -> Any:
     return option(None, Path, "New file to write for CI: JUnit XML.", WHERE, metavar="FILE")
 
@@ -315,7 +322,7 @@ class Rerun(Recorded):
 
     Exit code 1 when a case broke: it passed, and does not pass now.
 
-    Example:  merge-sumo rerun runs/design2 3 7 --vut design2
+    Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 
     Example:  merge-sumo rerun runs/design2 --stress
     """
@@ -324,6 +331,7 @@ class Rerun(Recorded):
     indices: Iterable[int] | int = keyword((), "Cases of the campaign; all of them by default.")
     _: KW_ONLY
     level: int | str = _level()
+    out: AnyPath | None = _page()
 
 
 @dataclass(frozen=True)
@@ -352,9 +360,7 @@ class Compare(Asked):
         metadata={"help": "The campaigns, or their folders, the oldest first."}
     )
     _: KW_ONLY
-    out: AnyPath | None = _out(
-        "New HTML page to write: what changed, in which cases, and both motions.", metavar="FILE"
-    )
+    out: AnyPath | None = _page()
     junit: AnyPath | None = _junit()
 
 

@@ -172,8 +172,19 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     before = campaign_of(asked.run).run
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
     chosen = comparison.chosen(before, indices, str(asked.level))
+    out = path_of(asked.out)
+    if out is not None:
+        check_new_file(out)
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
-        return comparison.rerun(study, chosen)
+        return _with_page(comparison.rerun(study, chosen), out)
+
+
+def _with_page(compared: Comparison, out: Path | None) -> Comparison:
+    """Write the page of a comparison, where one is asked for."""
+    if out is None:
+        return compared
+    write_new(out, comparison_page(compared).encode(errors="backslashreplace"))
+    return replace(compared, page_command="")
 
 
 @verb(verbs.Export)
@@ -252,9 +263,7 @@ def compare(asked: verbs.Compare) -> Comparison:
         if path is not None:
             check_new_file(path)
     versions = [campaign_of(run).run for run in asked.runs]
-    compared = comparison.compare(versions)
-    if out is not None:
-        write_new(out, comparison_page(compared, versions).encode(errors="backslashreplace"))
+    compared = _with_page(comparison.compare(versions), out)
     if junit is not None:
         write_junit_of_comparison(junit, compared)
     return compared

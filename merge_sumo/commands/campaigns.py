@@ -146,12 +146,14 @@ def rerun(
     from merge_sumo import api
 
     if stress:
-        if case or "level" in given.written:
-            raise UserError("--stress runs all cases: leave indices and --level away")
+        if case or given.written.keys() & {"level", "out"}:
+            raise UserError(
+                "--stress runs all cases, without a page: leave indices, --level and --out away"
+            )
         given.print(api.stress(run, **given.written))
         return
     result = api.rerun(run, case or (), **given.written)
-    given.print(result)
+    given.print(result, page=given.keywords["out"])
     raise typer.Exit(1 if result.worse else 0)
 
 

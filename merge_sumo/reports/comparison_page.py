@@ -5,20 +5,19 @@ It is one HTML file without scripts that loads nothing.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.reports.pages import page
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import VEHICLES, VUT
-from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
-from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import replace_own
 from merge_sumo.verdict.campaign_verdict import judge
+from merge_sumo.verdict.cause import cause
 
 SHOWN: Final = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
@@ -28,6 +27,8 @@ DRAWN: Final = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NEITHER, Change.STILL_CONTACT, Change.FIXED),
 )
 """Changes of which a section has both motions of each case; the template says what they mean."""
+SEEN: Final = 0.005
+"""In m, m/s and m/s2: motions that differ by less look alike."""
 AGAINST_PAGE: Final = f"{AGAINST}.html"
 """Page in the folder of a campaign against an earlier version."""
 STYLES: Final = ("report.css", "comparison.css")
@@ -35,21 +36,21 @@ STYLES: Final = ("report.css", "comparison.css")
 
 def write_against(run: Run) -> None:
     """Write the page of a campaign against an earlier version into its folder; else do nothing."""
-    compared, earlier = compare_against(run), run.earlier()
+    compared = compare_against(run)
     if compared is not None:
-        html = comparison_page(compared, [earlier, run])
+        html = comparison_page(compared)
         replace_own(run.folder / AGAINST_PAGE, html.encode(errors="backslashreplace"))
 
 
-def comparison_page(compared: Comparison, runs: Sequence[Run | None]) -> str:
-    """Return the page of a comparison as HTML; `runs` have the motions of the versions, if any."""
+def comparison_page(compared: Comparison) -> str:
+    """Return the page of a comparison as HTML."""
     outcomes = next(version.outcomes for version in compared.versions if version.outcomes)
     return page(
         "comparison.html.jinja",
         styles=STYLES,
         compared=compared,
         counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
-        steps=[(step, _maps(step), _sections(step, runs)) for step in compared.steps],
+        steps=[(step, _maps(step), _sections(step, compared)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
         most=MOST_REGIONS,
         cut=cut,
@@ -67,52 +68,69 @@ def _maps(step: Step) -> dict[int, Any]:
     return dict(sorted(maps.items()))
 
 
-def _sections(step: Step, runs: Sequence[Run | None]) -> list[tuple[Change, int, Any]]:
-    """Return each change with the number of its cases, and of the first of them both motions.
+def _sections(step: Step, compared: Comparison) -> list[tuple[Change, int, Any]]:
+    """Return each change with the number of its cases, and of the first of them the picture.
 
-    A case is shown as the pair of the versions, each with its run, its outcome, its cause, and
-    its charts, which are none without a motion.
+    Of a case: what became of it; by version its number, folder, outcome, and cause; the charts;
+    when the motions begin to differ.
     """
     sections, left = [], SHOWN
-    of_versions = runs[step.before - 1], runs[step.after - 1]
+    numbers = (step.before, step.after)
+    versions = [compared.versions[number - 1] for number in numbers]
+    folders = [version.folder for version in versions]
     for change in DRAWN:
         cases = [case for case in step.cases if case.change is change]
         shown = cases[:left]
         left -= len(shown)
-        outcomes = [one.a for one in shown], [one.b for one in shown]
-        sides = list(zip(of_versions, outcomes, strict=True))
-        motions = [
-            {} if run is None else run.trajectories(o.index for o in own) for run, own in sides
+        pairs = [(one.a, one.b) for one in shown]
+        known = [
+            version.motions(outcome.index for outcome in outcomes)
+            for version, outcomes in zip(versions, zip(*pairs, strict=True), strict=False)
         ]
-        said = [{} if run is None else causes(run, own) for run, own in sides]
         rows = []
-        for one in shown:
-            own = [found.get(o.index) for found, o in zip(motions, (one.a, one.b), strict=True)]
-            both = [motion for motion in own if motion is not None]
-            charts = [[] if motion is None else _charts(motion, both) for motion in own]
-            words = said[0].get(one.a.index), said[1].get(one.b.index)
-            rows.append((one, list(zip(of_versions, (one.a, one.b), words, charts, strict=True))))
+        for one, pair in zip(shown, pairs, strict=True):
+            found = [of.get(outcome.index) for of, outcome in zip(known, pair, strict=True)]
+            motions = [None if motion is None else motion.whole for motion in found]
+            words = [cause(outcome, own) for outcome, own in zip(pair, found, strict=True)]
+            both = list(zip(numbers, folders, pair, words, strict=True))
+            rows.append((one, both, _charts(*motions), _differ_s(*motions)))
         if cases:
             sections.append((change, len(cases), rows))
     return sections
 
 
-def _charts(motion: Trajectory, both: Sequence[Trajectory]) -> list[dict[str, Any]]:
-    """Return speeds and distances to M of all cars, over the axes of both motions of the case."""
+def _differ_s(earlier: FloatArray | None, later: FloatArray | None) -> float | None:
+    """Return when two motions, (T + 1, A, 3), begin to differ; None where they do not."""
+    if earlier is None or later is None:
+        return None
+    rows = min(len(earlier), len(later))
+    apart = (np.abs(earlier[:rows] - later[:rows]) > SEEN).any(axis=(1, 2))
+    if len(earlier) == len(later) and not apart.any():
+        return None
+    return round((int(apart.argmax()) if apart.any() else rows - 1) * DT_S, 1)
+
+
+def _charts(earlier: FloatArray | None, later: FloatArray | None) -> list[dict[str, Any]]:
+    """Return speeds and distances to M of all cars in both motions, over the same axes."""
+    known = [
+        (name, one) for name, one in (("earlier", earlier), ("later", later)) if one is not None
+    ]
     charts = []
-    # The VUT lies on top.
-    cars = sorted(range(motion.motion.shape[1]), key=lambda car: car == VUT)
-    for title, k in (("speed, m/s", 1), ("distance to M, m", 0)):
-        values = np.concatenate([one.motion[:, :, k].ravel() for one in both])
+    for title, k in (("speed, m/s", 1), ("distance to M, m", 0)) if known else ():
+        values = np.concatenate([one[:, :, k].ravel() for _, one in known])
         low, high = float(values.min()), float(values.max())
+        # The VUT lies on top.
+        cars = sorted(range(known[0][1].shape[1]), key=lambda car: car == VUT)
         charts.append(
             {
                 "title": title,
                 "low": low,
                 "high": max(high, low + 1.0),
-                "steps": max(1, *(len(one.motion) - 1 for one in both)),
+                "steps": max(1, *(len(one) - 1 for _, one in known)),
                 "lines": [
-                    (VEHICLES[car], np.round(motion.motion[:, car, k], 2).tolist()) for car in cars
+                    (f"{VEHICLES[car]} {name}", np.round(one[:, car, k], 2).tolist())
+                    for car in cars
+                    for name, one in known
                 ],
             }
         )

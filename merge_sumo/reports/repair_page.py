@@ -32,6 +32,6 @@ def write_repair(repair: RepairResult, before: Run) -> None:
     )
     files = {"repair.json": to_json(repair.to_record(), indent=1).decode(), PAGE: html}
     if (best := repair.best) is not None:
-        files[CHANGES] = comparison_page(best.compared, [None, best.campaign])
+        files[CHANGES] = comparison_page(best.compared)
     for name, text in files.items():
         replace_own(repair.folder / name, text.encode(errors="backslashreplace"))

@@ -14,7 +14,7 @@ changed VUT. All return a `Comparison`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -31,12 +31,14 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.chance import RunsOfCase, by_case, one_per_case
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.summary import LevelSummary, summarise
@@ -45,6 +47,10 @@ LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""
 SIGNIFICANT: Final = 0.05
 """Chance of the runs of a case in equal versions, up to which a change is none of chance."""
+PAGE: Final = "changes.html"
+"""Name of the page with both motions in the commands that write it."""
+Motions = Callable[[Iterable[int]], Mapping[int, Trajectory]]
+"""Gives motions by the index of their case, without those that are not there."""
 
 
 class Change(StrEnum):
@@ -216,6 +222,7 @@ class Version:
         outcomes: all runs.
         tolerated: share of its runs in which a case may fail.
         levels: POV levels.
+        motions: gives its motions.
     """
 
     vut: str
@@ -223,12 +230,24 @@ class Version:
     outcomes: Sequence[Outcome]
     tolerated: float
     levels: Sequence[int]
+    motions: Motions
 
     @classmethod
     def of(cls, run: Run) -> Version:
         """Return a campaign as a version."""
         levels = sorted({*run.levels, *(outcome.case.level for outcome in run.outcomes)})
-        return cls(run.vut, str(run.folder), run.outcomes, run.tolerated, levels)
+        folder = str(run.folder)
+        return cls(run.vut, folder, run.outcomes, run.tolerated, levels, run.trajectories)
+
+    def with_vut(self, vut: str, episodes: Sequence[Episode]) -> Version:
+        """Return the version of another VUT in the same cases, by its episodes."""
+        outcomes = [episode.outcome for episode in episodes]
+        own = {episode.outcome.index: episode.trajectory for episode in episodes}
+
+        def motions(indices: Iterable[int]) -> dict[int, Trajectory]:
+            return {index: own[index] for index in indices if index in own}
+
+        return replace(self, vut=vut, folder=None, outcomes=outcomes, motions=motions)
 
     @cached_property
     def cases(self) -> list[Outcome]:
@@ -306,12 +325,14 @@ class Comparison(Result):
         steps: what changed.
         source: a sentence on where the cases come from.
         notes: sentences on what limits the comparison.
+        page_command: the command that writes its page, with both motions of the cases.
     """
 
     versions: tuple[Version, ...]
     steps: tuple[Step, ...]
     source: str
     notes: tuple[str, ...] = ()
+    page_command: str = ""
 
     @property
     def broke(self) -> int:
@@ -357,20 +378,20 @@ class Comparison(Result):
         ]
         for step in self.steps:
             text += self._lines_of(step)
+        differ = any(c.change is not Change.BOTH for step in self.steps for c in step.cases)
+        if differ and self.page_command:
+            text.append(f"both motions in one picture: {self.page_command}")
         return [*text, *self.notes]
 
     def _lines_of(self, step: Step) -> list[str]:
         named = f"from {step.before} to {step.after}: {counted(len(step.cases), 'case')} with both"
         text = [named] if step.cases else []
         text += step.table_lines()
-        folder = self.versions[step.after - 1].folder
         for change in (Change.BROKE, Change.WITHIN_CHANCE, Change.STILL_CONTACT):
             cases = [case for case in step.cases if case.change is change]
             if cases:
                 text.append(f"{change}{cut(len(cases), LISTED)}:")
                 text += [f"  case {case.b.index}: {case.became}" for case in cases[:LISTED]]
-            if cases and folder is not None:
-                text.append(f"  look at one: merge-sumo replay {quoted(folder)} {cases[0].b.index}")
         return text
 
     def fmc(self) -> dict[int, list[str]]:
@@ -412,6 +433,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
     found = [Version.of(run) for run in runs]
     if not set.intersection(*(set(version.levels) for version in found[:2])):
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
+    folders = " ".join(quoted(run.folder) for run in runs)
     return Comparison(
         versions=tuple(found),
         steps=tuple(_step(found, number) for number in range(1, len(found))),
@@ -420,6 +442,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
             "hint, and `merge-sumo rerun` pairs the cases of one with another VUT"
         ),
         notes=tuple(_notes(runs)),
+        page_command=f"merge-sumo compare {folders} --out {PAGE}",
     )
 
 
@@ -432,15 +455,15 @@ def compare_against(run: Run) -> Comparison | None:
     if earlier is None:
         return None
     outcomes = earlier.outcomes[: len(run.outcomes)]
-    before = Version(earlier.vut, str(earlier.folder), outcomes, run.tolerated, run.levels)
+    before = replace(Version.of(earlier), outcomes=outcomes, tolerated=run.tolerated)
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
     return _of_two(before, Version.of(run), source)
 
 
-def compare_outcomes(before: Sequence[Outcome], after: Run, vut: str) -> Comparison:
+def compare_episodes(before: Sequence[Episode], after: Run, vut: str) -> Comparison:
     """Compare a campaign with what another VUT does in its cases."""
     later = Version.of(after)
-    earlier = replace(later, vut=vut, folder=None, outcomes=before)
+    earlier = later.with_vut(vut, before)
     return _of_two(earlier, later, f"the cases come from the search of {after.vut}")
 
 
@@ -573,13 +596,13 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     levels = sorted({outcome.case.level for outcome in before})
     study.check_same_system(levels, may_change=True)
     # In another order than the campaign's, which a VUT that remembers would repeat.
-    order, by_index = before[::-1], dict[int, Outcome]()
+    order, by_index = before[::-1], dict[int, Episode]()
     plan = study.plan.for_cases(len(before))
     with workers_or_here(study.workers) as processes:
         open_simulators(plan, processes)
         for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
             old = order[place]
-            by_index[old.index] = now.at(old.index, old.batch).outcome
+            by_index[old.index] = now.at(old.index, old.batch)
             study.on_cases(1)
     after = [by_index[outcome.index] for outcome in before]
     search = f"merge-sumo campaign --vut {quoted(settings.vut)}"
@@ -589,5 +612,10 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
         f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
         f"now alone fails may lie elsewhere: `{search}` searches there"
     )
-    earlier = Version(run.vut, str(run.folder), before, run.tolerated, levels)
-    return _of_two(earlier, replace(earlier, vut=settings.vut, folder=None, outcomes=after), source)
+    earlier = replace(Version.of(run), outcomes=before, levels=levels)
+    compared = _of_two(earlier, earlier.with_vut(settings.vut, after), source)
+    differing = [one for one in compared.steps[0].cases if one.change is not Change.BOTH]
+    indices = " ".join(str(one.b.index) for one in differing[:LISTED])
+    again = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
+    again += f" --pov {quoted(settings.pov)}" if settings.pov is not None else ""
+    return replace(compared, page_command=f"{again} --out {PAGE}")

@@ -43,7 +43,7 @@ from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, from_unit, to_unit
-from merge_sumo.studies.comparison import Comparison, compare_outcomes, cut, passes
+from merge_sumo.studies.comparison import Comparison, compare_episodes, cut, passes
 from merge_sumo.studies.run_study import OnPart, RunStudy, check_least
 from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted, quoted
@@ -144,6 +144,12 @@ class Round:
     compared: Comparison
 
     @property
+    def failing(self) -> tuple[int, int]:
+        """Number of the fresh cases that do not pass: with today's values, with the chosen ones."""
+        cases = self.compared.steps[0].cases
+        return sum(not passes(c.a) for c in cases), sum(not passes(c.b) for c in cases)
+
+    @property
     def fmc(self) -> float:
         """FMC of the failures of the fresh campaign, summed over the levels."""
         levels = summarise(self.campaign.cases, self.campaign.levels).levels
@@ -205,8 +211,8 @@ class RepairResult(Result):
 
     @property
     def repaired(self) -> str | None:
-        """The repaired controller as a spec."""
-        if self.chosen is None:
+        """The repaired controller as a spec; None where no fresh campaign confirms values."""
+        if self.chosen is None or not self.verified:
             return None
         return str(parse(self.vut).with_values(self.chosen.values, self.today))
 
@@ -221,6 +227,18 @@ class RepairResult(Result):
     def verified(self) -> bool:
         """Whether values were found, and no case of the fresh campaign broke by them."""
         return self.best is not None and not self.best.compared.worse
+
+    @property
+    def unverified(self) -> str:
+        """What speaks against the chosen values, in a sentence; empty where no values help."""
+        if self.best is None:
+            return ""
+        compared, (today, now) = self.best.compared, self.best.failing
+        return (
+            f"Not verified: of the {counted(len(compared.steps[0].cases), 'case')} of a fresh "
+            f"campaign {today} do not pass with today's values, and {now} with the values tried; "
+            f"{compared.broke} broke. These values are no repair."
+        )
 
     def to_record(self) -> dict[str, Any]:
         """Return what `repair.json` holds, and `--json` prints."""
@@ -237,8 +255,9 @@ class RepairResult(Result):
         if self.chosen is None:
             none = f"{self.vut}: {failing} fail, and no values in these ranges let one pass without"
             return [f"{none} others that fail", f"  these stay, {stays}"]
-        passing = len(self.failing) - len(self.stays)
+        passing, spec = len(self.failing) - len(self.stays), quoted(self.repaired or "")
         lines = [
+            *([] if self.verified else [self.unverified]),
             f"{self.vut}: {failing} did not pass; with other values {passing} of them pass, and "
             "none that passed fails",
             *([f"  {stays}"] if self.stays else []),
@@ -256,8 +275,7 @@ class RepairResult(Result):
                 f"today's values and the new ones {one.compared.headline}"
                 for number, one in enumerate(self.rounds, start=1)
             ),
-            *([] if self.verified else ["not verified: cases broke"]),
-            f"the repaired controller: merge-sumo campaign --vut {quoted(self.repaired or '')}",
+            *([f"the repaired controller: merge-sumo campaign --vut {spec}"] if spec else []),
         ]
 
 
@@ -360,10 +378,10 @@ class _Repair:
 
     def compared(self, campaign: Run) -> Comparison:
         """Compare a fresh campaign with today's values in the same cases."""
-        today = self._run(self._plan, [outcome.case for outcome in campaign.outcomes])
-        pairs = zip(today, campaign.outcomes, strict=True)
-        before = [replace(old, index=new.index) for old, new in pairs]
-        return compare_outcomes(before, campaign, str(self._plan.vut.spec))
+        cases = [outcome.case for outcome in campaign.outcomes]
+        today = dict(evaluate(self._plan.for_cases(len(cases)), cases, self._workers))
+        before = [today[one.index].at(one.index, one.batch) for one in campaign.outcomes]
+        return compare_episodes(before, campaign, str(self._plan.vut.spec))
 
     def round(self, number: int, earlier: Trial | None) -> Trial | None:
         """Search in a round; return the best trial, with all cases, or None where none helps."""
