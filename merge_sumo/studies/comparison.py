@@ -14,10 +14,9 @@ changed VUT. All return a `Comparison`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -31,8 +30,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.studies.version import Version
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_plain
 from merge_sumo.system.result import Result
@@ -41,16 +40,13 @@ from merge_sumo.verdict.chance import RunsOfCase, by_case, one_per_case
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
-from merge_sumo.verdict.summary import LevelSummary, summarise
 
 LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""
 SIGNIFICANT: Final = 0.05
 """Chance of the runs of a case in equal versions, up to which a change is none of chance."""
-PAGE: Final = "changes.html"
-"""Name of the page with both motions in the commands that write it."""
-Motions = Callable[[Iterable[int]], Mapping[int, Trajectory]]
-"""Gives motions by the index of their case, without those that are not there."""
+OUT: Final = " --out changes.html"
+"""Ends the commands that write the page with both motions."""
 
 
 class Change(StrEnum):
@@ -210,60 +206,6 @@ class Region(Record, frozen=True):
     fmc: float
     cases: int
     failed: int
-
-
-@dataclass(frozen=True)
-class Version:
-    """A version of a VUT: the outcomes that are recorded of it.
-
-    Attributes:
-        vut: name of the VUT.
-        folder: of its campaign; None where it ran in the cases of another one's.
-        outcomes: all runs.
-        tolerated: share of its runs in which a case may fail.
-        levels: POV levels.
-        motions: gives its motions.
-    """
-
-    vut: str
-    folder: str | None
-    outcomes: Sequence[Outcome]
-    tolerated: float
-    levels: Sequence[int]
-    motions: Motions
-
-    @classmethod
-    def of(cls, run: Run) -> Version:
-        """Return a campaign as a version."""
-        levels = sorted({*run.levels, *(outcome.case.level for outcome in run.outcomes)})
-        folder = str(run.folder)
-        return cls(run.vut, folder, run.outcomes, run.tolerated, levels, run.trajectories)
-
-    def with_vut(self, vut: str, episodes: Sequence[Episode]) -> Version:
-        """Return the version of another VUT in the same cases, by its episodes."""
-        outcomes = [episode.outcome for episode in episodes]
-        own = {episode.outcome.index: episode.trajectory for episode in episodes}
-
-        def motions(indices: Iterable[int]) -> dict[int, Trajectory]:
-            return {index: own[index] for index in indices if index in own}
-
-        return replace(self, vut=vut, folder=None, outcomes=outcomes, motions=motions)
-
-    @cached_property
-    def cases(self) -> list[Outcome]:
-        """The deciding run of each case."""
-        return one_per_case(self.outcomes, self.tolerated)
-
-    @cached_property
-    def at(self) -> dict[int, LevelSummary]:
-        """By level, what is known of it."""
-        return summarise(self.outcomes, self.levels, self.tolerated).levels
-
-    def to_record(self) -> dict[str, Any]:
-        """Return it as JSON shows it."""
-        levels = {level_name(level): to_plain(self.at[level]) for level in self.levels}
-        counts = judge(self.outcomes, self.tolerated).to_record()
-        return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
 
 
 @dataclass(frozen=True, slots=True)
@@ -442,7 +384,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
             "hint, and `merge-sumo rerun` pairs the cases of one with another VUT"
         ),
         notes=tuple(_notes(runs)),
-        page_command=f"merge-sumo compare {folders} --out {PAGE}",
+        page_command=f"merge-sumo compare {folders}{OUT}",
     )
 
 
@@ -617,5 +559,6 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     differing = [one for one in compared.steps[0].cases if one.change is not Change.BOTH]
     indices = " ".join(str(one.b.index) for one in differing[:LISTED])
     again = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
-    again += f" --pov {quoted(settings.pov)}" if settings.pov is not None else ""
-    return replace(compared, page_command=f"{again} --out {PAGE}")
+    if settings.pov is not None:
+        again += f" --pov {quoted(settings.pov)}"
+    return replace(compared, page_command=again + OUT)
