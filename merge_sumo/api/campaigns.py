@@ -14,6 +14,7 @@ from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings, controllers
+from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import notice
 from merge_sumo.reports.junit import check_junit, write_junit
@@ -106,8 +107,9 @@ def _write_findings(
         known := avoidance(done, plan, workers=workers, check=check, on_part=careful)
     ):
         AVOIDANCE.write_lines(done.folder, known)
-    note_shares(done, plan, check)
-    note_explanation(done, plan, check=check)
+    with workers_or_here(None) as here:  # worker processes take longer to start than these cases
+        note_shares(done, plan, here, check)
+        note_explanation(done, plan, here, check)
     link_latest(done.folder)
     write_report(done, result.summary, counted("surrogates of the report", "levels"))
 

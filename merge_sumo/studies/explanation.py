@@ -23,7 +23,7 @@ from msgspec import Meta
 
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import named_again
-from merge_sumo.engine.evaluate import THIS_PROCESS, Episodes, evaluate, workers_or_here
+from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
@@ -218,19 +218,18 @@ def failure_of(run: Run, index: int | None) -> Outcome:
 def note_explanation(
     run: Run,
     plan: SimulationPlan,
-    *,
+    workers: Workers,
     check: Callable[[], None] = lambda: None,
 ) -> None:
     """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
-    It runs in this process: others take longer to start. Nothing is written for drivers that need
-    SUMO, nor where the engines differ. `check` is called
+    Nothing is written for drivers that need SUMO, nor where the engines differ. `check` is called
     after each step, and may raise to stop there.
     """
     worst = failures(run.cases)[:1]
     if plan.needs_sumo is None and worst:
         with suppress(UserError):
-            _explained(run, _Neighbours(plan.with_engine(None), worst[0], (), THIS_PROCESS, check))
+            _explained(run, _Neighbours(plan.with_engine(None), worst[0], (), workers, check))
 
 
 def explain(

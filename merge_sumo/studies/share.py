@@ -14,12 +14,13 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record
+from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.chance import clopper_pearson
 
 CASES: Final = 2000
@@ -65,7 +66,9 @@ class Shares(Record, frozen=True):
 SHARES: Final = StudyFile("shares.json", Shares)
 
 
-def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lambda: None) -> None:
+def note_shares(
+    run: Run, plan: SimulationPlan, workers: Workers, check: Callable[[], None] = lambda: None
+) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.
 
     Nothing is written for drivers that need SUMO, where it takes long (`probability`), where a case
@@ -77,20 +80,22 @@ def note_shares(run: Run, plan: SimulationPlan, check: Callable[[], None] = lamb
     levels = []
     for level in run.levels:
         try:
-            levels.append(share_at(plan, level, CASES, run.settings.seed))
+            levels.append(share_at(plan, level, CASES, run.settings.seed, workers))
         except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
             return
         check()
     SHARES.write(run.folder, Shares(tuple(levels)))
 
 
-def share_at(plan: SimulationPlan, level: int, cases: int, seed: int) -> LevelShare:
+def share_at(
+    plan: SimulationPlan, level: int, cases: int, seed: int, workers: Workers | None = None
+) -> LevelShare:
     """Return the share of uniform cases of a level that fail, by the equations of motion."""
     rng = np.random.default_rng([seed, STREAM, level])
     points = rng.random((cases, len(plan.scenario.dimensions(level))))
     pool = Pool(levels=(level,), scenario=plan.scenario)
     kinematic = plan.for_verdicts().with_engine(None)
-    ran = evaluate(kinematic, CasesAt(pool, level, points), THIS_PROCESS, fails_of)
+    ran = evaluate(kinematic, CasesAt(pool, level, points), workers, fails_of)
     return LevelShare(level, cases, sum(fails for _, fails in ran))
 
 

@@ -45,6 +45,13 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     assert SHARES.read(again.folder) == shares
 
 
+def test_a_case_runs_after_a_campaign_of_worker_processes(tmp_path):
+    run = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "run", workers=2)
+    assert SHARES.read(run.folder) is not None
+    first = run.run.outcomes[0]
+    assert api.run(recorded=(run.folder, 0)).measures == first.measures
+
+
 def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_named(tmp_path):
     run = api.campaign("sumo:IDM", level="0", cases=10, out=tmp_path / "run", progress=False)
     assert SHARES.read(run.folder) is None
