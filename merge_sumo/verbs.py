@@ -31,11 +31,11 @@ from merge_sumo.options import (
 )
 
 if TYPE_CHECKING:
-    from merge_sumo.scenario.scenario import Scenario
+    from merge_sumo.scenario.scenario import AnyLevels, Scenario
     from merge_sumo.verdict.score import Outcome
     from merge_sumo.vuts.in_memory import AnyVut
 else:  # the command line reads no annotation, and importing these takes time
-    AnyVut = Outcome = Scenario = Any
+    AnyLevels = AnyVut = Outcome = Scenario = Any
 
 
 VUT: Final = {
@@ -48,7 +48,7 @@ COORDINATES: Final = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "h
 
 
 def _level() -> Any:
-    return option("all", str, "POV level: 0, 1, 2, own or all.", TESTED)
+    return option("all", str, "POV levels: 0, 1, 2, own, several with commas, or all.", TESTED)
 
 
 def _params(help: str) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def _any_scenario(help: str) -> Any:
 class SearchOfTest(Execution, Search, Test):
     """The keywords of a campaign, begun or gone on with."""
 
-    level: int | str = _level()
+    level: AnyLevels = _level()
     against: AnyVut | None = option(
         None,
         str,
@@ -330,7 +330,7 @@ class Rerun(Recorded):
     run: AnyRun = field(metadata=RUN)
     indices: Iterable[int] | int = keyword((), "Cases of the campaign; all of them by default.")
     _: KW_ONLY
-    level: int | str = _level()
+    level: AnyLevels = _level()
     out: AnyPath | None = _page()
 
 
@@ -526,7 +526,7 @@ class GroundTruth(Execution, Test):
     """
 
     vut: AnyVut = field(metadata=VUT)
-    level: int | str = _level()
+    level: AnyLevels = _level()
     _: KW_ONLY
     cases: int | None = option(None, int, "Uniform cases of a level.", CASES, shown=TRUTH_CASES)
     seed: int = seed_option("Same seed, same cases.")
@@ -546,7 +546,7 @@ class Benchmark(Execution, Test):
     """
 
     vut: AnyVut = field(metadata=VUT)
-    level: int | str = _level()
+    level: AnyLevels = _level()
     _: KW_ONLY
     samplers: Iterable[str] | None = option(
         None,

@@ -132,7 +132,7 @@ def resume(asked: verbs.Resume) -> CampaignRun:
     if "level" in asked.given:
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
-        levels = parse_levels(str(asked.level), policies, settings.scenario.levels, own=own)
+        levels = parse_levels(asked.level, policies, settings.scenario.levels, own=own)
         settings = replace(settings, levels=levels)
     return concluded(settings, resolve(settings), folder, where, asked, goes_on=True)
 
@@ -171,7 +171,7 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     """Run recorded cases again with a changed VUT."""
     before = campaign_of(asked.run).run
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
-    chosen = comparison.chosen(before, indices, str(asked.level))
+    chosen = comparison.chosen(before, indices, asked.level)
     out = path_of(asked.out)
     if out is not None:
         check_new_file(out)

@@ -131,7 +131,7 @@ def settings_for(
             fields |= {"cases": DEFAULT_CASES, "stop_when_converged": True}
     scenario = scenario_of(asked.scenario, asked.values(OfScenario))
     folder = policies_folder(asked.policies, scenario)
-    levels = parse_levels(str(asked.level), folder, scenario.levels, own=pov is not None)
+    levels = parse_levels(asked.level, folder, scenario.levels, own=pov is not None)
     fields |= {"vut": spec, "pov": pov, "levels": levels, **search}
     return settings_in(asked, scenario, fields), _where(asked, workers)
 

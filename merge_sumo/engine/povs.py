@@ -19,7 +19,16 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray, ToldCase
-from merge_sumo.scenario.scenario import ALL_LEVELS, OWN, VUT, Scenario, lane_of, level_name
+from merge_sumo.scenario.scenario import (
+    ALL_LEVELS,
+    OWN,
+    VUT,
+    AnyLevels,
+    Scenario,
+    lane_of,
+    level_name,
+    names_of_levels,
+)
 from merge_sumo.sumo.world import World
 from merge_sumo.system.hashing import Files
 from merge_sumo.system.suggestions import either
@@ -78,7 +87,7 @@ class Povs:
         return min(asked, most // cars)
 
 
-CHOICE: Final = "0, 1, 2 or all, or own with `pov`"
+CHOICE: Final = "0, 1, 2, several with commas, or all, or own with `pov`"
 ONE: Final = "0, 1 or 2, or own with `pov`"
 
 
@@ -108,35 +117,37 @@ def check_level(
 
 
 def parse_levels(
-    text: str,
+    asked: AnyLevels,
     policies: Path,
     scenario_levels: tuple[int, ...] = ALL_LEVELS,
     *,
     own: bool,
     choice: str = CHOICE,
 ) -> tuple[int, ...]:
-    """Return the levels that a person names: one, or all of a scenario for which there is a POV.
+    """Return the levels that a person names in their order: all are those that have a POV.
 
     Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
     """
-    if text == "all":
+    names = names_of_levels(asked)
+    if names == {"all"}:
         return levels_in(policies, scenario_levels, own=own)
     by_name = {level_name(level): level for level in ALL_LEVELS}
-    if text not in by_name:
-        raise UserError(f"there is no POV level {text!r}: choose {choice}")
-    level = by_name[text]
-    check_level(level, policies, scenario_levels, own=own)
-    if own and level != OWN:
+    for name in names:
+        if name not in by_name:
+            raise UserError(f"there is no POV level {name!r}: choose {choice}")
+        check_level(by_name[name], policies, scenario_levels, own=own)
+    if own and level_name(OWN) not in names:
+        text = ",".join(sorted(names))
         raise UserError(f"`pov` drives at `level` own or all, not at `level` {text}")
-    return (level,)
+    return tuple(level for name, level in by_name.items() if name in names)
 
 
 def one_level(
     text: str, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
 ) -> int:
     """Return the one level that a person names."""
-    if text == "all":
-        raise UserError(f"`level` all does not go here: choose {ONE}")
+    if text == "all" or "," in text:
+        raise UserError(f"`level` {text} does not go here: choose {ONE}")
     return parse_levels(text, policies, scenario_levels, own=own, choice=ONE)[0]
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 
@@ -59,6 +59,16 @@ Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in 
 def level_name(level: int) -> str:
     """Return a level as people write it."""
     return "own" if level == OWN else str(level)
+
+
+AnyLevels = int | str | Iterable[int | str]
+
+
+def names_of_levels(asked: AnyLevels) -> set[str]:
+    """Return the names of the levels that a person lists, in a text with commas."""
+    listed = asked if isinstance(asked, Iterable) else [asked]
+    parts = asked.split(",") if isinstance(asked, str) else listed
+    return {str(part).strip() for part in parts} or {""}
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_her
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.version import Version
 from merge_sumo.system.printable import counted, quoted
@@ -512,17 +512,19 @@ def _box_in_words(cases: Sequence[Case]) -> str:
     return ", ".join(parts)
 
 
-def chosen(run: Run, indices: Sequence[int], level: str = "all") -> list[Outcome]:
-    """Return cases of a campaign by their indices, by default all, of a level or of all.
+def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[Outcome]:
+    """Return cases of a campaign by their indices, by default all, of some levels or of all.
 
     Raises `UserError` for an index without a case, and where there is no such case.
     """
     found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
-    names = {level_name(number): number for number in run.levels}
-    if level != "all" and level not in names:
-        there = ", ".join(names)
-        raise UserError(f"{run.folder} has no cases at level {level}: it has {there}, or all")
-    found = [one for one in found if level == "all" or one.case.level == names[level]]
+    there = list(map(level_name, run.levels))
+    names = names_of_levels(level)
+    for name in () if names == {"all"} else names.difference(there):
+        raise UserError(
+            f"{run.folder} has no cases at level {name}: it has {', '.join(there)}, or all"
+        )
+    found = [o for o in found if names == {"all"} or level_name(o.case.level) in names]
     if not found:
         raise UserError(f"{run.folder} has none of these cases: name others, or another level")
     return found

@@ -319,8 +319,8 @@ class TruthResult(Result):
         for name in ("cases", "failures", "fmc", "real_regions"):
             of_levels = [one[name] for one in levels]
             sums[name] = None if None in of_levels else sum(of_levels)
-        text = self.criterion.text
-        return {"vut": self.vut, "level": "all", **sums, "fail_when": text, "levels": levels}
+        text, named = self.criterion.text, ",".join(map(level_name, self.truths))
+        return {"vut": self.vut, "level": named, **sums, "fail_when": text, "levels": levels}
 
     def lines(self) -> list[str]:
         """Return a line for each level, and any criterion but the default one in words."""
