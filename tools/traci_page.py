@@ -20,6 +20,13 @@ HEADINGS = (
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do
 
+In plain SUMO `setSpeed` often seems to do nothing, because in its default speed mode (31) the \
+safe speed of the car-following model, right of way, red lights, and the vehicle's own limits of \
+acceleration and speed override it. It acts in the next step, while `getSpeed` answers the speed \
+of the last one, and it holds until `setSpeed(-1)`, from where on the car-following model drives. \
+All of that is the same here but for the speed mode: `vut` departs in 38, in which its own limits \
+act and the rest does not.
+
 Made by `python tools/traci_page.py` from SUMO's own client: do not edit.
 
 A shadow SUMO answers questions. It has the original net and the vehicles `pov` and `vut` (in \
@@ -31,16 +38,18 @@ are available for all questions; there are no context subscriptions.
 
 The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
 the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
-scenario's limits. `vut` departs in speed mode 38 with its speed set, so a controller without \
-commands keeps its speed: limits of acceleration act, SUMO's checks of safe speed, right of way \
-and red lights do not. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
+scenario's limits. `vut` departs with its speed set, so a controller without commands keeps its \
+speed. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
 meaning in SUMO, whose car-following model then drives the VUT (deterministically: `sigma` is 0, \
 unless `setImperfection` changes it). On a road with an acceleration lane the lane that the step \
 gives the VUT is its wish to merge; `vut` departs in lane change mode 0, so nothing but the \
-controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lane-changes)). Other \
-commands are accepted without effect (with one note in \
-`controller.log`), or refused with a reason, as an error of that command; the connection stays \
-open. [Why SUMO decides](../decisions/traci-server.md).
+controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lane-changes)).
+
+`setPreviousSpeed` and `moveToXY` say what [a vehicle model of the controller's own]\
+(../tutorials/traci-controller.md#a-vehicle-model-of-your-own) has reached after the step; they go \
+before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Other commands are \
+accepted without effect (with one note in `controller.log`), or refused with a reason, as an error \
+of that command; the connection stays open. [Why SUMO decides](../decisions/traci-server.md).
 """
 
 

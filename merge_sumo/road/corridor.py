@@ -105,6 +105,20 @@ class LanePath:
         position_m = x_m - piece.start_m
         return LanePoint(piece.lane, position_m, *piece.point(position_m))
 
+    def nearest(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Return how far a point in the plane is from the lanes, in m, and the coordinate there."""
+        found = []
+        for piece in self.pieces:
+            shares, shape = pairwise(piece.shares), pairwise(piece.shape)
+            for (begin, end), ((x0, y0, _), (x1, y1, _)) in zip(shares, shape, strict=True):
+                dx, dy = x1 - x0, y1 - y0
+                along = ((x_m - x0) * dx + (y_m - y0) * dy) / (dx * dx + dy * dy or 1.0)
+                along = min(max(along, 0.0), 1.0)
+                away_m = math.hypot(x_m - x0 - along * dx, y_m - y0 - along * dy)
+                share = begin + along * (end - begin)
+                found.append((away_m, piece.start_m + share * piece.length_m))
+        return min(found)
+
     def speed_limits_mps(self) -> list[tuple[float, float]]:
         """Return (x_m from where on, limit) wherever the limit of the lanes changes."""
         limits: list[tuple[float, float]] = []

@@ -10,7 +10,7 @@ import pytest
 from foreign_nets import FOREIGN, edge, node, plain, straight
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Piece
+from merge_sumo.road.corridor import DRAWN_MIN_M, LanePath, Piece
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.scenario.scenario import DT_S, US23
@@ -137,6 +137,28 @@ def test_a_lane_point_by_hand():
     assert piece.point(20.0) == (10.0, 0.0, 90.0)
     assert piece.point(100.0) == pytest.approx((30.0, 20.0, 0.0))
     assert piece.point(140.0) == pytest.approx((30.0, 40.0, 0.0))
+
+
+def test_the_nearest_place_of_a_path_by_hand():
+    bend = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, 40.0, 0.0))
+    path = LanePath((Piece("a_0", -140.0, 140.0, 30.0, bend),))
+    assert path.nearest(10.0, -2.0) == pytest.approx((2.0, -120.0))
+    assert path.nearest(33.0, 20.0) == pytest.approx((3.0, -40.0))
+    assert path.nearest(-3.0, 4.0) == pytest.approx((5.0, -140.0))
+    assert path.nearest(31.0, -1.0) == pytest.approx((math.sqrt(2.0), -80.0))
+
+
+@pytest.mark.parametrize("name", FOREIGN)
+def test_the_nearest_place_to_a_point_of_a_path_is_the_points(corridor, name):
+    road = corridor(name)
+    for path in (road.mainline, road.ramp):
+        x_m = np.arange(-path.before_m, path.after_m, 0.7)
+        away_m, nearest_m = np.transpose([path.nearest(*path.point(x)[2:4]) for x in x_m])
+        assert max(away_m) < 1e-9
+        off_m = np.sort(np.abs(nearest_m - x_m))
+        # Lanes that are drawn as one point have one place.
+        assert off_m[-1] < DRAWN_MIN_M
+        assert off_m[-3] < 1e-6
 
 
 def test_behind_the_end_of_the_file_the_road_goes_straight_on(corridor):

@@ -18,6 +18,7 @@ class Effect(Enum):
 
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
     ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
+    REACHED = "Taken as what a vehicle model of the controller's own reaches in the step"
     NOTHING = "Accepted, changes nothing"
     REFUSED = "Refused: the scenario and the campaign decide it"
 
@@ -42,6 +43,7 @@ CARRIED_OUT: Final = frozenset(
 )
 ON_A_LANE: Final = frozenset({"vehicle.changeLane", "vehicle.changeLaneRelative"})
 """Commands that say on which lane the VUT is to drive, where there are two for it."""
+REACHED: Final = frozenset({"vehicle.setPreviousSpeed", "vehicle.moveToXY"})
 NOTHING: Final = frozenset(
     f"{domain}.{function}"
     for domain in ("vehicle", "vehicletype")
@@ -65,6 +67,8 @@ def effect_of(functions: tuple[str, ...]) -> Effect:
         return Effect.CARRIED_OUT
     if not ON_A_LANE.isdisjoint(functions):
         return Effect.ON_A_LANE
+    if not REACHED.isdisjoint(functions):
+        return Effect.REACHED
     accepted = any(
         function in NOTHING
         or function.endswith(".setParameter")
@@ -93,7 +97,7 @@ def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) ->
         raise RefusedError(f"Invalid {MODEL[name]}.")
     if not all(map(math.isfinite, numbers)):
         given = ", ".join(f"{value!r:.40}" for value in arguments)
-        if name in SPEEDS:
+        if name in SPEEDS or function in REACHED:
             raise NotFiniteError(f"{function}({given})")
         raise RefusedError(f"{function} takes no ({given})")
     if functions[0] == "vehicle.changeLane":

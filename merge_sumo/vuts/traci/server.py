@@ -78,8 +78,8 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
             if message["do"] == "farewell":
                 client.farewell()
             else:
-                first, merged = message["do"] == "enter", message["merged"]
-                answer = {"v_mps": client.show(message["states"], first=first, merged=merged)}
+                states, merged = message["states"], message["merged"]
+                answer = {"v_mps": client.show(states, merged=merged, seed=message.get("seed"))}
                 answer |= {"merge": sumo.wants_to_merge, "by_sumo": sumo.by_sumo}
         except FaultError as fault:
             answer = {"fault": str(fault), "gone": fault.gone}
@@ -100,22 +100,24 @@ class Client:
         self._until_step_s: float | None = None
         """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
 
-    def show(self, states: Mapping[str, State], *, first: bool, merged: bool) -> float | None:
+    def show(
+        self, states: Mapping[str, State], *, merged: bool, seed: int | None = None
+    ) -> float | None:
         """Show the next state, and serve the client until it makes its next step.
 
-        With the `first` state of an episode the vehicles of the one before arrive; `merged` is
-        whether the VUT has left the acceleration lane. Returns the speed that SUMO gives the VUT in
-        that step; None where it is beyond the net. Raises `FaultError` for what the client does
-        wrong, and `ClosedError` when it says goodbye before the vehicles depart.
+        With the first state of an episode, which has its `seed`, the vehicles of the one before
+        arrive; `merged` is whether the VUT has left the acceleration lane. Returns the speed of the
+        VUT after that step; None where it is beyond the net. Raises `FaultError` for what the
+        client does wrong, and `ClosedError` when it says goodbye before the vehicles depart.
         """
         session = self.session
-        if first:
+        if seed is not None:
             if session.driving:
                 # The step in which they arrive was made when the client asked for it.
                 session.clear()
                 self._answer_step()
             self._serve_until_step()
-            session.enter(states)
+            session.enter(states, seed)
         else:
             session.put(states, merged=merged)
         self._answer_step()

@@ -9,12 +9,12 @@ every value is asked for anew.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
-from merge_sumo.scenario.scenario import VEHICLES
+from merge_sumo.scenario.scenario import DT_S, VEHICLES
 from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, RefusedError, ShadowSumo, State
 from merge_sumo.sumo.traci_names import name_of, named
 from merge_sumo.vuts.traci import commands
@@ -49,6 +49,8 @@ STAYED: Final = (
     "mode 0, in which changeLane merges it at once; in 1621, SUMO's own, SUMO merges it"
 )
 """Noted of a controller that may not know of the lane."""
+OFF_THE_LANE_M: Final = 2.0
+"""A vehicle that its own model moves is on a lane up to here: half of the width of a wide one."""
 EXPECTED: Final = 2
 """Vehicles that are expected between two episodes."""
 
@@ -63,6 +65,14 @@ class Subscription:
     end_s: float
     variables: tuple[tuple[int, bytes], ...]
     """Numbers of the variables, each with its parameter as it was sent."""
+
+
+class _Place(NamedTuple):
+    """Where a client moves the VUT to: along its lanes, in the plane, beside the lane that ends."""
+
+    x_m: float
+    point: tuple[float, float]
+    beside: bool
 
 
 class Session:
@@ -82,6 +92,10 @@ class Session:
         self.expected = True
         self.departed: list[str] = []
         self.arrived: list[str] = []
+        self._reached_mps: dict[str, float] = {}
+        """Speeds at the end of the coming step, by the commands of REACHED that told them."""
+        self._moved: list[_Place | None] = [None, None]
+        """Where the client moved the VUT to in the last step, and in the coming one."""
         self._knows_of_the_lane = False
         """Whether the client has ever commanded anything of lanes."""
 
@@ -95,14 +109,26 @@ class Session:
         self.departed.clear()
         self.arrived.clear()
 
-    def enter(self, states: Mapping[str, State]) -> None:
-        """Make a step in which the vehicles depart."""
+    def enter(self, states: Mapping[str, State], seed: int = 0) -> None:
+        """Make a step in which the vehicles depart; `seed` is a parameter of the VUT."""
+        self._moved, self._reached_mps = [None, None], {}
         self.sumo.enter(states)
+        self.sumo.call("vehicle.setParameter", NAME_OF_VUT, "seed", str(seed))
         self.departed += states
 
+    def position(self, name: str) -> tuple[float, ...]:
+        """Return where a vehicle is in the plane; as in SUMO, the VUT is where it was moved to."""
+        moved = self._moved[0] if name == NAME_OF_VUT else None
+        return moved.point if moved else self.sumo.point(name)[2:4]
+
     def step(self) -> float | None:
-        """Make a step; return the speed that SUMO gives the VUT by what was commanded."""
+        """Make a step; return the speed that the VUT has reached, or that SUMO gives it."""
         v_mps = self._noting_arrivals(self.sumo.step)
+        if v_mps is not None and self._reached_mps:
+            # setPreviousSpeed goes before moveToXY: a place does not say how fast it is passed.
+            _, v_mps = max(self._reached_mps.items())
+            self.sumo.by_sumo = False
+            self.sumo.wants_to_merge |= self._moved[1] is not None and self._moved[1].beside
         if self.sumo.was_forced and not self._knows_of_the_lane:
             self._note(STAYED)
         return v_mps
@@ -128,6 +154,7 @@ class Session:
 
     def results(self) -> bytes:
         """Return the answer to a step behind its status: the subscribed values."""
+        self._moved, self._reached_mps = [self._moved[1], None], {}
         answers = []
         for subscription in self.subscriptions:
             end_s = math.inf if subscription.end_s == FOR_EVER else subscription.end_s
@@ -237,9 +264,34 @@ class Session:
         if object_id not in (NAME_OF_VUT, OWN_TYPE):
             raise RefusedError(f"{object_id!r} is not the controller's to command")
         function, arguments = commands.call_of_command(functions, object_id, reader)
+        if effect is Effect.REACHED:
+            self._reach(function, [value for value in arguments if isinstance(value, float)])
+            return
         if function == "vehicle.changeLane":
             self._check_lane(*arguments[:2])
         self.sumo.call(function, *arguments)
+
+    def _reach(self, function: str, numbers: Sequence[float]) -> None:
+        """Take the speed, or the place (x, y), that the VUT has at the end of the coming step."""
+        if len(numbers) < (2 if function == "vehicle.moveToXY" else 1):
+            raise RefusedError(f"{function} was given no number")
+        if function == "vehicle.setPreviousSpeed":
+            if numbers[0] < 0.0:
+                raise RefusedError("Previous speed must not be negative.")
+            self._reached_mps[function] = numbers[0]
+            return
+        paths = [self.sumo.path(NAME_OF_VUT), self.sumo.road.mainline][: 1 + self.sumo.has_lane]
+        x, y = numbers[:2]
+        away_m, x_m, beside = min((*path.nearest(x, y), i) for i, path in enumerate(paths))
+        if not away_m <= OFF_THE_LANE_M:
+            raise RefusedError(
+                f"{function} takes points up to {OFF_THE_LANE_M} m from the lane of the VUT: "
+                f"this one is {away_m:.4g} m away"
+            )
+        # By eq. (4) the VUT has this speed from the end of the step on, and comes elsewhere.
+        before_m = self._moved[0].x_m if self._moved[0] else self.sumo.at_m[NAME_OF_VUT]
+        self._moved[1] = _Place(x_m, (x, y), bool(beside))
+        self._reached_mps[function] = (x_m - before_m) / DT_S
 
     def _check_vehicle(self, name: str) -> None:
         if name not in self.sumo.at_m:
@@ -259,8 +311,8 @@ class Session:
 
 OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
     # SUMO's own answers to these are those before the vehicle was put back.
-    (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.sumo.point(name)[2:4]),  # getPosition
-    (GET_VEHICLE, 0x39): lambda s, name: pack("O", (*s.sumo.point(name)[2:4], 0.0)),  # in space
+    (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.position(name)),  # getPosition
+    (GET_VEHICLE, 0x39): lambda s, name: pack("O", (*s.position(name), 0.0)),  # in space
     (GET_VEHICLE, 0x43): lambda s, name: pack("d", s.sumo.point(name).angle_deg),
     # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
     (GET_SIMULATION, 0x73): lambda s, _: pack("i", len(s.departed)),

@@ -21,6 +21,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
@@ -103,7 +104,8 @@ class TraciVut(Driver):
         self._shadow = Shadow(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
         self._begins_m[VUT] = -road.ramp.before_m
-        self._lane_m, self._brake_mps2 = lane_of(scenario), -scenario.a_min_mps2
+        self._lane_m = lane_of(scenario)
+        self._limits_mps2 = scenario.a_min_mps2, scenario.a_max_mps2
         self._door: Door | None = None
         self._program: Program | None = None
         self._client: socket.socket | None = None
@@ -111,7 +113,7 @@ class TraciVut(Driver):
         self._noted: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
-        self._starting = True
+        self._starting, self._seed = True, 0
         self._patience_s = options.connect_s
         try:
             self._connect()
@@ -125,7 +127,7 @@ class TraciVut(Driver):
     def begin(self, corridor: int, case: Case) -> None:
         """Note that the next scene is the first of an episode."""
         self._reason = None
-        self._starting = True
+        self._starting, self._seed = True, case.told_seed
         self._before_mps.clear()
 
     def act(self, scene: Scene) -> FloatArray:
@@ -175,10 +177,20 @@ class TraciVut(Driver):
         if self._lane_m is not None and not (merged or answer["merge"]) and answer["by_sumo"]:
             # As `SumoVut` does: by eq. (4) SUMO's driver would come a little beyond the lane's end.
             room_m = self._lane_m[1] - END_MARGIN_M - (x_m[VUT] + v_mps[VUT] * DT_S)
-            wanted_mps = min(wanted_mps, float(stopping_mps(np.array(room_m), self._brake_mps2)))
+            wanted_mps = min(
+                wanted_mps, float(stopping_mps(np.array(room_m), -self._limits_mps2[0]))
+            )
         acceleration_mps2 = (wanted_mps - v_mps[VUT]) / DT_S
         if not math.isfinite(acceleration_mps2):
             raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
+        low_mps2, high_mps2 = self._limits_mps2
+        possible_mps2 = min(max(acceleration_mps2, low_mps2), high_mps2)
+        if abs(acceleration_mps2 - possible_mps2) > ROUNDING_MPS2:
+            self._note(
+                f"the speed that the controller reached or set takes an acceleration outside "
+                f"{low_mps2:g} to {high_mps2:g} m/s2, the scenario's limits: it is clipped, and "
+                "clipped_steps counts such steps"
+            )
         return float(acceleration_mps2)
 
     def _enter(self, message: Mapping[str, Any]) -> dict[str, Any]:
@@ -189,7 +201,7 @@ class TraciVut(Driver):
         for _ in range(2):
             if self._client is None:
                 self._connect()
-            answer = self._ask({"do": "enter", **message})
+            answer = self._ask({"do": "enter", "seed": self._seed, **message})
             if "closed" not in answer:
                 return answer
             # The door stays open: the next client may be waiting already.
