@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 C = r"""
@@ -32,6 +32,7 @@ static int step(Unit* u) {
     if (u->steps == 4 && u->v[1] > 30.0) { FAULT }
     u->v[4] = fmin(fmax((28.0 - u->v[3]) / 0.1, 0.0), 1.0);
     u->v[5] = u->v[2] >= -50.0 ? 1.0 : 0.0;
+    u->v[6] = u->v[3] + 0.1 * u->v[4];
     return 0;
 }
 static int clear(Unit* u) { Unit none = {{0}, 0}; *u = none; return 0; }
@@ -41,6 +42,10 @@ int fmi2SetupExperiment(Unit* u, int a, double b, double c, int d, double e) { r
 int fmi2EnterInitializationMode(Unit* u) { return 0; }
 int fmi2ExitInitializationMode(Unit* u) { return 0; }
 int fmi2SetReal(Unit* u, const unsigned* r, size_t n, const double* v) { return set(u, r, n, v); }
+int fmi2SetInteger(Unit* u, const unsigned* r, size_t n, const int* v) {
+    for (size_t i = 0; i < n; i++) u->v[r[i]] = v[i];
+    return 0;
+}
 int fmi2GetReal(Unit* u, const unsigned* r, size_t n, double* v) { return get(u, r, n, v); }
 int fmi2GetBoolean(Unit* u, const unsigned* r, size_t n, int* v) {
     for (size_t i = 0; i < n; i++) v[i] = u->v[r[i]] != 0.0;
@@ -58,6 +63,10 @@ int fmi3EnterInitializationMode(Unit* u, bool a, double b, double c, bool d, dou
 int fmi3ExitInitializationMode(Unit* u) { return 0; }
 int fmi3SetFloat64(Unit* u, const unsigned* r, size_t n, const double* v, size_t m) {
     return set(u, r, n, v);
+}
+int fmi3SetInt64(Unit* u, const unsigned* r, size_t n, const long long* v, size_t m) {
+    for (size_t i = 0; i < n; i++) u->v[r[i]] = v[i];
+    return 0;
 }
 int fmi3GetFloat64(Unit* u, const unsigned* r, size_t n, double* v, size_t m) {
     return get(u, r, n, v);
@@ -78,51 +87,53 @@ void fmi3FreeInstance(Unit* u) { free(u); }
 NAMES = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps", "acceleration_mps2")
 
 
-WISHES = {"number": ("Real", "Float64"), "boolean": ("Boolean", "Boolean")}
-"""Types of an output `merge`, by FMI 2.0 and 3.0."""
+TYPES = {
+    "number": ("Real", "Float64"),
+    "boolean": ("Boolean", "Boolean"),
+    "integer": ("Integer", "Int64"),
+}
+"""Types of variables, by FMI 2.0 and 3.0."""
+MORE = {"merge": (5, "output"), "v_mps": (6, "output"), "seed": (7, "parameter")}
+"""References and causalities of variables that a unit may have besides."""
 
 
-def description(version: str, names: Sequence[str], wish: str = "") -> str:
-    """Return the modelDescription.xml of four inputs and an output, and perhaps a wish."""
-    causality = ["input"] * 4 + ["output"]
-    merge = outputs = ""
-    if wish:
-        of_2, of_3 = WISHES[wish]
-        variability = ' variability="discrete"' if wish == "boolean" else ""
-        merge = f'name="merge" valueReference="5" causality="output"{variability}'
-        if version == "2.0":
-            merge, outputs = f"<ScalarVariable {merge}><{of_2}/></ScalarVariable>", "6"
-        else:
-            merge, outputs = f"<{of_3} {merge}/>", "5"
-
-    def start(place: int) -> str:
-        return ' start="0"' if place < 4 else ""
-
-    if version == "2.0":
-        variables = "".join(
-            f'<ScalarVariable name="{n}" valueReference="{i}" causality="{c}" '
-            f'variability="continuous"><Real{start(i)}/></ScalarVariable>'
-            for i, (n, c) in enumerate(zip(names, causality, strict=True))
+def description(version: str, names: Sequence[str], more: Mapping[str, str]) -> str:
+    """Return the modelDescription.xml of four inputs, an output, and more variables by type."""
+    second = version == "2.0"
+    causalities = dict(zip(names, ["input"] * 4 + ["output"], strict=True))
+    listed = [(name, i, c, "number") for i, (name, c) in enumerate(causalities.items())]
+    listed += [(name, *MORE[name], kind) for name, kind in more.items()]
+    variables, outputs = "", ""
+    for index, (name, reference, causality, kind) in enumerate(listed, start=1):
+        of = TYPES[kind][not second]
+        start = "" if causality == "output" else ' start="0"'
+        continuous = causality != "parameter" and kind == "number"
+        variability = "continuous" if continuous else "discrete"
+        variability = "fixed" if causality == "parameter" else variability
+        head = f'name="{name}" valueReference="{reference}" causality="{causality}"'
+        head += f' variability="{variability}"'
+        variables += (
+            f"<ScalarVariable {head}><{of}{start}/></ScalarVariable>"
+            if second
+            else f"<{of} {head}{start}/>"
         )
+        if causality == "output":
+            of_2, of_3 = f'<Unknown index="{index}"/>', f'<Output valueReference="{reference}"/>'
+            outputs += of_2 if second else of_3
+    if second:
         return (
             '<fmiModelDescription fmiVersion="2.0" modelName="vut" guid="{vut}">'
-            '<CoSimulation modelIdentifier="vut"/><ModelVariables>'
-            f'{variables}{merge}</ModelVariables><ModelStructure><Outputs><Unknown index="5"/>'
-            + (f'<Unknown index="{outputs}"/>' if outputs else "")
-            + "</Outputs></ModelStructure></fmiModelDescription>"
+            f'<CoSimulation modelIdentifier="vut"/><ModelVariables>{variables}</ModelVariables>'
+            f"<ModelStructure><Outputs>{outputs}</Outputs></ModelStructure>"
+            "</fmiModelDescription>"
         )
-    variables = "".join(
-        f'<Float64 name="{n}" valueReference="{i}" causality="{c}"{start(i)}/>'
-        for i, (n, c) in enumerate(zip(names, causality, strict=True))
-    )
     return (
         '<fmiModelDescription fmiVersion="3.0" modelName="vut" instantiationToken="{vut}">'
         '<CoSimulation modelIdentifier="vut"/><ModelVariables>'
         '<Float64 name="time" valueReference="9" causality="independent" '
         'variability="continuous"/>'
-        f'{variables}{merge}</ModelVariables><ModelStructure><Output valueReference="4"/>'
-        + (f'<Output valueReference="{outputs}"/>' if outputs else "")
-        + "</ModelStructure></fmiModelDescription>"
+        f"{variables}</ModelVariables><ModelStructure>{outputs}</ModelStructure>"
+        "</fmiModelDescription>"
     )
 
 
@@ -146,11 +157,11 @@ def build_fmu(
     version: str = "2.0",
     names: Sequence[str] = NAMES,
     fault: str = "",
-    wish: str = "",
+    **more: str,
 ) -> Path:
     """Write the FMU; `fault` is C that runs in the fourth step of an episode with v_POV > 30.
 
-    `wish` is the type of an output `merge`, "number" or "boolean"; "" for no such output.
+    `more` are types of further variables, as `merge="boolean"`: "number", "boolean", "integer".
     """
     found = compiler()
     if found is None:
@@ -162,12 +173,12 @@ def build_fmu(
             [found, "-shared", "-fPIC", "-w", "-o", str(library), str(source), "-lm"], check=True
         )
         with zipfile.ZipFile(path, "x") as archive:
-            archive.writestr("modelDescription.xml", description(version, names, wish))
+            archive.writestr("modelDescription.xml", description(version, names, more))
             binaries = "linux64" if version == "2.0" else "x86_64-linux"
             archive.write(library, f"binaries/{binaries}/vut.so")
     return path
 
 
 if __name__ == "__main__":
-    file, fmi, kind = [*sys.argv[1:], *("2.0", "")[len(sys.argv) - 2 :]]
-    print(build_fmu(Path(file), fmi, wish=kind))
+    file, fmi, *kind = [*sys.argv[1:], *("2.0",)[len(sys.argv) - 2 :]]
+    print(build_fmu(Path(file), fmi, **dict(zip(("merge",), kind, strict=True))))

@@ -17,11 +17,15 @@ from merge_sumo.vuts.blame_cell import current_call
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"
+REACHED: Final = "v_mps"
+"""An output in the place of the acceleration: the speed that the vehicle has after the step."""
 MERGE: Final = "merge"
-"""An output that a unit need not have: whether to merge."""
-NAMES: Final = (*INPUTS, OUTPUT, MERGE)
+SEED: Final = "seed"
+"""What a unit need not have: an output, whether to merge, and an input or a parameter."""
+NAMES: Final = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
 _FLOATS: Final = ("Real", "Float64")
 _BOOLEAN: Final = "Boolean"
+_INTEGERS: Final = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
 
 
 def fmu_vut(spec: VutSpec, options: VutOptions) -> Vut:
@@ -45,7 +49,8 @@ class Unit:
     """The checked description of an FMU; `UserError` when the file is no such unit.
 
     An input that the unit does not have is not set, if at least one is there and none of the
-    missing ones was named; the acceleration must be there, and whether to merge may be.
+    missing ones was named; an output must be there, the speed reached or else the acceleration. A
+    spec that names the acceleration alone has it read. Whether to merge and the seed may be there.
     """
 
     def __init__(self, path: Path, names: dict[str, str]) -> None:
@@ -79,10 +84,19 @@ class Unit:
                 f"{path} has none of the inputs {', '.join(INPUTS)}: name its own, as in "
                 f"fmu:{path}?v_vut_mps=NAME"
             )
-        output = self._checked(variables, names.get(OUTPUT, OUTPUT))
-        wish = None
-        if MERGE in names or getattr(variables.get(MERGE), "causality", "") == "output":
-            wish = self._checked(variables, names.get(MERGE, MERGE), (*_FLOATS, _BOOLEAN))
+
+        def optional(key: str, causality: str, types: tuple[str, ...]) -> Any:
+            if key in names or getattr(variables.get(key), "causality", None) in causality.split():
+                return self._checked(variables, names.get(key, key), types)
+            return None
+
+        is_free = REACHED in names or OUTPUT not in names
+        output = optional(REACHED, "output", _FLOATS) if is_free else None
+        self.reaches = output is not None
+        if output is None:
+            output = self._checked(variables, names.get(OUTPUT, OUTPUT))
+        wish = optional(MERGE, "output", (*_FLOATS, _BOOLEAN))
+        self.seed = optional(SEED, "input parameter", (*_FLOATS, *_INTEGERS))
         self.input_places = [place for place, _ in inputs]
         self.input_references = [variable.valueReference for _, variable in inputs]
         self.output_references = [output.valueReference]
@@ -168,6 +182,10 @@ class FmuVut(PerCorridor):
         else:
             instance.enterInitializationMode(startTime=0.0)
         self._set(instance, seen)
+        if (taken := self._unit.seed) is not None:
+            # A signed integer of 32 bits has no room for all seeds.
+            seed = float(self.seed) if taken.type in _FLOATS else self.seed % 2**31
+            getattr(instance, f"set{taken.type}")([taken.valueReference], [seed])
         instance.exitInitializationMode()
 
     def answer(self, corridor: int, seen: Seen) -> float | tuple[float, bool]:
@@ -177,6 +195,8 @@ class FmuVut(PerCorridor):
         instance.doStep(seen.t_s, DT_S)
         read = instance.getReal if unit.version == "2" else instance.getFloat64
         acceleration = float(read(unit.output_references)[0])
+        if unit.reaches:
+            acceleration = (acceleration - seen.v_vut_mps) / DT_S
         if not unit.wish_references:
             return acceleration
         if unit.wish_is_number:

@@ -5,6 +5,7 @@ One number more is whether to merge, on a road with an acceleration lane.
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,12 +21,15 @@ from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, Vu
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its decision."""
 STATE: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
-"""The columns of a network's one input, (1, 4)."""
+"""The columns of a network's input, (1, 4)."""
+SEED: Final = "seed"
+"""An input that a network need not have: the seed of the case, one number."""
 WISH: Final = 1
 """Numbers of an output that say whether to merge: the last one, if there."""
 Decision = float | tuple[float, bool]
 """An acceleration, or it and whether to merge."""
 _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+_SEEDS: Final[dict[str, Any]] = {**_DTYPES, "tensor(int64)": np.int64}
 
 
 def onnx_vut(spec: VutSpec, options: VutOptions) -> Vut:
@@ -63,7 +67,18 @@ class Network:
             )
         except Exception as error:  # onnxruntime has a class of its own for every failure
             raise UserError(f"{path} is no ONNX network that can be run: {error}") from error
-        inputs = self._session.get_inputs()
+        given = {i.name: i for i in self._session.get_inputs()}
+        seed = given.pop(SEED, None) if len(given) > 1 else None
+        inputs = list(given.values())
+        self._seed: tuple[Any, list[int]] | None = None
+        if seed is not None:
+            # An axis without a number is one of a batch.
+            self._seed = _SEEDS.get(seed.type), [d if isinstance(d, int) else 1 for d in seed.shape]
+            if self._seed[0] is None or math.prod(self._seed[1]) != 1:
+                raise UserError(
+                    f"{path} has the input {SEED} {seed.type} {seed.shape}: it is one number, a "
+                    "float, a double or an int64"
+                )
         if len(inputs) != 1 or inputs[0].type not in _DTYPES or list(inputs[0].shape)[-1:] != [4]:
             said = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
             raise UserError(
@@ -87,14 +102,17 @@ class Network:
         if self.period_steps < 1:
             raise UserError(f"{path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
 
-    def run(self, state: tuple[float, ...]) -> np.ndarray[Any, Any]:
-        """Return the flat output for one state."""
-        fed = np.array([state], dtype=self._dtype)
-        return np.asarray(self._session.run(None, {self._input: fed})[0]).ravel()
+    def run(self, state: tuple[float, ...], seed: int = 0) -> np.ndarray[Any, Any]:
+        """Return the flat output for one state, and a seed for a network that takes one."""
+        fed = {self._input: np.array([state], dtype=self._dtype)}
+        if self._seed is not None:
+            dtype, shape = self._seed
+            fed[SEED] = np.full(shape, seed, dtype=dtype)
+        return np.asarray(self._session.run(None, fed)[0]).ravel()
 
-    def decision(self, state: tuple[float, ...], of_actions: FloatArray) -> Decision:
+    def decision(self, state: tuple[float, ...], of_actions: FloatArray, seed: int) -> Decision:
         """Return the acceleration, or that of the action of the highest value, and any wish."""
-        output = self.run(state)
+        output = self.run(state, seed)
         values = output if output.size in (1, ACTIONS) else output[:-WISH]
         if values.size == 1:
             acceleration_mps2 = float(values[0])
@@ -115,10 +133,12 @@ class OnnxVut(PerCorridor):
         self._network = network
         self._held: list[Decision] = [0.0] * corridors
         self._of_actions: list[FloatArray] = [np.empty(0)] * corridors
+        self._seeds = [0] * corridors
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the accelerations of the actions in the scenario of the case."""
         self._of_actions[corridor] = actions_mps2(case.scenario)
+        self._seeds[corridor] = case.told_seed
         super().begin(corridor, case)
 
     def renew(self, corridor: int) -> None:
@@ -130,7 +150,9 @@ class OnnxVut(PerCorridor):
     def answer(self, corridor: int, seen: Seen) -> Decision:
         """Return the held decision, made anew where one is due."""
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
-            self._held[corridor] = self._network.decision(seen[1:], self._of_actions[corridor])
+            self._held[corridor] = self._network.decision(
+                seen[1:], self._of_actions[corridor], self._seeds[corridor]
+            )
         return self._held[corridor]
 
 

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 
-def constant_network(path, *, answer, dtype=None, width=4):
-    """Write a network that answers numbers whatever it sees, times its first input's 0."""
+def constant_network(path, *, answer, dtype=None, width=4, seed=None):
+    """Write a network that answers numbers whatever it sees, times its first input's 0.
+
+    `seed` is (type, shape) of an input `seed`: by its fraction after division by 1,000 it answers.
+    """
     onnx = pytest.importorskip("onnx")
     helper, proto = onnx.helper, onnx.TensorProto
     kind = proto.FLOAT if dtype == np.float32 else proto.DOUBLE
@@ -16,13 +19,28 @@ def constant_network(path, *, answer, dtype=None, width=4):
     graph = helper.make_graph(
         [
             helper.make_node("MatMul", ["in", "w"], ["m"]),
-            helper.make_node("Add", ["m", "b"], ["out"]),
+            *(_of_seed(helper, kind) if seed else ()),
+            helper.make_node("Add", ["m", "s" if seed else "b"], ["out"]),
         ],
         "g",
-        [helper.make_tensor_value_info("in", kind, [1, width])],
+        [
+            *([helper.make_tensor_value_info("seed", *seed)] if seed else []),
+            helper.make_tensor_value_info("in", kind, [1, width]),
+        ],
         [helper.make_tensor_value_info("out", kind, [1, len(answer)])],
-        [onnx.numpy_helper.from_array(v, n) for v, n in ((weight, "w"), (bias, "b"))],
+        [
+            onnx.numpy_helper.from_array(v, n)
+            for v, n in ((weight, "w"), (bias, "b"), (np.array(1000.0, dtype=weight.dtype), "k"))
+        ],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
     path.write_bytes(model.SerializeToString())
     return path
+
+
+def _of_seed(helper, kind):
+    return (
+        helper.make_node("Cast", ["seed"], ["f"], to=kind),
+        helper.make_node("Mod", ["f", "k"], ["r"], fmod=1),
+        helper.make_node("Div", ["r", "k"], ["s"]),
+    )

@@ -50,7 +50,7 @@ def spec_of(tmp_path_factory):
             pytest.importorskip("fmpy")
             require(compiler() is not None, "gcc is not on the PATH")
             path = folder / "wishes.fmu"
-            return f"fmu:{path if path.exists() else build_fmu(path, wish='boolean')}"
+            return f"fmu:{path if path.exists() else build_fmu(path, merge='boolean')}"
         if name == "onnx":
             return f"onnx:{constant_network(folder / 'wishes.onnx', answer=[0.5, 1.0])}"
         return name

@@ -34,9 +34,9 @@ def unit(tmp_path_factory):
     require(compiler() is not None, "gcc is not on the PATH")
     folder = tmp_path_factory.mktemp("fmu")
 
-    def build(version="2.0", names=NAMES, fault="", wish="") -> Path:
+    def build(version="2.0", names=NAMES, fault="", **more) -> Path:
         path = folder / f"{len(list(folder.iterdir()))}.fmu"
-        return build_fmu(path, version, names, fault, wish)
+        return build_fmu(path, version, names, fault, **more)
 
     return build
 
@@ -122,8 +122,52 @@ def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
 @pytest.mark.parametrize("wish", some(["number", "boolean"], "boolean"))
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
 def test_an_output_merge_is_whether_to_merge(unit, version, wish):
-    vut = in_process(f"fmu:{unit(version, wish=wish)}")(2)
+    vut = in_process(f"fmu:{unit(version, merge=wish)}")(2)
     begin(vut)
     assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
     assert vut.wishes().tolist() == [STAY, MERGE]
     vut.close()
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_output_v_mps_is_the_speed_reached_unless_the_acceleration_alone_is_named(unit, version):
+    cases = cases_of(3)
+    # Its output acceleration_mps2 says something else in the fourth step.
+    path = unit(version, fault="u->v[4] = -1.0; u->v[6] = u->v[3] - 0.3; return 0;", v_mps="number")
+    for case, by_speed, by_name, named in zip(
+        cases,
+        run_cases(in_process(f"fmu:{path}"), cases),
+        run_cases(in_process(f"fmu:{path}?acceleration_mps2=acceleration_mps2"), cases),
+        run_cases(in_process(f"fmu:{path}?acceleration_mps2=v_vut_mps&v_mps=v_mps"), cases),
+        strict=True,
+    ):
+        fast = case.v_pov0_mps > 30.0
+        assert by_speed.a_vut_mps2[:5] == pytest.approx([1, 1, 1, -3 if fast else 1, 1])
+        assert by_name.a_vut_mps2[:5] == pytest.approx([1, 1, 1, -1 if fast else 1, 1])
+        assert np.array_equal(named.motion, by_speed.motion)
+    assert {case.v_pov0_mps > 30.0 for case in cases} == {True, False}
+
+
+def test_a_speed_out_of_reach_is_clipped_and_one_that_is_none_ends_the_case(unit):
+    fast = [case for case in cases_of(12) if case.v_pov0_mps > 30.0][:1]
+    for said, clipped in (("1e6", 1), ("-1e6", 1), ("NAN", None), ("INFINITY", None)):
+        path = unit(fault=f"u->v[6] = {said}; return 0;", v_mps="number")
+        (trajectory,) = run_cases(in_process(f"fmu:{path}"), fast)
+        if clipped is None:
+            assert trajectory.end is End.VUT_ERROR
+        else:
+            assert trajectory.clipped_steps == clipped
+
+
+@pytest.mark.parametrize("kind", ["number", "integer"])
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_unit_is_told_the_seed_of_each_case(unit, version, kind):
+    fast = [case for case in cases_of(12) if case.v_pov0_mps > 30.0]
+    path = unit(version, fault="u->v[4] = fmod(u->v[7], 1000.0) / 1000.0; return 0;", seed=kind)
+    told = [case.told_seed % 2**31 if kind == "integer" else case.told_seed for case in fast]
+    assert len(set(told)) == len(fast) > 2
+    assert max(case.told_seed for case in fast) > 2**31
+    for seed, trajectory in zip(
+        told, run_cases(in_process(f"fmu:{path}"), fast, corridors=2), strict=True
+    ):
+        assert trajectory.a_vut_mps2[3] == seed % 1000 / 1000.0

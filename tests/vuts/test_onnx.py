@@ -66,16 +66,33 @@ def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp
     assert wrong.reason(0) == "WrongAnswerError: wishes inf instead of a number, to merge or not"
 
 
+@pytest.mark.parametrize("shape", [[], [1], ["batch", 1]])
+@pytest.mark.parametrize("kind", ["INT64", "DOUBLE"])
+def test_a_network_with_an_input_seed_is_told_that_of_each_case(tmp_path, kind, shape):
+    seed = getattr(onnx.TensorProto, kind), shape
+    path = network(tmp_path / "seeded.onnx", answer=[0.0], seed=seed)
+    cases = cases_of(4)
+    found = run_cases(in_process(f"onnx:{path}"), cases, corridors=2)
+    for case, trajectory in zip(cases, found, strict=True):
+        expected = case.told_seed % 1000 / 1000.0
+        assert trajectory.a_vut_mps2[:-1] == pytest.approx(expected, abs=1e-12)
+    assert len({case.told_seed for case in cases}) == 4
+
+
 def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     (tmp_path / "text.onnx").write_text("no network")
     network(tmp_path / "wide.onnx", answer=[0.0], width=5)
     network(tmp_path / "three.onnx", answer=[0.0, 1.0, 0.0])
+    network(tmp_path / "word.onnx", answer=[0.0], seed=(onnx.TensorProto.INT32, [1]))
+    network(tmp_path / "pair.onnx", answer=[0.0], seed=(onnx.TensorProto.INT64, [2]))
     good = network(tmp_path / "good.onnx", answer=[0.0])
     for spec, said in {
         tmp_path / "nothing.onnx": "there is no ONNX file",
         tmp_path / "text.onnx": "is no ONNX network that can be run",
         tmp_path / "wide.onnx": "a VUT has one of floats",
         tmp_path / "three.onnx": "gives 3 numbers",
+        tmp_path / "word.onnx": "has the input seed tensor(int32) [1]: it is one number",
+        tmp_path / "pair.onnx": "has the input seed tensor(int64) [2]: it is one number",
         f"{good}?decision_period_s=0": "decision_period_s is '0'",
         f"{good}?decision_period_s=often": "decision_period_s is 'often'",
         f"{good}?period=1": "there is no option 'period'",
