@@ -287,6 +287,20 @@ class Test(OfScenario, Judged, Hosting):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Beginning(Asked):
+    """From when on a case is shown."""
+
+    from_s: float | None = option(
+        None,
+        float,
+        "Begin so long before the first conflict, as in -3: contact, else lowest TTC, merge, end.",
+        WHERE,
+        "--from",
+        metavar="SECONDS",
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class Search(Asked):
     """Which cases run."""
 

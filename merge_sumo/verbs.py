@@ -16,6 +16,7 @@ from merge_sumo.options import (
     AnyPath,
     AnyRun,
     Asked,
+    Beginning,
     Execution,
     Limits,
     Policies,
@@ -168,10 +169,11 @@ class Resume(SearchOfTest):
 
 
 @dataclass(frozen=True)
-class RunCase(Test):
+class RunCase(Beginning, Test):
     """Run one case and show what happens: verdict, measures, and the motion second by second.
 
-    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use.
+    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use. With --from
+    the controller drives from the start; with --gui, too, it does so twice, first without a window.
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """

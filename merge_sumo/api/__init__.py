@@ -92,6 +92,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.result import Shown
+from merge_sumo.verdict.conflict import check_from
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
@@ -148,6 +149,7 @@ def open_run(folder: AnyPath) -> CampaignRun:
 @verb(verbs.RunCase)
 def run(asked: verbs.RunCase) -> CaseRun:
     """Run one case and return it."""
+    check_from(asked.from_s)
     settings, case = given_case(asked) if asked.recorded is None else recorded_case(asked)
     if asked.out is not None:
         check_new(Path(asked.out))
@@ -161,9 +163,10 @@ def run(asked: verbs.RunCase) -> CaseRun:
         if asked.out is not None:
             write_scenario(Path(asked.out), plan.road, episode.outcome, episode.trajectory)
         if asked.on_end is not None:
-            asked.on_end(CaseRun(episode))
+            asked.on_end(CaseRun(episode, asked.from_s))
 
-    return CaseRun(run_one(plan, case, live=asked.gui, on_end=ended))
+    episode = run_one(plan, case, live=asked.gui, from_s=asked.from_s, on_end=ended)
+    return CaseRun(episode, asked.from_s)
 
 
 @verb(verbs.Rerun)
@@ -213,24 +216,27 @@ def report(run: AnyRun) -> Shown:
     return Shown({"report": path, "facts": to_plain(opened_run.facts)}, [path])
 
 
-def replay(folder: AnyRun, index: int | None = None) -> Replay:
+def replay(folder: AnyRun, index: int | None = None, *, from_s: float | None = None) -> Replay:
     """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
 
     Args:
         folder: a scenario folder, or a campaign.
         index: the case of the campaign, which is exported where it is not yet.
+        from_s: begin so long before the first conflict, as in -3.
 
     `diverged_at_s` of the result is None where the replay is identical.
     """
-    return replayer.replay(_scenario_folder(folder, index))
+    check_from(from_s)
+    return replayer.replay(_scenario_folder(folder, index), from_s)
 
 
-def open_in_gui(folder: AnyRun, index: int | None = None) -> int:
+def open_in_gui(folder: AnyRun, index: int | None = None, *, from_s: float | None = None) -> int:
     """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
 
     The arguments are those of `replay`. Raises `UserError` without a display.
     """
-    return replayer.open_gui(_scenario_folder(folder, index))
+    check_from(from_s)
+    return replayer.open_gui(_scenario_folder(folder, index), from_s)
 
 
 def _scenario_folder(folder: AnyRun, index: int | None) -> Path:

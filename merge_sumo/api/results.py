@@ -241,10 +241,11 @@ class CampaignRun(Result):
 
 
 class CaseRun(Result):
-    """One case that was run."""
+    """One case that was run; its table begins `from_s` before its first conflict."""
 
-    def __init__(self, episode: Episode) -> None:
+    def __init__(self, episode: Episode, from_s: float | None = None) -> None:
         self.outcome, self.trajectory = episode.outcome, episode.trajectory
+        self._from_s = from_s
 
     @property
     def measures(self) -> Measures:
@@ -276,7 +277,7 @@ class CaseRun(Result):
 
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
-        return lines_of(self.outcome, self.trajectory)
+        return lines_of(self.outcome, self.trajectory, self._from_s)
 
 
 def campaign_of(run: AnyRun) -> CampaignRun:

@@ -143,7 +143,7 @@ class Commands(typer.Typer):
     def verb(
         self, record: type[Asked] | None = None, name: str | None = None
     ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-        """Register a function as a command; the docstring of the record is the help.
+        """Register a function as a command; its docstring, or that of the record, is the help.
 
         Its first parameter is `Given`, which has the options of the record. The other parameters
         are arguments and options that the function reads.
@@ -176,7 +176,7 @@ class Commands(typer.Typer):
             command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
             command.__name__, command.__annotations__ = function.__name__, {}
             panel = PANEL_OF.get(name or function.__name__)
-            text = unwrapped((function if record is None else record).__doc__ or "")
+            text = unwrapped(function.__doc__ or (record and record.__doc__) or "")
             self.command(name, cls=GroupedCommand, help=text, rich_help_panel=panel)(command)
             return function
 

@@ -191,7 +191,7 @@ def export(
         show(path)
 
 
-@app.verb()
+@app.verb(options.Beginning)
 def replay(
     given: Given,
     folder: Annotated[
@@ -210,13 +210,13 @@ def replay(
     A case of a campaign is exported first. Says what happened, then "identical" (exit code 0) or
     "diverged at t = ..." (exit code 1).
 
-    Example:  merge-sumo replay scenarios/stalemate --gui
+    Example:  merge-sumo replay scenarios/stalemate --gui --from -3
     """
     from merge_sumo import api
 
     if gui:
-        raise typer.Exit(api.open_in_gui(folder, case))
-    result = api.replay(folder, case)
+        raise typer.Exit(api.open_in_gui(folder, case, **given.keywords))
+    result = api.replay(folder, case, **given.keywords)
     given.print(result)
     raise typer.Exit(0 if result.identical else 1)
 

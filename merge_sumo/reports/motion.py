@@ -9,14 +9,16 @@ from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.verdict.cause import cause, met
+from merge_sumo.verdict.conflict import Conflict
 from merge_sumo.verdict.score import Outcome, measures_in
 
 LABEL: Final = 31
 """Characters of the name of a measure; more where one is longer."""
 
 
-def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
-    """Return an episode as a terminal shows it: the case, its cause, measures and motion."""
+def lines_of(outcome: Outcome, trajectory: Trajectory, from_s: float | None = None) -> list[str]:
+    """Return an episode as a terminal shows it: the case, its cause, measures, motion from then."""
+    first, begins = Conflict.of(trajectory).begin(from_s)
     case = outcome.case
     lines = [
         f"case: level {level_name(case.level)}, {described(case)}",
@@ -25,7 +27,7 @@ def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
     if outcome.margin is not None:
         verb = "fails" if outcome.failed else "does not fail"
         lines.append(f"{verb}: margin {outcome.margin:.3g}")
-    return [*lines, "", *_measures(outcome), "", *motion_lines(trajectory)]
+    return [*lines, "", *_measures(outcome), "", *begins, *_motion_lines(trajectory, first)]
 
 
 def _measures(outcome: Outcome) -> Iterator[str]:
@@ -45,15 +47,16 @@ def _measures(outcome: Outcome) -> Iterator[str]:
         yield f"  {'steps beyond its limits':<{width}} {found.clipped_steps:10d}"
 
 
-def motion_lines(trajectory: Trajectory, every_s: float = 1.0) -> list[str]:
-    """Return the motion as a table: a row for each second, for the merge, and for the end.
+def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:
+    """Return the motion from a row on: a row for each second, for the merge, and for the end.
 
     Of every vehicle x in m, v in m/s and a in m/s2; then the signals that the VUT has left.
     """
     motion, until = trajectory.whole, len(trajectory.motion) - 1
     cars = VEHICLES[: motion.shape[1]]
     lines = ["  t s" + "".join(f"  {f'x {who.upper()}':>8}   m/s  m/s2" for who in cars)]
-    for row in sorted({*range(0, len(motion), round(every_s / DT_S)), until, len(motion) - 1}):
+    seconds = range(first, len(motion), round(1.0 / DT_S))
+    for row in sorted({*seconds, max(until, first), len(motion) - 1}):
         values = "".join(f"  {x:8.1f} {v:5.1f} {a:5.1f}" for x, v, a in motion[row].tolist())
         signals = {name: of[row] for name, of in (trajectory.signals or {}).items()}
         left = "".join(f"  {name} {value}" for name, value in signals.items() if value is not None)

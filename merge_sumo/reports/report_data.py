@@ -33,6 +33,7 @@ from merge_sumo.studies.surface import Grid, Surface, nodes
 from merge_sumo.system.records import to_plain
 from merge_sumo.verdict.campaign_verdict import shortened
 from merge_sumo.verdict.chance import RunsOfCase
+from merge_sumo.verdict.conflict import Conflict
 from merge_sumo.verdict.measures import Measure
 from merge_sumo.verdict.score import Outcome, measures_in
 from merge_sumo.verdict.severity import Severity
@@ -113,6 +114,7 @@ def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]
         "nearest": VEHICLES.index(measures.nearest),
         "offset": offset,
         "rows": 0 if motion is None else len(motion.whole),
+        "conflict": None if motion is None else [*Conflict.of(motion)],
         "end": measures.end,
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
         "severity": measures.severity,

@@ -325,6 +325,11 @@ class Scenario:
         return 2
 
     @property
+    def lengths_m(self) -> tuple[float, float]:
+        """Length of a car of the mainline, and of the VUT."""
+        return self.pov_length_m, self.vut_length_m
+
+    @property
     def pov_edges(self) -> tuple[str, ...]:
         """Edges of the net on which the POV and other cars drive, in order, past M."""
         raise NotImplementedError

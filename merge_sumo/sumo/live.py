@@ -61,6 +61,7 @@ class Window(AbstractContextManager["Window"]):
         self._opened = ExitStack()
         self._due_s: float | None = None
         self._shown = 0
+        self.first = 0  # rows before this one pass without delay
         self._half_m = 0.0
         """Half of the width that the view shows; 0 before it follows the VUT."""
 
@@ -108,7 +109,7 @@ class Window(AbstractContextManager["Window"]):
 
     def step(self) -> None:
         """Make a step when its time has come; real time, from the second one on."""
-        if self._shown:
+        if self._shown > self.first:
             self._look()
             now_s = monotonic()
             first = self._due_s is None

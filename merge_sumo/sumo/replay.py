@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import numpy as np
 from lxml import etree
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, notice
 from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.received import Allowed
@@ -34,6 +36,7 @@ from merge_sumo.sumo.replay_folder import (
 )
 from merge_sumo.system.interrupt import stopping_in_order
 from merge_sumo.system.result import Result
+from merge_sumo.verdict.conflict import Conflict
 
 REPLAYED: Final = "replayed.fcd.xml"
 
@@ -55,7 +58,7 @@ class Replay(Result):
         rows: rows that were compared.
         diverged_at_s: time of the first row that differs; None where none does.
         detail: in what it differs.
-        words: the case and its cause, as the folder has them.
+        words: the case and its cause, as the folder has them, and when a later begin is.
     """
 
     computed = ("identical",)
@@ -77,28 +80,46 @@ class Replay(Result):
         return [*self.words, f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
 
 
-def replay(folder: Path) -> Replay:
+def replay(folder: Path, from_s: float | None = None) -> Replay:
     """Replay a folder in headless SUMO and compare every row of all vehicles with the record.
 
     Positions (x, y, along the lane) and speeds must agree within 1e-6, and the record must be an
-    episode: all vehicles on their lanes, moved by eq. (4) and held at its end.
+    episode: all vehicles on their lanes, moved by eq. (4) and held at its end. With `from_s` SUMO
+    begins so long before the first conflict, in the state that it has there in the whole replay.
 
     The folder is data: net, vehicle types and record are read from it and nothing else, and SUMO
     runs in a temporary folder on what is allowed of them and on a configuration of ours. Raises
     `UserError` when the folder is no replay folder or SUMO cannot run it.
     """
     episode = _received(folder)
-    with _staged(episode) as stage:
-        arguments = ["-c", CONFIG, "--fcd-output", REPLAYED, "--precision", "9"]
-        ended = run_program("sumo", [*arguments, "--no-step-log", "true"], stage)
+    first, begins = _conflict(episode).begin(from_s)
+    with _staged(episode, first) as (stage, arguments):
+        arguments += ["--fcd-output", REPLAYED, "--device.fcd.begin", f"{first * DT_S:.1f}"]
+        arguments += ["--precision", "9", "--no-step-log", "true"]
+        ended = run_program("sumo", arguments, stage)
         if ended.code != 0:
             raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
         written = received.read_bytes(stage / REPLAYED, "the replay", follow_links=False)
     name = f"SUMO's replay of {folder}"
     replayed = _rows(received.parse(written, allowed.REPLAYED, name), name)
-    fault = _difference(episode, replayed) or _fault_of_record(episode)
+    rows = {key: of for key, of in episode.rows.items() if round(key[0] / DT_S) >= first}
+    fault = _difference(replace(episode, rows=rows), replayed) or _fault_of_record(episode)
     diverged_at_s, detail = fault or (None, "")
-    return Replay(len(episode.rows), diverged_at_s, detail, _words(episode.labels))
+    return Replay(len(rows), diverged_at_s, detail, (*_words(episode.labels), *begins))
+
+
+def _conflict(episode: _Episode) -> Conflict:
+    """Find the first conflict of a received folder; a place that is missing is told as a fault."""
+    cars, mainline = VEHICLES[: len(episode.types)], episode.road.corridor.mainline
+    times = sorted({time for time, _ in episode.rows})[:-HOLD_STEPS]
+    at = [[episode.places[time, who] or _OnPath(mainline, 0.0) for who in cars] for time in times]
+    x_m = [[place.x_m for place in places] for places in at]
+    v_mps = [[episode.rows[time, who][-1] for who in cars] for time in times]
+    lanes = {piece.lane for piece in mainline.pieces}
+    merged = (row for row, of in enumerate(at) if of[VUT].path.piece(of[VUT].x_m).lane in lanes)
+    length_m = {vtype.get("id"): float(vtype.get("length", "5")) for vtype in episode.types}
+    lengths_m = length_m["pov"], length_m["vut"]
+    return Conflict.find(np.stack((x_m, v_mps), axis=2), next(merged, None), lengths_m)
 
 
 def _words(labels: etree._Element | None) -> tuple[str, ...]:
@@ -195,13 +216,20 @@ def _checked_record(path: Path, vehicles: Sequence[str]) -> tuple[etree._Element
 
 
 @contextmanager
-def _staged(episode: _Episode) -> Iterator[Path]:
-    """Yield a temporary folder that holds an episode, with nothing in it that was not checked."""
+def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
+    """Yield a temporary folder, all in it checked, and what has SUMO play it from a row on.
+
+    SUMO begins one row earlier and inserts each vehicle where it last was outside of junctions: the
+    route that it gives it begins there, and decides between lanes that lie on each other.
+    """
+    row, record = max(first - 1, 0), copy.deepcopy(episode.record)
+    outer = [car for step in [*record][: row + 1] for car in step if ":" not in car.get("lane", "")]
+    record[row][:] = [*{car.get("id"): car for car in (*record[0], *outer)}.values()]
     with scratch_folder() as stage:
-        files = files_of(episode.road, episode.types, episode.record, episode.labels)
+        files = files_of(episode.road, episode.types, record, episode.labels)
         for name, content in files.items():
             (stage / name).write_bytes(content)
-        yield stage
+        yield stage, ["-c", CONFIG, "--begin", f"{row * DT_S:.1f}"]
 
 
 def _difference(episode: _Episode, replayed: Rows) -> tuple[float, str] | None:
@@ -287,15 +315,19 @@ def check_display() -> None:
         )
 
 
-def open_gui(folder: Path) -> int:
+def open_gui(folder: Path, from_s: float | None = None) -> int:
     """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code.
 
     As for `replay`, sumo-gui runs in a temporary folder, on nothing that was not checked. Raises
-    `UserError` when there is no display or the folder is no replay folder.
+    `UserError` when there is no display or the folder is no replay folder. A late begin is noticed.
     """
     check_display()
-    with stopping_in_order(), _staged(_received(folder)) as stage:
-        return run_program("sumo-gui", ["-c", CONFIG], stage, limit_s=None).code
+    episode = _received(folder)
+    first, begins = _conflict(episode).begin(from_s)
+    for sentence in begins:
+        notice(sentence)
+    with stopping_in_order(), _staged(episode, first) as (stage, arguments):
+        return run_program("sumo-gui", arguments, stage, limit_s=None).code
 
 
 def _rows(root: etree._Element, name: str) -> Rows:

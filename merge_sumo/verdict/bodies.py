@@ -63,8 +63,7 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
             # One row for each step and car: x of the car, x of the VUT, and both lengths.
             cars = np.delete(trajectory.motion[steps, :, 0], VUT, axis=1)[..., None]
             own = np.broadcast_to(trajectory.motion[steps, VUT, None, :1], cars.shape)
-            scenario = trajectory.case.scenario
-            lengths = scenario.pov_length_m, scenario.vut_length_m
+            lengths = trajectory.case.scenario.lengths_m
             rows = np.concatenate(
                 (cars, own, np.broadcast_to(lengths, (*cars.shape[:2], 2))), axis=2
             )

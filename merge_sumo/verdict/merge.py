@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import DT_S, VUT, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, VUT, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 REACTION_S: Final = 0.75
@@ -121,7 +121,7 @@ def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
     if trajectory.end is not End.MERGED:
         return math.inf, None
     after = trajectory.motion[-1:] if trajectory.after is None else trajectory.after
-    gap_m, closing_mps = _gaps_behind_m(trajectory.case.scenario, after)
+    gap_m, closing_mps = gaps_m(after, trajectory.case.scenario.lengths_m)
     touching = np.argwhere(gap_m <= 0.0)
     if not len(touching):
         return float(gap_m.min()), None
@@ -143,11 +143,11 @@ def braked_after_mps2(trajectory: Trajectory) -> float | None:
     return max(0.0, -float(trajectory.after[:, is_behind, 2].min(initial=0.0)))
 
 
-def _gaps_behind_m(scenario: Scenario, after: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the bumper gaps and closing speeds, (T, A - 1), of the cars in a follow-up."""
+def gaps_m(after: FloatArray, lengths_m: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
+    """Return the bumper gaps and closing speeds, (T, A - 1), of x and v in one lane, (T, A, 2)."""
     cars, vut = np.delete(after, VUT, axis=1), after[:, [VUT]]
     dx, dv = ((cars - vut)[:, :, column] for column in (0, 1))
-    length_m = np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
+    length_m = np.where(dx >= 0.0, *lengths_m)
     return np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
 
 
@@ -160,7 +160,7 @@ def followed_up(trajectory: Trajectory) -> tuple[float, float, float] | None:
     """
     if trajectory.after is None:
         return None
-    gap_m, closing_mps = _gaps_behind_m(trajectory.case.scenario, trajectory.after)
+    gap_m, closing_mps = gaps_m(trajectory.after, trajectory.case.scenario.lengths_m)
     least_m = float(gap_m.min())
     if least_m <= 0.0:
         return least_m, 0.0, math.inf

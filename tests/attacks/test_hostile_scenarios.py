@@ -490,7 +490,7 @@ class TestTheProgramsThatAreStarted:
         ):
             attack(scene, name)
         assert assert_nothing_happens(scene, lambda: open_gui(scene.folder)) == 0
-        assert shown == [("sumo-gui", ["-c", CONFIG], None)]
+        assert shown == [("sumo-gui", ["-c", CONFIG, "--begin", "0.0"], None)]
 
 
 def runs(pid: int) -> bool:

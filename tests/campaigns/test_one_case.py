@@ -41,6 +41,17 @@ class TestTheCommand:
         rows = _rows(tmp_path / "kept")
         assert replayed == f"identical: {rows} rows of x, y, position and speed"
 
+    def test_begins_its_table_before_the_conflict(self, command_line):
+        _, whole, _ = command_line("run", "--vut", "design2", *STALEMATE, "--json")
+        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE, "--from", "-3")
+        begins, _, *table = out.splitlines()[-9:]
+        assert begins == "from 6.3 s, 3 s before the contact at 9.3 s"
+        assert [line.split()[0] for line in table] == [f"{6.3 + s:.1f}" for s in range(7)]
+        motion = json.loads(whole)["motion"]
+        assert [line.split()[1] for line in table] == [f"{car[0][0]:.1f}" for car in motion[63::10]]
+        _, told, _ = command_line("run", "--vut", "design2", *STALEMATE, "--from", "-3", "--json")
+        assert told == whole, "the record is of all of it"
+
     def test_says_the_same_of_a_recorded_case_as_its_campaign(self, command_line, run):
         code, out, _ = command_line("run", "--case", run.folder, "7", "--json")
         told = json.loads(out)
@@ -105,6 +116,16 @@ class TestInSumoGui:
         assert (live.trajectory.motion == without.trajectory.motion).all()
         assert live.outcome == without.outcome
         assert len(slept) == len(live.trajectory.whole) - 1, "every step waits for its time"
+
+    def test_passes_the_time_before_without_delay(self, window):
+        slept: list[float] = []
+        window.setattr("merge_sumo.sumo.live.sleep", slept.append)
+        plan = plan_for("design2", corridors=1)
+        live = run_one(plan, COLLIDES, live=True, from_s=-3.0)
+        without = run_one(plan, COLLIDES)
+        assert (live.trajectory.motion == without.trajectory.motion).all()
+        assert live.outcome == without.outcome
+        assert len(slept) == len(live.trajectory.whole) - 1 - 63, "from 6.3 s on"
 
     def test_opens_no_port(self, window):
         ports: list[list[str]] = []

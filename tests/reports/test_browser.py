@@ -18,6 +18,7 @@ from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report
 from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
 from merge_sumo.system.records import to_plain
+from merge_sumo.verdict.conflict import Conflict
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -91,6 +92,13 @@ def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
         page.locator("#copy:text('Copied')").wait_for()
         command = f"merge-sumo replay {made.folder} {worst[0]} --gui"
         assert page.evaluate("navigator.clipboard.readText()") == command
+        conflict = Conflict.of(made.trajectory(worst[0]))
+        row, what = conflict.row, f"{conflict.what} at {conflict.row / 10:.1f} s"
+        assert page.locator("#before").get_attribute("title") == f"Plays from 3 s before {what}"
+        # In one go, before the animation has its first frame.
+        jump = "button => { button.click(); return [slider.value, playing]; }"
+        assert page.locator("#before").evaluate(jump) == [str(row - 30), True]
+        page.locator("#play").click()
         page.locator("#time").fill("0")
         before = page.locator("#road").get_attribute("viewBox")
         page.locator("#play").click()

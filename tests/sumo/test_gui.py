@@ -17,8 +17,10 @@ from PIL import Image
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo.replay_folder import COLOURS, LABELS, VIEW
 from merge_sumo.verdict.cause import cause
+from merge_sumo.verdict.conflict import Conflict
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2
@@ -69,17 +71,17 @@ def pictures(run, display, tmp_path_factory) -> list[np.ndarray]:
     return taken
 
 
-def taken_of(folder: Path, display: str, scratch: Path) -> list[np.ndarray]:
+def taken_of(folder: Path, display: str, scratch: Path, *options: str) -> list[np.ndarray]:
     """Open a folder with `replay --gui` and return its pictures at two times as arrays.
 
     The view and the configuration that merge-sumo writes are made to take pictures and to end by
-    themselves.
+    themselves. There is no picture of a time that is not shown.
     """
     files = [scratch / f"at-{time_s:g}-s.png" for time_s in PICTURE_TIMES_S]
     times = {str(file): str(time_s) for file, time_s in zip(files, PICTURE_TIMES_S, strict=True)}
     (scratch / "show.py").write_text(SHOW.format(times=times))
     window = subprocess.Popen(
-        [sys.executable, scratch / "show.py", "replay", str(folder), "--gui"],
+        [sys.executable, scratch / "show.py", "replay", str(folder), "--gui", *options],
         env={**os.environ, "DISPLAY": display},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -92,7 +94,7 @@ def taken_of(folder: Path, display: str, scratch: Path) -> list[np.ndarray]:
         if window.poll() is None:
             os.killpg(window.pid, signal.SIGKILL)
     assert window.returncode == 0, said
-    return [picture(file) for file in files]
+    return [picture(file) for file in files if file.exists()]
 
 
 def picture(file: Path) -> np.ndarray:
@@ -119,6 +121,17 @@ def test_the_cars_meet(pictures):
         for image in pictures
     ]
     assert apart[1] < apart[0]
+
+
+def test_it_begins_before_the_conflict_and_looks_the_same_from_there_on(
+    run, pictures, display, tmp_path
+):
+    index = failures(run.outcomes)[0].index
+    export_case(run, index, tmp_path / "case")
+    begin_s = Conflict.of(run.trajectory(index)).row * DT_S - 3.0
+    assert PICTURE_TIMES_S[0] < begin_s - 0.2 < begin_s < PICTURE_TIMES_S[1]
+    (taken,) = taken_of(tmp_path / "case", display, tmp_path, "--from", "-3")
+    assert (taken == pictures[1]).all()
 
 
 def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pictures, tmp_path):

@@ -299,6 +299,8 @@ function showMotion(i) {
   const flags = [[moving.met, cases.pov_brakes_s[i]], [VUT, cases.vut_brakes_s[i]]].filter(([, t]) => t !== null);
   animate(moving, flags, (end) => [...signalCharts(i, end), ...whyCharts(i)]);
   at(failed(i) ? moving.until : 0);
+  const [row, what] = cases.conflict[i];
+  Object.assign(byId("before"), { title: `Plays from 3 s before ${what} at ${fixed(row * DT, 1)} s`, onclick: () => { at(row - 3 / DT); if (!playing) play(true); } });
 }
 function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
   const found = data.why[cases.index[i]];
