@@ -51,8 +51,8 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
         ("arguments", "parts"),
         [
             (("--vut", "design9"), ("'design9'", "design1", "level0")),
-            (("--level", "3"), ("'3'", "0, 1, 2 or all")),
-            (("--level", "-1"), ("'-1'", "0, 1, 2 or all")),
+            (("--level", "3"), ("'3'", "0, 1, 2, several")),
+            (("--level", "-1"), ("'-1'", "0, 1, 2, several")),
             (("--cases", "0"), ("--cases is 0",)),
             (("--gate", "failure"), ("choose failures",)),
             (("--junit", "gone/junit.xml"), ("--junit", "there is no folder gone")),
