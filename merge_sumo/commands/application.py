@@ -64,10 +64,7 @@ class GroupedCommand(TyperCommand):
         return super().get_params(ctx)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; `UserError` where an option is gone, or would win over itself."""
-        gone.check_options(
-            self.name or "", args, {name for parameter in self.params for name in parameter.opts}
-        )
+        """Parse the arguments; `UserError` where an option would win over itself."""
         # Parsing empties the list.
         _, _, given = self.make_parser(ctx).parse_args(args=list(args))
         for option, times in Counter(given).items():
