@@ -291,25 +291,31 @@ class Explain(Recorded):
 
 @dataclass(frozen=True)
 class Export(Asked):
-    """Write cases of a campaign for SUMO, for other simulators, or as a table.
+    """Write cases of a campaign for SUMO, for other simulators, as a table, or to commit.
 
     Example:  merge-sumo export runs/design2 17 42
+
+    Example:  merge-sumo export runs/design2 --format cases --out cases.toml
     """
 
     run: AnyRun = field(metadata=RUN)
     indices: Iterable[int] | int | None = keyword(
-        None, "Cases of the campaign; of a table all of them when left out."
+        None, "Cases of the campaign; csv: all when left out, cases: 40 that watch a controller."
     )
     _: KW_ONLY
     file_format: str = option(
         "sumo",
         str,
         "Format: {formats}. sumo: folders that sumo-gui replays. openscenario: folders with "
-        "OpenSCENARIO and OpenDRIVE. csv: one table of motion.",
+        "OpenSCENARIO and OpenDRIVE. csv: one table of motion. cases: one small TOML file to "
+        "commit, for rerun.",
         WHERE,
         "--format",
     )
-    out: AnyPath | None = _out("Folder to write into.", "RUN/scenarios for sumo, else RUN/exports")
+    out: AnyPath | None = _out(
+        "Folder to write into, or FILE.csv and FILE.toml.",
+        "RUN/scenarios for sumo, else RUN/exports",
+    )
 
 
 # Verbs: change
@@ -322,18 +328,23 @@ class Rerun(Recorded):
     The cases are those of the old version's search: `campaign --against` searches where the new one
     alone fails.
 
-    Exit code 1 when a case broke: it passed, and does not pass now.
+    Exit code 1 when a case broke: it passed, and does not pass now. A cases file of `export` may
+    stand in the place of the campaign. Then what changed in the file is shown, `out` is the file as
+    it is now, and the exit code is 1 also where a case lost more margin than the tolerance.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
+
+    Example:  merge-sumo rerun cases.toml --vut design2 --junit changes.xml
 
     Example:  merge-sumo rerun runs/design2 --stress
     """
 
-    run: AnyRun = field(metadata=RUN)
+    run: AnyRun = field(metadata={"help": "The campaign, its folder, or a cases file."})
     indices: Iterable[int] | int = keyword((), "Cases of the campaign; all of them by default.")
     _: KW_ONLY
     level: AnyLevels = _level()
     out: AnyPath | None = _page()
+    junit: AnyPath | None = _junit()
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from merge_sumo import options, verbs
 from merge_sumo.api.asked import (
+    new_file_of,
     opened,
     opened_study,
     opened_truths,
@@ -33,7 +34,7 @@ from merge_sumo.api.asked import (
 )
 from merge_sumo.api.campaigns import concluded, notice_untrained
 from merge_sumo.api.cases import given_case, recorded_case
-from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of
+from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import run_one
@@ -55,6 +56,7 @@ from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.road.merge import road_for
+from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.studies import (
@@ -68,6 +70,7 @@ from merge_sumo.studies import (
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
 from merge_sumo.studies import stress as ladder
+from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import Comparison
 from merge_sumo.studies.explanation import EXPLANATIONS, ExplanationResult
 from merge_sumo.studies.probability import PROBABILITY, ProbabilityResult
@@ -83,7 +86,6 @@ from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
     check_new,
-    check_new_file,
     check_own,
     dated,
     make_folder,
@@ -157,7 +159,7 @@ def run(asked: verbs.RunCase) -> CaseRun:
         notice(sentence)
     plan = resolve(settings, debug=asked.debug)
     if asked.recorded is not None:
-        notice_changes(campaign_of(asked.recorded[0]).run, plan)
+        notice_changes(recorded(asked.recorded[0]), plan)
 
     def ended(episode: Episode) -> None:
         if asked.out is not None:
@@ -172,21 +174,27 @@ def run(asked: verbs.RunCase) -> CaseRun:
 @verb(verbs.Rerun)
 def rerun(asked: verbs.Rerun) -> Comparison:
     """Run recorded cases again with a changed VUT."""
-    before = campaign_of(asked.run).run
+    before = recorded(asked.run)
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
     chosen = comparison.chosen(before, indices, asked.level)
-    out = path_of(asked.out)
-    if out is not None:
-        check_new_file(out)
+    out, junit = new_file_of(asked.out), new_file_of(asked.junit)
+    if isinstance(before, CasesFile) and out is not None and out.suffix != SUFFIX:
+        raise UserError(f"`out` of a cases file is one, too: name it NAME{SUFFIX}")
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
-        return _with_page(comparison.rerun(study, chosen), out)
+        compared = comparison.rerun(study, chosen)
+    if isinstance(before, CasesFile):
+        compared = before.compared(compared, out or before.folder)
+    return _written(compared, out, junit)
 
 
-def _with_page(compared: Comparison, out: Path | None) -> Comparison:
-    """Write the page of a comparison, where one is asked for."""
+def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
+    """Write the page, or the cases file of now, and JUnit, where they are asked for."""
+    if junit is not None:
+        write_junit_of_comparison(junit, compared)
     if out is None:
         return compared
-    write_new(out, comparison_page(compared).encode(errors="backslashreplace"))
+    text = comparison_page(compared) if compared.text is None else compared.text
+    write_new(out, text.encode(errors="backslashreplace"))
     return replace(compared, page_command="")
 
 
@@ -201,7 +209,7 @@ def export(asked: verbs.Export) -> list[Path]:
         check_own(*(loaded.folder / name for name in below))
     target = loaded.folder / export_format.below if asked.out is None else Path(asked.out)
     if export_format.write_table is not None:
-        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
+        wanted = wanted or list(export_format.chosen(loaded))
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
         raise UserError(f"`file_format` {asked.file_format} needs the indices of cases")
@@ -264,15 +272,9 @@ def compare(asked: verbs.Compare) -> Comparison:
     """Compare recorded campaigns: what broke, and what was fixed."""
     if isinstance(asked.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
-    out, junit = path_of(asked.out), path_of(asked.junit)
-    for path in (out, junit):
-        if path is not None:
-            check_new_file(path)
+    out, junit = new_file_of(asked.out), new_file_of(asked.junit)
     versions = [campaign_of(run).run for run in asked.runs]
-    compared = _with_page(comparison.compare(versions), out)
-    if junit is not None:
-        write_junit_of_comparison(junit, compared)
-    return compared
+    return _written(comparison.compare(versions), out, junit)
 
 
 @verb(verbs.GroundTruth)

@@ -35,6 +35,7 @@ from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
+from merge_sumo.system.folders import check_new_file
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
 from merge_sumo.verbs import Benchmark, Campaign, GroundTruth, SearchOfTest
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
@@ -96,6 +97,13 @@ def opened_truths(
         Bars(shown=where.progress) as bars,
     ):
         yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
+
+
+def new_file_of(path: AnyPath | None) -> Path | None:
+    """Return what a person names as a new file; `UserError` where none can be written."""
+    if path is not None:
+        check_new_file(Path(path))
+    return path_of(path)
 
 
 def path_of(path: AnyPath | None) -> Path | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from merge_sumo import options, verbs
 from merge_sumo.api.asked import scenario_of, settings_in, stated_again
-from merge_sumo.api.results import campaign_of
+from merge_sumo.api.results import recorded
 from merge_sumo.campaigns.one_case import ONE, case_of
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.engine.povs import one_level, policies_folder
@@ -24,7 +24,7 @@ def recorded_case(asked: verbs.RunCase) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     assert asked.recorded is not None, "one of a campaign"  # noqa: S101
     fields, _ = stated_again(asked, asked.vut, {})
-    run = campaign_of(asked.recorded[0]).run
+    run = recorded(asked.recorded[0])
     before = run.outcome(asked.recorded[1]).case
     level = before.level
     if asked.level is not None:

@@ -15,9 +15,11 @@ from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.motion import lines_of
+from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import Change, Comparison, compare_against
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import to_plain
@@ -283,6 +285,13 @@ class CaseRun(Result):
 def campaign_of(run: AnyRun) -> CampaignRun:
     """Open a campaign that a person names."""
     return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
+
+
+def recorded(run: AnyRun) -> Run:
+    """Open what a person names: a campaign, or a cases file."""
+    path = folder_of(run)
+    is_file = not path.is_dir() and (path.suffix == SUFFIX or path.exists())
+    return CasesFile(path) if is_file else campaign_of(run).run
 
 
 def folder_of(run: AnyRun) -> Path:

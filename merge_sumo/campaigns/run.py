@@ -102,18 +102,7 @@ class Run:
 
     def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
         """Read settings and outcomes, where the writer of the folder has none in memory."""
-        self.folder = folder
-        self.record = read_settings(folder)
-        self.scenario = scenario_of(self.record, folder / SETTINGS)
-        self._batches: dict[int, dict[int, FloatArray]] = {}
-        self._signals: dict[int, Signals] = {}
-        """By index, of the batches that were read."""
-        try:
-            names = {field.name for field in fields(RecordedSettings)}
-            known = {name: value for name, value in self.record.items() if name in names}
-            self.settings = convert(known, RecordedSettings)
-        except UserError as error:
-            raise UserError(f"{folder / SETTINGS} is no campaign's: {error}") from error
+        self._take(folder, read_settings(folder), folder / SETTINGS)
         try:
             self.criterion = Criterion(self.settings.fail_when, self.settings.require)
             if outcomes is None:
@@ -127,6 +116,20 @@ class Run:
                     "be read without it"
                 ) from error
             raise
+
+    def _take(self, folder: Path, record: dict[str, Any], place: Path) -> None:
+        """Take settings that are recorded at a place."""
+        self.folder, self.record = folder, record
+        self.scenario = scenario_of(record, place)
+        self._batches: dict[int, dict[int, FloatArray]] = {}
+        self._signals: dict[int, Signals] = {}
+        """By index, of the batches that were read."""
+        try:
+            names = {field.name for field in fields(RecordedSettings)}
+            known = {name: value for name, value in self.record.items() if name in names}
+            self.settings = convert(known, RecordedSettings)
+        except UserError as error:
+            raise UserError(f"{place} is no campaign's: {error}") from error
 
     def _read(self) -> None:
         folder = self.folder

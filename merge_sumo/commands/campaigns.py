@@ -127,7 +127,7 @@ def _coordinates(given: list[str]) -> dict[str, float]:
 @app.verb(verbs.Rerun)
 def rerun(
     given: Given,
-    run: RunArgument,
+    run: Annotated[Path, typer.Argument(help="Folder of a campaign, or a cases file.")],
     case: Annotated[
         list[int] | None,
         typer.Argument(help="Indices of cases in outcomes.jsonl; all if left out."),
@@ -146,9 +146,9 @@ def rerun(
     from merge_sumo import api
 
     if stress:
-        if case or given.written.keys() & {"level", "out"}:
+        if case or given.written.keys() & {"level", "out", "junit"}:
             raise UserError(
-                "--stress runs all cases, without a page: leave indices, --level and --out away"
+                "--stress runs all cases: leave indices, --level, --out and --junit away"
             )
         given.print(api.stress(run, **given.written))
         return
@@ -178,7 +178,7 @@ def export(
     run: RunArgument,
     case: Annotated[
         list[int] | None,
-        typer.Argument(help="Indices of cases in outcomes.jsonl; csv: all if left out."),
+        typer.Argument(help="Indices of cases in outcomes.jsonl; csv: all, cases: 40 by default."),
     ] = None,
 ) -> None:
     from merge_sumo import api

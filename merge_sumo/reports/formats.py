@@ -14,6 +14,7 @@ FORMATS: Final[Registry[ExportFormat]] = Registry(
         "sumo": "merge_sumo.reports.exports:SUMO",
         "openscenario": "merge_sumo.reports.exports:OPENSCENARIO",
         "csv": "merge_sumo.reports.exports:CSV",
+        "cases": "merge_sumo.reports.exports:CASES",
     },
     accepts=lambda item: (
         isinstance(item, ExportFormat) and (item.write_case is None) != (item.write_table is None)

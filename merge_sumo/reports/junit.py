@@ -10,6 +10,7 @@ broke is a `failure`. Times are simulated seconds.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -21,7 +22,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against
+from merge_sumo.studies.comparison import WORSE, Change, Comparison, Step, compare_against
 from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
@@ -67,8 +68,6 @@ def write_junit(
             if outcome.case.level == level:
                 runs, cause = shares.get(outcome.index, ""), said.get(outcome.index)
                 _case(suite, outcome, runs, cause, is_unsure=outcome.index in unsure)
-        if unsure:
-            suite.set("skipped", str(len(list(suite.iter("skipped")))))
     _write(path, root)
 
 
@@ -77,7 +76,7 @@ def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
     root = etree.Element("testsuites", name="merge-sumo compare")
     for step in compared.steps:
         before, after = (compared.versions[n - 1] for n in (step.before, step.after))
-        _step(root, printable(f"{before.folder} to {after.folder}"), step)
+        _step(root, printable(f"{before.folder} to {after.folder or after.vut}"), step)
     _write(path, root)
 
 
@@ -86,6 +85,8 @@ def _write(path: Path, root: etree._Element) -> None:
     for part in (*root.findall("testsuite"), root):
         tests = list(part.iter("testcase"))
         part.set("tests", str(len(tests)))
+        if part is not root and (skipped := len(list(part.iter("skipped")))):
+            part.set("skipped", str(skipped))
         part.set("failures", str(len(list(part.iter("failure")))))
         part.set("errors", str(len(list(part.iter("error")))))
         part.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")
@@ -114,11 +115,13 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
     """Add a suite of the cases that two versions ran."""
     suite = etree.SubElement(root, "testsuite", name=name)
     for one in step.cases:
-        if one.change is not Change.BOTH:
+        if one.change is not Change.BOTH or one.tolerance < math.inf:
             case = f"case {one.b.index}: {described(one.b.case)}"
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
-            if one.change is Change.BROKE:
+            if one.change in WORSE:
                 _wrong(test, "failure", REGRESSION, one.became)
+            if one.change is Change.ACCEPTED:
+                etree.SubElement(test, "skipped", message=f"accepted: {one.accepted}")
 
 
 def _case(

@@ -13,12 +13,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.system.records import read_toml
+from merge_sumo.system.records import read_toml, toml_value
 from merge_sumo.system.resources import resource
 from merge_sumo.system.suggestions import meant
 
@@ -115,15 +115,6 @@ def to_toml(scenario: Scenario, found: Sequence[str]) -> str:
         if value is None or field.name not in recorded:
             continue
         comment = COMMENTS.get(field.name)
-        text = f"{field.name} = {_toml(value)}"
+        text = f"{field.name} = {toml_value(value)}"
         lines.append(f"{text:<44}# {comment}" if comment else text)
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f"{value:.10g}" if "." in f"{value:.10g}" else f"{value:.10g}.0"

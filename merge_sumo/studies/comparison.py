@@ -13,6 +13,7 @@ changed VUT. All return a `Comparison`.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -55,10 +56,12 @@ class Change(StrEnum):
     A case passes where the VUT arrives and the criterion is met. One whose runs are not alike may
     pass with one version alone by chance: it is `WITHIN_CHANCE` where Fisher's exact test does not
     tell the shares of failing runs apart. `LATER_ALONE`, `EARLIER_ALONE` and `NOT_SEEN` are only of
-    regions.
+    regions, `LESS_MARGIN` and `ACCEPTED` only of a cases file.
     """
 
     BROKE = "broke"
+    LESS_MARGIN = "pass with less margin"
+    ACCEPTED = "accepted"
     LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
     NEITHER = "pass with neither"
@@ -67,6 +70,9 @@ class Change(StrEnum):
     EARLIER_ALONE = "found in the earlier alone"
     NOT_SEEN = "not looked at"
     BOTH = "pass with both"
+
+
+WORSE: Final = (Change.BROKE, Change.LESS_MARGIN)
 
 
 def passes(outcome: Outcome) -> bool:
@@ -83,17 +89,25 @@ class ComparedCase:
         b: its outcome with the later one.
         runs_a: its runs with the earlier one, of which `a` decides; None for a single one.
         runs_b: its runs with the later one.
+        tolerance: the margin that it may lose.
+        accepted: why it may fail; an error is not excused.
     """
 
     a: Outcome
     b: Outcome
     runs_a: RunsOfCase | None = None
     runs_b: RunsOfCase | None = None
+    tolerance: float = math.inf
+    accepted: str = ""
 
     @property
     def change(self) -> Change:
         """What became of it."""
         before, after = passes(self.a), passes(self.b)
+        if self.accepted and not (after or self.b.measures.end.is_error):
+            return Change.ACCEPTED
+        if before and after and short(self.a.margin) - short(self.b.margin) > self.tolerance:
+            return Change.LESS_MARGIN
         if before == after:
             return Change.BOTH if before else Change.NEITHER
         if self.chance is not None and self.chance > SIGNIFICANT:
@@ -126,13 +140,16 @@ class ComparedCase:
             return f"{shares}, by Fisher's exact test p = {self.chance:.2g}"
         before, after = _word(self.a), _word(self.b)
         if before == after and self.change is not Change.BOTH:
+            less = self.change is Change.LESS_MARGIN
             verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
-            before, after = (f"{before}, {verdict}" for verdict in verdicts)
+            margins = (f"margin {short(o.margin)}" for o in (self.a, self.b))
+            before, after = (f"{before}, {one}" for one in (margins if less else verdicts))
         return f"{before} -> {after}"
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
         record: dict[str, Any] = {"change": self.change, "level": self.a.case.level}
+        record |= {"accepted": self.accepted} if self.accepted else {}
         sides = (("before", self.a, self.runs_a), ("after", self.b, self.runs_b))
         for name, outcome, runs in sides:
             found = outcome.measures
@@ -141,6 +158,11 @@ class ComparedCase:
             if runs is not None:
                 record |= {f"runs_{name}": runs.runs, f"failed_runs_{name}": runs.failures}
         return record
+
+
+def short(value: Any) -> Any:
+    """Return a number to the digits that a cases file has, another value as it is."""
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _word(outcome: Outcome) -> str:
@@ -268,6 +290,7 @@ class Comparison(Result):
         source: a sentence on where the cases come from.
         notes: sentences on what limits the comparison.
         page_command: the command that writes its page, with both motions of the cases.
+        text: of a cases file, what it would be now; then the notes have the difference.
     """
 
     versions: tuple[Version, ...]
@@ -275,6 +298,7 @@ class Comparison(Result):
     source: str
     notes: tuple[str, ...] = ()
     page_command: str = ""
+    text: str | None = None
 
     @property
     def broke(self) -> int:
@@ -283,8 +307,9 @@ class Comparison(Result):
 
     @property
     def worse(self) -> bool:
-        """Whether a case broke, or the last version was tested in no case."""
-        return self.broke > 0 or not any(o.is_tested for o in self.versions[-1].outcomes)
+        """Whether a case broke or lost too much margin, or the last version tested no case."""
+        got_worse = any(one.change in WORSE for step in self.steps for one in step.cases)
+        return got_worse or not any(o.is_tested for o in self.versions[-1].outcomes)
 
     @property
     def headline(self) -> str:
@@ -308,6 +333,8 @@ class Comparison(Result):
 
     def lines(self) -> list[str]:
         """Return the numbers, version by version and step by step, and the first of the cases."""
+        if self.text is not None:
+            return [self.headline, *self.notes]
         text = [self.headline, self.source]
         for number, version in enumerate(self.versions, start=1):
             verdict = judge(version.outcomes, version.tolerated)

@@ -183,6 +183,15 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
         raise UserError(f"the {what} {path} is no TOML: {error}") from error
 
 
+def toml_value(value: object) -> str:
+    """Return plain values as TOML has them, in a line; names without spaces, numbers in full."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name} = {toml_value(of)}' for name, of in value.items())}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
 def to_plain(value: object) -> Any:
     """Return a value as the lists and tables that JSON has; a number of numpy is one of Python."""
     return msgspec.to_builtins(value, enc_hook=methodcaller("item"))

@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 import pytest
-from ci_snippets import PAGE, commands
+from ci_snippets import PAGE, commands, main
+
+import merge_sumo as ms
 
 TEXT = PAGE.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("kind", ["github", "gitlab"])
 def test_a_workflow_installs_runs_a_campaign_with_gates_and_the_test(kind):
-    install, campaign, test = commands(kind, TEXT)
+    install, again, campaign, test = commands(kind, TEXT)
     assert install.startswith("pip install merge-sumo")
+    assert again.startswith("merge-sumo rerun cases.toml --vut controller.py:Controller")
     assert campaign.startswith("merge-sumo campaign --vut controller.py:Controller")
     assert "--gate failures" in campaign
     assert test == "python -m pytest test_controller.py"
+
+
+def test_the_cases_of_the_page_are_those_of_its_controller(tmp_path, monkeypatch):
+    main("github", tmp_path / "ci")
+    monkeypatch.chdir(tmp_path / "ci")
+    same = ms.rerun("cases.toml", vut="controller.py:Controller")
+    assert same.text == (tmp_path / "ci" / "cases.toml").read_text()
+    controller = tmp_path / "ci" / "controller.py"
+    controller.write_text(controller.read_text().replace("+ 2.0", "+ 0.2"))
+    now = ms.rerun("cases.toml", vut="controller.py:Controller")
+    shown = TEXT.partition("in the place of `+ 2.0`")[2].partition("```text\n")[2]
+    for line in shown.partition("```")[0].splitlines():
+        assert line == "..." or line in now.lines()

@@ -24,6 +24,8 @@ WRITERS: Final = {
     "reproduce": ("reproduce --quick --seeds 1 --workers 1 --out", ""),
     "export": ("export run 0 1 --out", ""),
     "export csv": ("export run 0 --format csv --out", ""),
+    "export cases": ("export run 0 --format cases --out", ".toml"),
+    "junit of rerun": ("rerun run 0 --junit", ".xml"),
     "export openscenario": ("export run 0 --format openscenario --out", ""),
     "train": ("train --only pov1 --out", ""),
     "scenario new": (
