@@ -294,13 +294,11 @@ class Export(Asked):
     """Write cases of a campaign for SUMO, for other simulators, as a table, or to commit.
 
     Example:  merge-sumo export runs/design2 17 42
-
-    Example:  merge-sumo export runs/design2 --format cases --out cases.toml
     """
 
     run: AnyRun = field(metadata=RUN)
     indices: Iterable[int] | int | None = keyword(
-        None, "Cases of the campaign; csv: all when left out, cases: 40 that watch a controller."
+        None, "Cases of the campaign; csv: all when left out, cases: 40 that watch a VUT."
     )
     _: KW_ONLY
     file_format: str = option(
@@ -313,8 +311,7 @@ class Export(Asked):
         "--format",
     )
     out: AnyPath | None = _out(
-        "Folder to write into, or FILE.csv and FILE.toml.",
-        "RUN/scenarios for sumo, else RUN/exports",
+        "Folder to write into; of cases also FILE.toml.", "RUN/scenarios for sumo, else RUN/exports"
     )
 
 

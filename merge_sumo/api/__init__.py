@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING
 
 from merge_sumo import options, verbs
 from merge_sumo.api.asked import (
-    new_file_of,
     opened,
     opened_study,
     opened_truths,
@@ -177,13 +176,13 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     before = recorded(asked.run)
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
     chosen = comparison.chosen(before, indices, asked.level)
-    out, junit = new_file_of(asked.out), new_file_of(asked.junit)
+    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
     if isinstance(before, CasesFile) and out is not None and out.suffix != SUFFIX:
         raise UserError(f"`out` of a cases file is one, too: name it NAME{SUFFIX}")
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = comparison.rerun(study, chosen)
     if isinstance(before, CasesFile):
-        compared = before.compared(compared, out or before.folder)
+        compared = before.judged(compared, out or before.folder)
     return _written(compared, out, junit)
 
 
@@ -209,7 +208,7 @@ def export(asked: verbs.Export) -> list[Path]:
         check_own(*(loaded.folder / name for name in below))
     target = loaded.folder / export_format.below if asked.out is None else Path(asked.out)
     if export_format.write_table is not None:
-        wanted = wanted or list(export_format.chosen(loaded))
+        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
         raise UserError(f"`file_format` {asked.file_format} needs the indices of cases")
@@ -272,7 +271,7 @@ def compare(asked: verbs.Compare) -> Comparison:
     """Compare recorded campaigns: what broke, and what was fixed."""
     if isinstance(asked.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
-    out, junit = new_file_of(asked.out), new_file_of(asked.junit)
+    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
     versions = [campaign_of(run).run for run in asked.runs]
     return _written(comparison.compare(versions), out, junit)
 

@@ -99,15 +99,10 @@ def opened_truths(
         yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
 
 
-def new_file_of(path: AnyPath | None) -> Path | None:
-    """Return what a person names as a new file; `UserError` where none can be written."""
-    if path is not None:
+def path_of(path: AnyPath | None, *, new: bool = False) -> Path | None:
+    """Return what a person names as a path; `UserError` where it is to be of a new file."""
+    if path is not None and new:
         check_new_file(Path(path))
-    return path_of(path)
-
-
-def path_of(path: AnyPath | None) -> Path | None:
-    """Return what a person names as a path."""
     return None if path is None else Path(path)
 
 

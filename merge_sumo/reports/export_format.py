@@ -22,13 +22,11 @@ class ExportFormat:
     Attributes:
         about: what is written, in a sentence without its full stop.
         write_case: writes the case of an index into a new folder, and returns the file to open.
-        write_table: writes cases into a new file, at a path or in a folder, and returns its path.
+        write_table: writes cases into a new file of a folder, and returns its path.
         below: folder in that of the campaign, where a person names none.
-        chosen: gives the cases of a table for which a person names none, by default all.
     """
 
     about: str
     write_case: Callable[[Run, int, Path, Corridor], Path] | None = None
     write_table: Callable[[Run, Sequence[int], Path], Path] | None = None
     below: str = EXPORTS
-    chosen: Callable[[Run], Sequence[int]] = lambda run: range(len(run.outcomes))

@@ -24,13 +24,13 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.studies.cases_file import watching, write_cases
+from merge_sumo.studies.cases_file import write_cases
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.system.folders import check_place, file_at, new_file, write_folder
+from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
 from merge_sumo.verdict.bodies import WIDTH_M
 from merge_sumo.verdict.merge import merged_rows
 
-TABLE: Final = "trajectories.csv"
+TABLE: Final = "trajectories"
 SEVERITY: Final = "severity"
 """Column with one of our words."""
 SIGNAL: Final = "signal_"
@@ -66,14 +66,17 @@ def write_folders(
         yield write(run, index, target / case_name(index), road)
 
 
-def write_table(run: Run, indices: Sequence[int], target: Path) -> Path:
+def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
     """Write the motion of cases as one table, one row a step; return its path.
 
     Raises `UserError` when the file exists, or a case has no trajectory.
     """
+    check_place(folder)
+    path = folder / f"{TABLE}.csv"
+    check_new(path)
     rows = [row for index in indices for row in _rows(run, index)]
     signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
-    path = file_at(target, TABLE)
+    make_place(folder)
     with new_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         writer = csv.DictWriter(text, (*columns_of(run.scenario), *signals))
@@ -263,4 +266,4 @@ OPENSCENARIO: Final = ExportFormat(
     about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
 )
 CSV: Final = ExportFormat(about="one table of motion", write_table=write_table)
-CASES: Final = ExportFormat(about="one file to commit", write_table=write_cases, chosen=watching)
+CASES: Final = ExportFormat(about="one file of at most 40 cases to commit", write_table=write_cases)

@@ -10,7 +10,6 @@ broke is a `failure`. Times are simulated seconds.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -115,13 +114,13 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
     """Add a suite of the cases that two versions ran."""
     suite = etree.SubElement(root, "testsuite", name=name)
     for one in step.cases:
-        if one.change is not Change.BOTH or one.tolerance < math.inf:
+        if one.change is not Change.BOTH or one.judged:
             case = f"case {one.b.index}: {described(one.b.case)}"
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
             if one.change in WORSE:
                 _wrong(test, "failure", REGRESSION, one.became)
             if one.change is Change.ACCEPTED:
-                etree.SubElement(test, "skipped", message=f"accepted: {one.accepted}")
+                etree.SubElement(test, "skipped", message=f"accepted: {one.became}")
 
 
 def _case(

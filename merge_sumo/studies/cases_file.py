@@ -1,7 +1,4 @@
-"""Cases in one small file to commit: a TOML head, and a line a case with what decided it.
-
-The file is enough to run them on another machine, and names no code to run.
-"""
+"""Cases in one small file to commit: it is all that runs them elsewhere, and names no code."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -20,19 +18,21 @@ from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.studies.comparison import WORSE, Comparison, passes, short
-from merge_sumo.system.folders import file_at, write_new
+from merge_sumo.studies.comparison import WORSE, Change, ComparedCase, Comparison, passes, short
+from merge_sumo.system.folders import make_place, write_new
 from merge_sumo.system.records import Record, convert, read_toml, to_json, toml_value
 from merge_sumo.verdict.cause import cause
+from merge_sumo.verdict.chance import one_per_case
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion, condition_of
 from merge_sumo.verdict.score import Measures, Outcome, record_fields
 
 MOST: Final = 40
-"""Cases of a file for which nobody names any."""
+"""Cases of a file."""
 TOLERANCE: Final = 0.01
 ABOUT: Final = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case does not pass any more, or its
@@ -57,10 +57,7 @@ class Head(Record, frozen=True):
 
 
 class CasesFile(Run):
-    """A cases file, as a campaign of which only what decided its cases is known.
-
-    Raises `UserError` where the file is none.
-    """
+    """A cases file, as a campaign of which only what decided its cases is known."""
 
     def __init__(self, path: Path) -> None:
         _, record = read_toml(path, "cases file")
@@ -112,29 +109,33 @@ class CasesFile(Run):
                 return outcome
         raise UserError(f"{self.folder} has no case {index}")
 
-    def compared(self, with_now: Comparison, path: Path) -> Comparison:
-        """Return a comparison by what the file allows, with the file as it is now for a path."""
-        (step,), (_, now) = with_now.steps, with_now.versions
-        cases = [
-            replace(one, tolerance=self.tolerance, accepted=self.accepted.get(one.a.index, ""))
-            for one in step.cases
-        ]
+    def judged(self, compared: Comparison, path: Path) -> Comparison:
+        """Return a comparison of cases by what the file allows; its text is that for a path."""
+        (step,), (_, now) = compared.steps, compared.versions
+        cases = [replace(one, judged=self._change(one)) for one in step.cases]
         outcomes = {one.index: one for one in (*self.outcomes, *now.outcomes)}
         before = cases_toml(self, self.outcomes, path)
         text = cases_toml(self, outcomes.values(), path, now.vut)
         notes = list[str]()
         for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
             notes += [] if old == new else [f"- {old.strip()}", f"+ {new.strip()}"]
-        for one in cases:
-            index = one.b.index
+        for index, one in ((one.b.index, one) for one in cases):
             if one.change in WORSE:
                 why = cause(one.b, now.motions([index]).get(index))
                 notes.append(f"case {index}, {one.change}: {why}")
-            elif one.accepted:
+            elif reason := self.accepted.get(index):
                 so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
-                notes.append(f"case {index} is accepted ({one.accepted}) and {so}")
+                notes.append(f"case {index} is accepted ({reason}) and {so}")
         steps = (replace(step, cases=cases),)
-        return replace(with_now, steps=steps, text=text, notes=tuple(notes))
+        return replace(compared, steps=steps, text=text, notes=tuple(notes))
+
+    def _change(self, one: ComparedCase) -> Change:
+        """Return what the file calls a change; it never excuses an error."""
+        if passes(one.a) and passes(one.b):
+            less = short(one.a.margin) - short(one.b.margin) > self.tolerance
+            return Change.LESS_MARGIN if less else Change.BOTH
+        excused = one.a.index in self.accepted and not one.b.measures.end.is_error
+        return Change.ACCEPTED if excused and not passes(one.b) else one.change
 
 
 def verdict_of(outcome: Outcome) -> str:
@@ -144,32 +145,35 @@ def verdict_of(outcome: Outcome) -> str:
     return "error" if outcome.measures.end.is_error else "timeout"
 
 
-def watching(run: Run) -> list[int]:
-    """Return the indices of at most 40 cases that watch a controller.
+def watching(run: Run, outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Return at most 40 outcomes of a campaign: of more, those that watch a controller.
 
     A quarter are the worst failures of regions. The others pass, the levels in turn: by turns the
     one of least margin and of least clearance that is apart from what is chosen, and the farthest.
     """
-    chosen, scenario = spread_failures(run.cases)[: MOST // 4], run.scenario
-    for turn in range(MOST):
-        for level in run.levels:
-            own = [one for one in run.cases if one.case.level == level]
-            left = [one for one in own if passes(one) and one not in chosen]
-            if left and len(chosen) < MOST:
-                known = to_unit((one.case for one in own if one in chosen), level, scenario)
-                points = to_unit((one.case for one in left), level, scenario)
-                away = cKDTree(known).query(points)[0]
-                near = [(one.margin, one.measures.clearance_m, 0.0)[turn % 3] for one in left]
-                apart = away > radius_for(points.shape[1]) if turn % 3 < 2 else away
-                # The last key decides first; no clearance is the largest.
-                chosen.append(left[np.lexsort((np.array(near, dtype=float), -1.0 * apart))[0]])
-    return [outcome.index for outcome in chosen]
+    if len(outcomes) <= MOST:
+        return list(outcomes)
+    cases, scenario = one_per_case(outcomes, run.tolerated), run.scenario
+    chosen = spread_failures(cases)[: MOST // 4]
+    for turn, level in product(range(MOST), run.levels):
+        left = [o for o in cases if o.case.level == level and passes(o) and o not in chosen]
+        if left and len(chosen) < MOST:
+            known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
+            points = to_unit((one.case for one in left), level, scenario)
+            away = cKDTree(known).query(points)[0]
+            near = [(one.margin, one.measures.clearance_m, 0.0)[turn % 3] for one in left]
+            apart = away > radius_for(points.shape[1]) if turn % 3 < 2 else away
+            # The last key decides first; no clearance is the largest.
+            chosen.append(left[np.lexsort((np.array(near, dtype=float), -1.0 * apart))[0]])
+    return chosen
 
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
-    """Write cases of a campaign as a new file, at a path or in a folder, and return its path."""
-    outcomes = [run.outcome(index) for index in dict.fromkeys(indices)]
-    path = file_at(target, "cases.toml")
+    """Write at most 40 cases as a new file, at a path or in a folder, and return its path."""
+    outcomes = watching(run, [run.outcome(index) for index in dict.fromkeys(indices)])
+    path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
+    if path != target:
+        make_place(target)
     write_new(path, cases_toml(run, outcomes, path).encode())
     return path
 

@@ -13,7 +13,6 @@ changed VUT. All return a `Comparison`.
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -89,25 +88,21 @@ class ComparedCase:
         b: its outcome with the later one.
         runs_a: its runs with the earlier one, of which `a` decides; None for a single one.
         runs_b: its runs with the later one.
-        tolerance: the margin that it may lose.
-        accepted: why it may fail; an error is not excused.
+        judged: what a cases file calls its change; None where none says.
     """
 
     a: Outcome
     b: Outcome
     runs_a: RunsOfCase | None = None
     runs_b: RunsOfCase | None = None
-    tolerance: float = math.inf
-    accepted: str = ""
+    judged: Change | None = None
 
     @property
     def change(self) -> Change:
         """What became of it."""
+        if self.judged is not None:
+            return self.judged
         before, after = passes(self.a), passes(self.b)
-        if self.accepted and not (after or self.b.measures.end.is_error):
-            return Change.ACCEPTED
-        if before and after and short(self.a.margin) - short(self.b.margin) > self.tolerance:
-            return Change.LESS_MARGIN
         if before == after:
             return Change.BOTH if before else Change.NEITHER
         if self.chance is not None and self.chance > SIGNIFICANT:
@@ -140,16 +135,15 @@ class ComparedCase:
             return f"{shares}, by Fisher's exact test p = {self.chance:.2g}"
         before, after = _word(self.a), _word(self.b)
         if before == after and self.change is not Change.BOTH:
-            less = self.change is Change.LESS_MARGIN
             verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
-            margins = (f"margin {short(o.margin)}" for o in (self.a, self.b))
-            before, after = (f"{before}, {one}" for one in (margins if less else verdicts))
+            if self.change is Change.LESS_MARGIN:
+                verdicts = (f"margin {short(o.margin)}" for o in (self.a, self.b))
+            before, after = (f"{before}, {verdict}" for verdict in verdicts)
         return f"{before} -> {after}"
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
         record: dict[str, Any] = {"change": self.change, "level": self.a.case.level}
-        record |= {"accepted": self.accepted} if self.accepted else {}
         sides = (("before", self.a, self.runs_a), ("after", self.b, self.runs_b))
         for name, outcome, runs in sides:
             found = outcome.measures

@@ -195,15 +195,6 @@ def make_place(folder: Path, option: str = "`out`") -> None:
             check_place(folder, option)  # made by another process since
 
 
-def file_at(target: Path, name: str) -> Path:
-    """Return the path of a new file: one with the suffix of `name`, else `name` in a folder."""
-    path = target if target.suffix == Path(name).suffix else target / name
-    if path != target:
-        make_place(target)
-    check_new_file(path)
-    return path
-
-
 def _remove_if_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
