@@ -53,7 +53,7 @@ class Head(Record, frozen=True):
     require: str | None = None
     net_sha256: str | None = None
     policies_sha256: dict[str, str] | None = None
-    tolerance: Annotated[float, Meta(ge=0.0)] = TOLERANCE
+    tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] = TOLERANCE
 
 
 class CasesFile(Run):
@@ -104,17 +104,17 @@ class CasesFile(Run):
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the file has no such case."""
-        for outcome in self.outcomes:
-            if outcome.index == index:
-                return outcome
-        raise UserError(f"{self.folder} has no case {index}")
+        found = {outcome.index: outcome for outcome in self.outcomes}
+        if index not in found:
+            raise UserError(f"{self.folder} has no case {index}")
+        return found[index]
 
     def judged(self, compared: Comparison, path: Path) -> Comparison:
         """Return a comparison of cases by what the file allows; its text is that for a path."""
         (step,), (_, now) = compared.steps, compared.versions
         cases = [replace(one, judged=self._change(one)) for one in step.cases]
         outcomes = {one.index: one for one in (*self.outcomes, *now.outcomes)}
-        before = cases_toml(self, self.outcomes, path)
+        before = cases_toml(self, self.outcomes, path, self.settings.vut)
         text = cases_toml(self, outcomes.values(), path, now.vut)
         notes = list[str]()
         for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
@@ -126,8 +126,8 @@ class CasesFile(Run):
             elif reason := self.accepted.get(index):
                 so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
                 notes.append(f"case {index} is accepted ({reason}) and {so}")
-        steps = (replace(step, cases=cases),)
-        return replace(compared, steps=steps, text=text, notes=tuple(notes))
+        step = replace(step, cases=cases)
+        return replace(compared, steps=(step,), text=text, notes=tuple(notes))
 
     def _change(self, one: ComparedCase) -> Change:
         """Return what the file calls a change; it never excuses an error."""
@@ -148,13 +148,14 @@ def verdict_of(outcome: Outcome) -> str:
 def watching(run: Run, outcomes: Sequence[Outcome]) -> list[Outcome]:
     """Return at most 40 outcomes of a campaign: of more, those that watch a controller.
 
-    A quarter are the worst failures of regions. The others pass, the levels in turn: by turns the
-    one of least margin and of least clearance that is apart from what is chosen, and the farthest.
+    A quarter are the worst failures of regions. The others pass, if as many do, the levels in turn:
+    by turns that of least margin and of least clearance that lies apart, and the farthest.
     """
     if len(outcomes) <= MOST:
         return list(outcomes)
     cases, scenario = one_per_case(outcomes, run.tolerated), run.scenario
-    chosen = spread_failures(cases)[: MOST // 4]
+    failing = spread_failures(cases)
+    chosen = failing[: MOST // 4]
     for turn, level in product(range(MOST), run.levels):
         left = [o for o in cases if o.case.level == level and passes(o) and o not in chosen]
         if left and len(chosen) < MOST:
@@ -165,7 +166,7 @@ def watching(run: Run, outcomes: Sequence[Outcome]) -> list[Outcome]:
             apart = away > radius_for(points.shape[1]) if turn % 3 < 2 else away
             # The last key decides first; no clearance is the largest.
             chosen.append(left[np.lexsort((np.array(near, dtype=float), -1.0 * apart))[0]])
-    return chosen
+    return [*chosen, *failing[MOST // 4 :]][:MOST]
 
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
@@ -174,12 +175,12 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
     path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
     if path != target:
         make_place(target)
-    write_new(path, cases_toml(run, outcomes, path).encode())
+    write_new(path, cases_toml(run, outcomes, path, run.settings.vut).encode())
     return path
 
 
-def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str | None = None) -> str:
-    """Return a cases file for a path; `vut` is who drove, by default that of the campaign."""
+def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
+    """Return a cases file for a path; `vut` is who drove."""
     scenario = run.scenario
     ordered = sorted(outcomes, key=lambda one: (one.case.level, one.index))
     usual, place = {one.name: one.default for one in fields(scenario)}, scenario.to_record()
@@ -189,8 +190,7 @@ def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str | Non
     head = {name: run.record.get(name) for name in Head.__struct_fields__}
     learned = {POLICIES.get(one.case.level) for one in ordered}
     hashes = {of: one for of, one in (head["policies_sha256"] or {}).items() if of in learned}
-    head |= {"policies_sha256": hashes or None, "scenario": place, "cases": None}
-    head["vut"] = vut or head["vut"]
+    head |= {"vut": vut, "policies_sha256": hashes or None, "scenario": place, "cases": None}
     head["tolerance"] = run.tolerance if isinstance(run, CasesFile) else TOLERANCE
     lines = [f"{name} = {toml_value(one)}" for name, one in head.items() if one is not None]
     lines += ["cases = [", *(f"  {_line(run, outcome)}," for outcome in ordered), "]"]
@@ -200,14 +200,10 @@ def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str | Non
 def _line(run: Run, outcome: Outcome) -> str:
     """Return the line of a case: verdict and what decided it, its place, and what is accepted."""
     accepted = run.accepted if isinstance(run, CasesFile) and not passes(outcome) else {}
-    record = outcome.to_record() | {
-        "verdict": verdict_of(outcome),
-        "end": None if outcome.measures.end.is_tested else outcome.measures.end,
-        "margin": outcome.margin,
-        "accepted": accepted.get(outcome.index),
-    }
-    judge = run.criterion
-    deciding = () if judge.require else sorted(condition_of(judge.words).names)
+    record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
+    record |= {"accepted": accepted.get(outcome.index)}
+    record |= {"end": None} if outcome.measures.end.is_tested else {}
+    deciding = () if run.criterion.require else sorted(condition_of(run.criterion.words).names)
     told = ("index", "level", "verdict", "end", "severity", "margin", *deciding, "error")
     place = (of.field for of in run.scenario.dimensions(outcome.case.level))
     line = {name: short(record.get(name)) for name in told}
