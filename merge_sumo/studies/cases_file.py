@@ -25,6 +25,7 @@ from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import WORSE, Change, ComparedCase, Comparison, passes, short
 from merge_sumo.system.folders import make_place, write_new
+from merge_sumo.system.printable import printable
 from merge_sumo.system.records import Record, convert, read_toml, to_json, toml_value
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.chance import one_per_case
@@ -127,7 +128,7 @@ class CasesFile(Run):
                 so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
                 notes.append(f"case {index} is accepted ({reason}) and {so}")
         step = replace(step, cases=cases)
-        return replace(compared, steps=(step,), text=text, notes=tuple(notes))
+        return replace(compared, steps=(step,), text=text, notes=tuple(map(printable, notes)))
 
     def _change(self, one: ComparedCase) -> Change:
         """Return what the file calls a change; it never excuses an error."""

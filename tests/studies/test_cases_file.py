@@ -142,17 +142,19 @@ def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, 
     now = ms.rerun(file, vut=WORSE)
     index = next(one.b.index for one in now.steps[0].cases if one.change == "broke")
     (line,) = (text for text in file.read_text().splitlines() if f"{{index = {index}," in text)
-    edit(file, line, line.replace("},", ', accepted = "it waits"},'))
+    edit(file, line, line.replace("},", ', accepted = "it waits\\u001b"},'))
     new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
     said = command_line("rerun", file, index, "--vut", WORSE, "--out", new, "--junit", junit)
     assert said.code == 0
     assert said.out.startswith("0 cases broke, 1 accepted\n")
-    assert f"case {index} is accepted (it waits) and fails, not counted" in said.out
+    assert f"case {index} is accepted (it waits\\x1b) and fails, not counted" in said.out
     assert len(etree.parse(junit).getroot().findall(".//skipped")) == 1
-    assert CasesFile(new).accepted == {index: "it waits"}
+    assert CasesFile(new).accepted == {index: "it waits\x1b"}
     said = command_line("rerun", file, index)
     assert said.code == 0
-    assert f"case {index} is accepted (it waits) and passes now: take the mark away" in said.out
+    assert (
+        f"case {index} is accepted (it waits\\x1b) and passes now: take the mark away" in said.out
+    )
     told = json.loads(command_line("run", "--case", file, index, "--json").out)
     assert told["score"] == pytest.approx(CasesFile(file).outcome(index).measures.score, rel=1e-5)
     assert_refused(command_line("rerun", file, 999), f"{file} has no case 999")
