@@ -180,5 +180,5 @@ def build_fmu(
 
 
 if __name__ == "__main__":
-    file, fmi, *kind = [*sys.argv[1:], *("2.0",)[len(sys.argv) - 2 :]]
-    print(build_fmu(Path(file), fmi, **dict(zip(("merge",), kind, strict=True))))
+    file, fmi, kind = [*sys.argv[1:], *("", "2.0", "")[len(sys.argv) - 1 :]]
+    print(build_fmu(Path(file), fmi, **({"merge": kind} if kind else {})))

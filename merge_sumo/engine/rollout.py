@@ -404,6 +404,6 @@ class _Rollout:
         signals = series(episode.left, len(motion))
         before, after = cut_at(motion, episode.merge_row - episode.first_row)
         merged = Trajectory(
-            episode.case, before, self.ends_as, None, episode.clipped, after, signals
+            episode.case, before, self.ends_as, error, episode.clipped, after, signals
         )
         return episode.index, merged

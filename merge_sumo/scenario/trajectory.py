@@ -61,10 +61,10 @@ class Trajectory:
 
     `end` is MERGED whenever the VUT arrived at M: how near the bodies came is its severity
     (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
-    the simulation did wrong. `clipped_steps` counts the answers of the VUT that were outside the
-    limits of acceleration and were clipped. `after` is the motion behind M where the scenario has
-    it followed up, its first row that of the merge. `signals` are what the VUT left for each row of
-    both, where it left any.
+    the simulation did wrong, in a case that MERGED behind M. `clipped_steps` counts the answers of
+    the VUT that were outside the limits of acceleration and were clipped. `after` is the motion
+    behind M where the scenario has it followed up, its first row that of the merge. `signals` are
+    what the VUT left for each row of both, where it left any.
     """
 
     case: Case

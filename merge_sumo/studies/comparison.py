@@ -543,7 +543,7 @@ def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[O
     names = names_of_levels(level)
     for name in () if names == {"all"} else names.difference(there):
         raise UserError(
-            f"{run.folder} has no cases at level {name}: it has {', '.join(there)}, or all"
+            f"{run.folder} has no cases at level {name!r}: it has {', '.join(there)}, or all"
         )
     found = [o for o in found if names == {"all"} or level_name(o.case.level) in names]
     if not found:

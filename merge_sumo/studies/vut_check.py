@@ -133,8 +133,8 @@ def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[s
     if not wrong:
         return []
     return [
-        f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
-        f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
+        f"{len(wrong)} of {len(cases)} ordinary cases end in an error, the first as "
+        f"{wrong[0].end} at t = {wrong[0].t_end_s} s: {wrong[0].error}"
     ]
 
 

@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import BinaryIO, Final
 
@@ -328,9 +329,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def dated(what: str) -> Path:
-    """Return a dated name below `runs/`, of which `what` becomes a part."""
+    """Return a dated name below `runs/` that is free, of which `what` becomes a part."""
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
-    return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    now = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    paths = (DEFAULT / f"{name}{again}-{now}" for again in chain([""], count(-2, -1)))
+    return next(path for path in paths if not os.path.lexists(path))
 
 
 LATEST: Final = "latest"

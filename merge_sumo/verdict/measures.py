@@ -191,7 +191,7 @@ OURS: Final = (
         "steps in which the VUT asked for more than its limits of acceleration",
         digits=0,
     ),
-    Measure("error", "what the VUT or the simulation did wrong, else None"),
+    Measure("error", "what the VUT or the simulation did wrong, also behind M, else None"),
     Measure("nearest", "name of the car that the measures are of; recorded in traffic only"),
     _low(
         "after_gap_m",

@@ -8,6 +8,7 @@ from typing import Final
 
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.system.printable import counted
+from merge_sumo.verdict.campaign_verdict import message_of
 from merge_sumo.verdict.criteria import CRITERIA
 from merge_sumo.verdict.criterion import Criterion, condition_of, values_of
 from merge_sumo.verdict.score import Outcome
@@ -28,7 +29,17 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
-    return [*often, *_one_verdict(outcomes, criterion)]
+    return [*often, *_behind(outcomes), *_one_verdict(outcomes, criterion)]
+
+
+def _behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield in how many cases a driver fails behind M, where a verdict stands already."""
+    wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
+    if wrong:
+        yield (
+            f"in {counted(len(wrong), 'case')} an error ends the follow-up, the first in case "
+            f"{wrong[0].index}: {message_of(wrong[0])}"
+        )
 
 
 def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:

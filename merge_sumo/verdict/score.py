@@ -366,7 +366,7 @@ def measure_all(
 
 def merge_score(trajectory: Trajectory) -> float | None:
     """Return the score P of a merge; None after an error."""
-    if trajectory.error is not None:
+    if trajectory.end.is_error:
         return None
     dx = ttc = None
     if trajectory.end.is_tested:

@@ -12,6 +12,7 @@ from lxml import html
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
+from merge_sumo.system.folders import DATED, dated
 from merge_sumo.verdict.summary import summarise
 
 
@@ -89,3 +90,11 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
         getattr(ms, verb)("design2", **values)
     assert sentence in str(refused.value)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_two_campaigns_of_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for _ in range(3):
+        path = dated("design1")
+        assert DATED.fullmatch(path.name)
+        path.mkdir(parents=True)

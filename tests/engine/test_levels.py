@@ -52,7 +52,7 @@ def test_two_are_tested_and_run_again(tmp_path):
     assert {outcome.case.level for outcome in run.run.outcomes} == {0, 1}
     again = ms.rerun(run, level=[0, 1]).to_record()
     assert sum(row["cases"] for row in again["steps"][0]["transitions"]) == 20
-    with pytest.raises(UserError, match="has no cases at level 2: it has 0, 1, or all"):
+    with pytest.raises(UserError, match="has no cases at level '2': it has 0, 1, or all"):
         ms.rerun(run, level="0,2")
     with pytest.raises(UserError, match="`level` 0,1 does not go here: choose 0, 1 or 2"):
         ms.run("design1", level="0,1", x_pov0_m=-200.0, v_pov0_mps=30.0)

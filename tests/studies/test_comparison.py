@@ -257,7 +257,7 @@ def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
     ("arguments", "part"),
     [
         (("60",), "has no case 60"),
-        (("--level", "2"), "has no cases at level 2: it has 0, or all"),
+        (("--level", "2"), "has no cases at level '2': it has 0, or all"),
         (("3", "--stress"), "--stress runs all cases"),
     ],
 )

@@ -64,7 +64,10 @@ def test_it_says_the_same_as_json(check):
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
             "differently",
         ),
-        ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
+        (
+            "def Vut(seen):\n    return None\n",
+            "16 of 16 ordinary cases end in an error, the first as VUT_ERROR",
+        ),
         ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From a stand (v = 0) it ends as"),
         ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "it never starts"),
         (

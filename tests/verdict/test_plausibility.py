@@ -45,6 +45,15 @@ class TestAfterTheRun:
         assert len(notes) == (not is_headline)
         assert said in (headline or notes[0])
 
+    def test_errors_behind_m_are_told(self, run):
+        first, second, *others = run.outcomes
+        wrong = [
+            replace(o, measures=replace(o.measures, error="answered nan")) for o in (first, second)
+        ]
+        assert doubts([*wrong, *others], Criterion()) == [
+            f"in 2 cases an error ends the follow-up, the first in case {first.index}: answered nan"
+        ]
+
     def test_the_command_says_it_in_terminal_json_and_report(
         self, tmp_path, command_line, monkeypatch
     ):

@@ -132,6 +132,14 @@ def test_a_reached_speed_goes_before_commands_and_places_in_its_step_alone(drive
         assert stepped(drive) == pytest.approx(17.9, abs=1e-12)
 
 
+def test_where_nothing_else_is_commanded_the_vut_keeps_the_speed_that_it_reached(drive):
+    drive.begin()
+    drive.ours.vehicle.setPreviousSpeed("vut", 18.15)
+    assert [stepped(drive) for _ in range(3)] == pytest.approx([18.15] * 3, abs=1e-12)
+    drive.ours.vehicle.setPreviousSpeed("vut", 25.0)
+    assert [stepped(drive) for _ in range(3)] == pytest.approx([18.35] * 3, abs=1e-12)
+
+
 def test_it_acts_in_all_steps_that_a_client_makes_at_once_and_in_no_other_episode(drive):
     drive.begin()
     drive.ours.vehicle.setPreviousSpeed("vut", 18.15)

@@ -97,6 +97,8 @@ def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) ->
         raise RefusedError(f"Invalid {MODEL[name]}.")
     if not all(map(math.isfinite, numbers)):
         given = ", ".join(f"{value!r:.40}" for value in arguments)
+        if function in REACHED:  # what follows are defaults of the client
+            given = next(f"{value!r}" for value in numbers if not math.isfinite(value))
         if name in SPEEDS or function in REACHED:
             raise NotFiniteError(f"{function}({given})")
         raise RefusedError(f"{function} takes no ({given})")

@@ -96,6 +96,8 @@ class Session:
         """Speeds at the end of the coming step, by the commands of REACHED that told them."""
         self._moved: list[_Place | None] = [None, None]
         """Where the client moved the VUT to in the last step, and in the coming one."""
+        self._commands_speeds = False
+        """Whether the client has commanded a speed in this episode."""
         self._knows_of_the_lane = False
         """Whether the client has ever commanded anything of lanes."""
 
@@ -112,6 +114,7 @@ class Session:
     def enter(self, states: Mapping[str, State], seed: int = 0) -> None:
         """Make a step in which the vehicles depart; `seed` is a parameter of the VUT."""
         self._moved, self._reached_mps = [None, None], {}
+        self._commands_speeds = False
         self.sumo.enter(states)
         self.sumo.call("vehicle.setParameter", NAME_OF_VUT, "seed", str(seed))
         self.departed += states
@@ -136,6 +139,9 @@ class Session:
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles into their states after the step; `merged` is of the VUT."""
         self._noting_arrivals(lambda: self.sumo.put(states, merged=merged))
+        if self._reached_mps and not self._commands_speeds and NAME_OF_VUT in self.sumo.at_m:
+            # As from its departure on, it keeps its speed where nothing is commanded.
+            self.sumo.call("vehicle.setSpeed", NAME_OF_VUT, states[NAME_OF_VUT][1])
 
     def clear(self) -> None:
         """End the episode: all vehicles arrive, and what was subscribed of them ends."""
@@ -267,6 +273,7 @@ class Session:
         if effect is Effect.REACHED:
             self._reach(function, [value for value in arguments if isinstance(value, float)])
             return
+        self._commands_speeds |= function.partition(".")[2] in commands.SPEEDS
         if function == "vehicle.changeLane":
             self._check_lane(*arguments[:2])
         self.sumo.call(function, *arguments)

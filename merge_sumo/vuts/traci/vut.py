@@ -189,7 +189,7 @@ class TraciVut(Driver):
             self._note(
                 f"the speed that the controller reached or set takes an acceleration outside "
                 f"{low_mps2:g} to {high_mps2:g} m/s2, the scenario's limits: it is clipped, and "
-                "clipped_steps counts such steps"
+                "clipped_steps counts such steps up to M"
             )
         return float(acceleration_mps2)
 
