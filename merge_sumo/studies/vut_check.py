@@ -20,6 +20,7 @@ from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.result import Result, Shown
+from merge_sumo.verdict.plausibility import doubts, mostly_clipped
 from merge_sumo.vuts.base import HERE
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.python import installed_vuts
@@ -83,7 +84,9 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
             for corridor in range(ground.world.corridors):
                 ground.vut.begin(corridor, from_stand)
             differing += _differences("a reset too many", first, _run(ground, cases))
-        notes = _limits(first)
+        outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
+        headline = mostly_clipped(outcomes)
+        notes = [*([headline] if headline else []), *doubts(outcomes, plan.criterion)]
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:
@@ -129,12 +132,12 @@ def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
 
 
 def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
-    wrong = [t for t in trajectories if t.error is not None]
+    wrong = [t for t in trajectories if t.end.is_error]
     if not wrong:
         return []
     return [
-        f"{len(wrong)} of {len(cases)} ordinary cases end in an error, the first as "
-        f"{wrong[0].end} at t = {wrong[0].t_end_s} s: {wrong[0].error}"
+        f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
+        f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
     ]
 
 
@@ -182,20 +185,9 @@ def _why(plan: SimulationPlan, difference: _Difference) -> str:
     )
 
 
-def _limits(trajectories: Sequence[Trajectory]) -> list[str]:
-    steps = sum(len(t.motion) - 1 for t in trajectories)
-    clipped = sum(t.clipped_steps for t in trajectories)
-    if not clipped:
-        return []
-    return [
-        f"In {clipped} of {steps} steps it asks for an acceleration outside -4 to 2 m/s2; that is "
-        "clipped, and counted in `clipped_steps`."
-    ]
-
-
 def _from_stand(ground: Simulator, from_stand: Case) -> list[str]:
     (trajectory,) = _run(ground, [from_stand])
-    if trajectory.error is not None:
+    if trajectory.end.is_error:
         return [
             f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
             f"{trajectory.error}"

@@ -64,10 +64,7 @@ def test_it_says_the_same_as_json(check):
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
             "differently",
         ),
-        (
-            "def Vut(seen):\n    return None\n",
-            "16 of 16 ordinary cases end in an error, the first as VUT_ERROR",
-        ),
+        ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
         ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From a stand (v = 0) it ends as"),
         ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "it never starts"),
         (
@@ -89,7 +86,7 @@ def test_what_is_wrong_is_said_in_a_sentence(check, source, problem):
 def test_limits_and_answers_to_nonsense_are_notes(check):
     code, said = check("def Vut(seen):\n    return 5.0\n")
     assert code == 0
-    assert "steps it asks for an acceleration outside -4 to 2 m/s2" in said
+    assert "steps the VUT asks for an acceleration outside -4 to 2 m/s2" in said
     assert "To a state that is not a number it answers 5 m/s2." in said
 
 
