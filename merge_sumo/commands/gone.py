@@ -11,9 +11,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
     "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
-    "failures-per-merge": "`merge-sumo probability RUN --traffic NAME` says it",
-    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded, and `merge-sumo "
-    "rerun RUN --vut SPEC` runs the cases of one campaign with another VUT",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
     "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
     "stress": "`merge-sumo rerun RUN --stress` does it",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
