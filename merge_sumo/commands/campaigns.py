@@ -153,7 +153,7 @@ def rerun(
         given.print(api.stress(run, **given.written))
         return
     result = api.rerun(run, case or (), **given.written)
-    given.print(result, page=given.keywords["out"])
+    given.print(result, **{"page" if result.text is None else "cases": given.keywords["out"]})
     raise typer.Exit(1 if result.worse else 0)
 
 
