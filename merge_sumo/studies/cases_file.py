@@ -33,7 +33,7 @@ from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion, condition_o
 from merge_sumo.verdict.score import Measures, Outcome, record_fields
 
 MOST: Final = 40
-"""Cases of a file."""
+"""Cases of a file for which nobody names any."""
 TOLERANCE: Final = 0.01
 ABOUT: Final = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case does not pass any more, or its
@@ -146,15 +146,15 @@ def verdict_of(outcome: Outcome) -> str:
     return "error" if outcome.measures.end.is_error else "timeout"
 
 
-def watching(run: Run, outcomes: Sequence[Outcome]) -> list[Outcome]:
+def watching(run: Run) -> list[Outcome]:
     """Return at most 40 outcomes of a campaign: of more, those that watch a controller.
 
     A quarter are the worst failures of regions. The others pass, if as many do, the levels in turn:
     by turns that of least margin and of least clearance that lies apart, and the farthest.
     """
-    if len(outcomes) <= MOST:
-        return list(outcomes)
-    cases, scenario = one_per_case(outcomes, run.tolerated), run.scenario
+    if len(run.outcomes) <= MOST:
+        return run.outcomes
+    cases, scenario = one_per_case(run.outcomes, run.tolerated), run.scenario
     failing = spread_failures(cases)
     chosen = failing[: MOST // 4]
     for turn, level in product(range(MOST), run.levels):
@@ -171,8 +171,9 @@ def watching(run: Run, outcomes: Sequence[Outcome]) -> list[Outcome]:
 
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
-    """Write at most 40 cases as a new file, at a path or in a folder, and return its path."""
-    outcomes = watching(run, [run.outcome(index) for index in dict.fromkeys(indices)])
+    """Write cases as a new file, at a path or in a folder; return its path. Of all cases, 40."""
+    named = [run.outcome(index) for index in dict.fromkeys(indices)]
+    outcomes = named if len(named) < len(run.outcomes) else watching(run)
     path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
     if path != target:
         make_place(target)

@@ -8,6 +8,7 @@ import json
 import os
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from calling import assert_refused
@@ -103,6 +104,8 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
     run_campaign(campaign_settings(vut="own.py:Own", cases=60), tmp_path / "run")
     assert command_line("export", "run", "--format", "cases", "--out", "c.toml").code == 0
     assert_refused(command_line("rerun", "c.toml"), "c.toml was run with vut own.py:Own")
+    ms.export("run", range(50), file_format="cases", out="named.toml")
+    assert len(CasesFile(Path("named.toml")).outcomes) == 50, "those that are named"
     said = command_line("rerun", "c.toml", "--vut", "own.py:Own")
     assert (said.code, said.out) == (0, "0 cases broke, 40 pass with both\n")
     for name, words in (
