@@ -266,4 +266,6 @@ OPENSCENARIO: Final = ExportFormat(
     about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
 )
 CSV: Final = ExportFormat(about="one table of motion", write_table=write_table)
-CASES: Final = ExportFormat(about="one file to commit: 40 cases, or those named", write_table=write_cases)
+CASES: Final = ExportFormat(
+    about="one file to commit: 40 cases, or those named", write_table=write_cases
+)
