@@ -176,14 +176,23 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     before = recorded(asked.run)
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
     chosen = comparison.chosen(before, indices, asked.level)
-    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
-    if isinstance(before, CasesFile) and out is not None and out.suffix != SUFFIX:
-        raise UserError(f"`out` of a cases file is one, too: name it NAME{SUFFIX}")
+    out, junit = _new_files(asked)
+    whole = out is None or (out.suffix == SUFFIX and len(chosen) == len(before.outcomes))
+    if isinstance(before, CasesFile) and not whole:
+        raise UserError(f"`out` of a cases file is one, too: NAME{SUFFIX}, of all cases")
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = comparison.rerun(study, chosen)
     if isinstance(before, CasesFile):
         compared = before.judged(compared, out or before.folder)
     return _written(compared, out, junit)
+
+
+def _new_files(asked: verbs.Rerun | verbs.Compare) -> tuple[Path | None, Path | None]:
+    """Return the new files of a comparison; `UserError` where one cannot be, or both are one."""
+    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
+    if out is not None and out == junit:
+        raise UserError(f"`out` and `junit` name the same file {out}: give each its own")
+    return out, junit
 
 
 def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
@@ -271,7 +280,7 @@ def compare(asked: verbs.Compare) -> Comparison:
     """Compare recorded campaigns: what broke, and what was fixed."""
     if isinstance(asked.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
-    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
+    out, junit = _new_files(asked)
     versions = [campaign_of(run).run for run in asked.runs]
     return _written(comparison.compare(versions), out, junit)
 

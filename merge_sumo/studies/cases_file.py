@@ -27,18 +27,20 @@ from merge_sumo.studies.comparison import WORSE, Change, ComparedCase, Compariso
 from merge_sumo.system.folders import make_place, write_new
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import Record, convert, read_toml, to_json, toml_value
+from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.chance import one_per_case
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion, condition_of
 from merge_sumo.verdict.score import Measures, Outcome, record_fields
+from merge_sumo.verdict.severity import Severity
 
 MOST: Final = 40
 """Cases of a file for which nobody names any."""
 TOLERANCE: Final = 0.01
 ABOUT: Final = """\
-# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case does not pass any more, or its
-# margin, in units of the criterion's thresholds, drops by more than the tolerance. A failure that
-# is known may have in its line: accepted = "the reason"
+# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case does not pass any more, bodies
+# touch that did not, or the margin, in units of the criterion's thresholds, drops by more than the
+# tolerance. A failure that is known may have in its line: accepted = "the reason"
 """
 
 
@@ -127,16 +129,22 @@ class CasesFile(Run):
             elif reason := self.accepted.get(index):
                 so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
                 notes.append(f"case {index} is accepted ({reason}) and {so}")
+        if not any(one.is_tested for one in now.outcomes):
+            notes.append(judge(now.outcomes).nothing_tested)
         step = replace(step, cases=cases)
         return replace(compared, steps=(step,), text=text, notes=tuple(map(printable, notes)))
 
     def _change(self, one: ComparedCase) -> Change:
-        """Return what the file calls a change; it never excuses an error."""
+        """Return what the file calls a change; it excuses neither a new error nor a new contact."""
+        a, b = one.a.measures, one.b.measures
         if passes(one.a) and passes(one.b):
             less = short(one.a.margin) - short(one.b.margin) > self.tolerance
-            return Change.LESS_MARGIN if less else Change.BOTH
-        excused = one.a.index in self.accepted and not one.b.measures.end.is_error
-        return Change.ACCEPTED if excused and not passes(one.b) else one.change
+            touches = b.severity == Severity.CONTACT != a.severity
+            return Change.WORSE if less or touches else Change.BOTH
+        if b.end.is_error:
+            return Change.NEITHER if a.end.is_error else Change.BROKE
+        excused = one.a.index in self.accepted and not passes(one.b)
+        return Change.ACCEPTED if excused else one.change
 
 
 def verdict_of(outcome: Outcome) -> str:

@@ -55,11 +55,11 @@ class Change(StrEnum):
     A case passes where the VUT arrives and the criterion is met. One whose runs are not alike may
     pass with one version alone by chance: it is `WITHIN_CHANCE` where Fisher's exact test does not
     tell the shares of failing runs apart. `LATER_ALONE`, `EARLIER_ALONE` and `NOT_SEEN` are only of
-    regions, `LESS_MARGIN` and `ACCEPTED` only of a cases file.
+    regions, `WORSE` and `ACCEPTED` only of a cases file.
     """
 
     BROKE = "broke"
-    LESS_MARGIN = "pass with less margin"
+    WORSE = "worse but passing"
     ACCEPTED = "accepted"
     LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
@@ -71,7 +71,7 @@ class Change(StrEnum):
     BOTH = "pass with both"
 
 
-WORSE: Final = (Change.BROKE, Change.LESS_MARGIN)
+WORSE: Final = (Change.BROKE, Change.WORSE)
 
 
 def passes(outcome: Outcome) -> bool:
@@ -136,7 +136,7 @@ class ComparedCase:
         before, after = _word(self.a), _word(self.b)
         if before == after and self.change is not Change.BOTH:
             verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
-            if self.change is Change.LESS_MARGIN:
+            if self.change is Change.WORSE:
                 verdicts = (f"margin {short(o.margin)}" for o in (self.a, self.b))
             before, after = (f"{before}, {verdict}" for verdict in verdicts)
         return f"{before} -> {after}"

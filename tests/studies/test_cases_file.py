@@ -19,7 +19,10 @@ from lxml import etree
 import merge_sumo as ms
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.cases_file import CasesFile, write_cases
+from merge_sumo.studies.comparison import ComparedCase, passes
+from merge_sumo.verdict.severity import Severity
 
 CONTROLLER = """
 class Own:
@@ -94,7 +97,9 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert ms.rerun(file, vut="level0").worse
     edit(file, "tolerance = 0.01", "tolerance = 200.0")
     tolerant = ms.rerun(file, vut="design2?gap_m=12")
-    assert not tolerant.worse
+    worse = [one for one in tolerant.steps[0].cases if one.change == "worse but passing"]
+    assert all(one.b.measures.severity == "contact" for one in worse), "new contacts alone"
+    assert tolerant.worse is bool(worse)
     assert len(tolerant.lines()) > 2, "what changed is shown all the same"
 
 
@@ -109,7 +114,7 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
     said = command_line("rerun", "c.toml", "--vut", "own.py:Own")
     assert (said.code, said.out) == (0, "0 cases broke, 40 pass with both\n")
     for name, words in (
-        ("Late", ", pass with less margin: Safe: "),
+        ("Late", ", worse but passing: Safe: "),
         ("Blind", ", broke: "),
         ("Lost", ", broke: VUT_ERROR at "),
     ):
@@ -118,6 +123,24 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
         assert words in said.out, name
     edit(tmp_path / "c.toml", "},\n", ', accepted = "never mind"},\n', 40)
     assert ms.rerun("c.toml", vut="own.py:Lost").broke == 40, "no error is accepted"
+
+
+@on_us23
+def test_a_new_error_or_contact_is_worse(file):
+    record = CasesFile(file)
+    safe = next(o for o in record.outcomes if passes(o) and o.measures.severity == "safe")
+    fails = next(o for o in record.outcomes if not passes(o))
+
+    def change(before, **measured):
+        return record._change(
+            ComparedCase(before, replace(before, measures=replace(before.measures, **measured)))
+        )
+
+    assert change(safe, severity=Severity.CONTACT) == "worse but passing"
+    assert change(safe, severity=Severity.HARSH) == "pass with both"
+    record.accepted = {fails.index: "known"}
+    assert change(fails) == "accepted"
+    assert change(fails, end=End.VUT_ERROR) == "broke"
 
 
 @on_us23
@@ -135,7 +158,7 @@ def test_the_diff_has_the_lines_of_the_file_that_change(file, command_line, tmp_
     assert after == [swapped.get(line, line) for line in before]
     assert command_line("rerun", new).code == 0, "the new file holds now"
     root = etree.parse(junit).getroot()
-    wrong = said.out.count(", broke: ") + said.out.count(", pass with less margin: ")
+    wrong = said.out.count(", broke: ") + said.out.count(", worse but passing: ")
     assert (root.get("tests"), root.get("failures")) == ("40", str(wrong))
     assert any(", margin " in failure.get("message") for failure in root.iter("failure"))
 
@@ -147,7 +170,9 @@ def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, 
     (line,) = (text for text in file.read_text().splitlines() if f"{{index = {index}," in text)
     edit(file, line, line.replace("},", ', accepted = "it waits\\u001b"},'))
     new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
-    said = command_line("rerun", file, index, "--vut", WORSE, "--out", new, "--junit", junit)
+    assert_refused(command_line("rerun", file, index, "--out", new), "NAME.toml, of all cases")
+    ms.rerun(file, vut=WORSE, out=new)
+    said = command_line("rerun", file, index, "--vut", WORSE, "--junit", junit)
     assert said.code == 0
     assert said.out.startswith("0 cases broke, 1 accepted\n")
     assert f"case {index} is accepted (it waits\\x1b) and fails, not counted" in said.out
