@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 import typer
 from typer.core import TyperCommand, TyperGroup, TyperOption
 
-from merge_sumo.commands import gone
 from merge_sumo.commands.printing import notices_printed, print_result, say
 from merge_sumo.errors import UserError
 from merge_sumo.help_texts import with_names
@@ -39,6 +38,17 @@ PANELS: Final[Mapping[str, tuple[str, ...]]] = {
 }
 """Commands by panel of the help, the most used first."""
 PANEL_OF: Final = {name: panel for panel, names in PANELS.items() for name in names}
+GONE: Final[Mapping[str, str]] = {
+    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
+    "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
+    "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
+    "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
+    "stress": "`merge-sumo rerun RUN --stress` does it",
+    "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
+    "bounds how much of the pool can fail",
+}
+"""What replaces a command of an earlier version, by its name."""
 
 
 def unwrapped(text: str) -> str:
@@ -96,7 +106,8 @@ class CommandGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that the first argument names; `UserError` where it is gone."""
-        gone.check_command(args)
+        if args and args[0] in GONE:
+            raise UserError(f"the command {args[0]} is gone: {GONE[args[0]]}")
         return super().resolve_command(ctx, args)
 
 
