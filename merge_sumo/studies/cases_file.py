@@ -56,6 +56,7 @@ class Head(Record, frozen=True):
     require: str | None = None
     net_sha256: str | None = None
     policies_sha256: dict[str, str] | None = None
+    pov_files: dict[str, str] | None = None
     tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] = TOLERANCE
 
 

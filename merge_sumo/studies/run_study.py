@@ -67,7 +67,7 @@ class RunStudy:
             if not same_pov(run.record, today, level):
                 raise UserError(
                     f"{run.folder} was run against another POV of level {level_name(level)} than "
-                    "today's: give its `policies`"
+                    "today's: give its `policies`, or the same `pov`"
                 )
         if not may_change:
             notice_changes(run, self.plan)

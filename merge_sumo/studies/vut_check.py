@@ -85,8 +85,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
                 ground.vut.begin(corridor, from_stand)
             differing += _differences("a reset too many", first, _run(ground, cases))
         outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
-        headline = mostly_clipped(outcomes)
-        notes = [*([headline] if headline else []), *doubts(outcomes, plan.criterion)]
+        notes = [*filter(None, [mostly_clipped(outcomes)]), *doubts(outcomes, plan.criterion)]
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:

@@ -184,9 +184,13 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
 
 
 def toml_value(value: object) -> str:
-    """Return plain values as TOML has them, in a line; names without spaces, numbers in full."""
+    """Return plain values as TOML has them, in a line, numbers in full."""
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{name} = {toml_value(of)}' for name, of in value.items())}}}"
+        named = []
+        for name, of in value.items():
+            is_bare = name.isascii() and name.isidentifier()
+            named.append(f"{name if is_bare else toml_value(name)} = {toml_value(of)}")
+        return f"{{{', '.join(named)}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

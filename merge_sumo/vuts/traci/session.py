@@ -96,8 +96,7 @@ class Session:
         """Speeds at the end of the coming step, by the commands of REACHED that told them."""
         self._moved: list[_Place | None] = [None, None]
         """Where the client moved the VUT to in the last step, and in the coming one."""
-        self._commands_speeds = False
-        """Whether the client has commanded a speed in this episode."""
+        self._commands_speeds = False  # by the client, in this episode
         self._knows_of_the_lane = False
         """Whether the client has ever commanded anything of lanes."""
 
