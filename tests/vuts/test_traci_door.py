@@ -42,6 +42,7 @@ def strangers(port: Path, behave, count: int = 3):
         while not stopped.is_set():
             with suppress(OSError, GoneError, ValueError):
                 client = Client(int(port.read_text()), 0.5)
+                port.with_suffix(".met").touch()
                 client.socket.settimeout(0.5)
                 with client.socket:
                     served.append(bool(behave(client)))
@@ -76,7 +77,8 @@ class TestAProgram:
     def test_is_served_whoever_of_the_same_user_connects_besides(self, name, tmp_path):
         port, log = tmp_path / "port", tmp_path / "controller.log"
         with strangers(port, STRANGERS[name]) as served:
-            vut = factory(f"traci:sh -c 'echo {{port}} > {port}; exec {OURS}'", log=log)
+            wait = f"until [ -e {port}.met ]; do sleep 0.02; done"
+            vut = factory(f"traci:sh -c 'echo {{port}} > {port}; {wait}; exec {OURS}'", log=log)
             assert_drives_as_level0(vut, cases_of(2))
         assert not any(served)
         if name == "drives":
