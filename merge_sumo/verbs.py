@@ -327,7 +327,7 @@ class Rerun(Recorded):
 
     Exit code 1 when a case broke: it passed, and does not pass now. A cases file of `export` may
     stand in the place of the campaign. Then what changed in the file is shown, `out` is the file as
-    it is now, and the exit code is 1 also where a case lost more margin than the tolerance.
+    it is now, and the exit code is 1 also for a new error or contact, or too little margin.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 

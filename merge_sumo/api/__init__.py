@@ -217,7 +217,6 @@ def export(asked: verbs.Export) -> list[Path]:
         check_own(*(loaded.folder / name for name in below))
     target = loaded.folder / export_format.below if asked.out is None else Path(asked.out)
     if export_format.write_table is not None:
-        wanted = wanted or [outcome.index for outcome in loaded.outcomes]
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
         raise UserError(f"`file_format` {asked.file_format} needs the indices of cases")

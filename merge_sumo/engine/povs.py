@@ -87,7 +87,7 @@ class Povs:
         return min(asked, most // cars)
 
 
-CHOICE: Final = "0, 1, 2, several with commas, or all, or own with `pov`"
+CHOICE: Final = "0, 1, 2, several with commas, all alone, or own with `pov`"
 ONE: Final = "0, 1 or 2, or own with `pov`"
 
 
@@ -129,7 +129,7 @@ def parse_levels(
     Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
     """
     names = names_of_levels(asked)
-    if names == {"all"}:
+    if names == ("all",):
         return levels_in(policies, scenario_levels, own=own)
     by_name = {level_name(level): level for level in ALL_LEVELS}
     for name in names:
@@ -137,7 +137,7 @@ def parse_levels(
             raise UserError(f"there is no POV level {name!r}: choose {choice}")
         check_level(by_name[name], policies, scenario_levels, own=own)
     if own and level_name(OWN) not in names:
-        text = ",".join(sorted(names))
+        text = ",".join(names)
         raise UserError(f"`pov` drives at `level` own or all, not at `level` {text}")
     return tuple(level for name, level in by_name.items() if name in names)
 

@@ -67,14 +67,14 @@ def write_folders(
 
 
 def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
-    """Write the motion of cases as one table, one row a step; return its path.
+    """Write the motion of cases, or of all, as one table, one row a step; return its path.
 
     Raises `UserError` when the file exists, or a case has no trajectory.
     """
     check_place(folder)
     path = folder / f"{TABLE}.csv"
     check_new(path)
-    rows = [row for index in indices for row in _rows(run, index)]
+    rows = [row for index in indices or range(len(run.outcomes)) for row in _rows(run, index)]
     signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
     make_place(folder)
     with new_file(path) as file:
@@ -267,5 +267,5 @@ OPENSCENARIO: Final = ExportFormat(
 )
 CSV: Final = ExportFormat(about="one table of motion", write_table=write_table)
 CASES: Final = ExportFormat(
-    about="one file to commit: 40 cases, or those named", write_table=write_cases
+    about="one file to commit: at most 40 cases, or those named", write_table=write_cases
 )

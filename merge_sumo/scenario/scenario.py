@@ -64,11 +64,11 @@ def level_name(level: int) -> str:
 AnyLevels = int | str | Iterable[int | str]
 
 
-def names_of_levels(asked: AnyLevels) -> set[str]:
+def names_of_levels(asked: AnyLevels) -> tuple[str, ...]:
     """Return the names of the levels that a person lists, in a text with commas."""
     listed = asked if isinstance(asked, Iterable) else [asked]
     parts = asked.split(",") if isinstance(asked, str) else listed
-    return {str(part).strip() for part in parts} or {""}
+    return tuple(dict.fromkeys(str(part).strip() for part in parts)) or ("",)
 
 
 @dataclass(frozen=True, slots=True)

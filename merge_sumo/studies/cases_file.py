@@ -38,9 +38,9 @@ MOST: Final = 40
 """Cases of a file for which nobody names any."""
 TOLERANCE: Final = 0.01
 ABOUT: Final = """\
-# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case does not pass any more, bodies
-# touch that did not, or the margin, in units of the criterion's thresholds, drops by more than the
-# tolerance. A failure that is known may have in its line: accepted = "the reason"
+# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
+# error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is
+# less by more than the tolerance. A known failure may have in its line: accepted = "the reason"
 """
 
 
@@ -138,14 +138,14 @@ class CasesFile(Run):
     def _change(self, one: ComparedCase) -> Change:
         """Return what the file calls a change; it excuses neither a new error nor a new contact."""
         a, b = one.a.measures, one.b.measures
+        if b.error is not None and a.error is None:
+            return Change.BROKE
         if passes(one.a) and passes(one.b):
             less = short(one.a.margin) - short(one.b.margin) > self.tolerance
             touches = b.severity == Severity.CONTACT != a.severity
             return Change.WORSE if less or touches else Change.BOTH
-        if b.end.is_error:
-            return Change.NEITHER if a.end.is_error else Change.BROKE
-        excused = one.a.index in self.accepted and not passes(one.b)
-        return Change.ACCEPTED if excused else one.change
+        is_known = one.a.index in self.accepted and not b.end.is_error
+        return Change.ACCEPTED if is_known and not passes(one.b) else one.change
 
 
 def verdict_of(outcome: Outcome) -> str:
@@ -180,9 +180,8 @@ def watching(run: Run) -> list[Outcome]:
 
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
-    """Write cases as a new file, at a path or in a folder; return its path. Of all cases, 40."""
-    named = [run.outcome(index) for index in dict.fromkeys(indices)]
-    outcomes = named if len(named) < len(run.outcomes) else watching(run)
+    """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
+    outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
     if path != target:
         make_place(target)

@@ -539,13 +539,13 @@ def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[O
     Raises `UserError` for an index without a case, and where there is no such case.
     """
     found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
-    there = list(map(level_name, run.levels))
-    names = names_of_levels(level)
-    for name in () if names == {"all"} else names.difference(there):
+    asked, there = names_of_levels(level), tuple(map(level_name, run.levels))
+    names = there if asked == ("all",) else asked
+    for name in (name for name in names if name not in there):
         raise UserError(
             f"{run.folder} has no cases at level {name!r}: it has {', '.join(there)}, or all"
         )
-    found = [o for o in found if names == {"all"} or level_name(o.case.level) in names]
+    found = [one for one in found if level_name(one.case.level) in names]
     if not found:
         raise UserError(f"{run.folder} has none of these cases: name others, or another level")
     return found

@@ -157,7 +157,7 @@ def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
 
 
 def message_of(outcome: Outcome) -> str:
-    """Return why a case was not tested, on one line and fit to be shown anywhere."""
+    """Return why a case, or its follow-up, has no end, on one line that may be shown anywhere."""
     measures = outcome.measures
     if measures.error is not None:
         # Cut before it is escaped: a message may have megabytes.

@@ -36,10 +36,8 @@ def _behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield in how many cases a driver fails behind M, where a verdict stands already."""
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:
-        yield (
-            f"in {counted(len(wrong), 'case')} an error ends the follow-up, the first in case "
-            f"{wrong[0].index}: {message_of(wrong[0])}"
-        )
+        first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"
+        yield f"in {counted(len(wrong), 'case')} an error ends the follow-up, {first}"
 
 
 def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:

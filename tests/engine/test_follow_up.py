@@ -18,6 +18,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
+from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.merge import followed_up
 from merge_sumo.verdict.score import FOLLOWED_UP, Outcome, measure
@@ -140,3 +141,5 @@ class TestDrivingOn:
             assert trajectory.after[-1, VUT, 0] >= 10.0
             assert len(trajectory.after) < 10
             assert measure(trajectory).score == measure(replace(trajectory, error=None)).score
+            words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
+            assert words.endswith("Behind M an error ends the follow-up.")
