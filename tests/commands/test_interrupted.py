@@ -91,7 +91,9 @@ def test_what_was_stopped_is_made_to_the_byte_and_nothing_stays(name, run, tmp_p
     process = world.start(*given(world, verb, 2))
     time.sleep(np.random.default_rng([len(name), len(how)]).uniform(0.3, 1.0) * whole_s)
     code, err = stop(process, how)
-    assert "Traceback" not in err, err
+    # A worker that Python is about to start finds its parent killed.
+    unborn = how == "SIGKILL" and "EOFError: Ran out of input" in err
+    assert unborn or "Traceback" not in err, err
     assert "\x1b" not in err, "there is no terminal"
     assert wait_for(world.has_ended), "left running"
     if how != "SIGKILL":
