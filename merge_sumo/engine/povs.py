@@ -137,8 +137,7 @@ def parse_levels(
             raise UserError(f"there is no POV level {name!r}: choose {choice}")
         check_level(by_name[name], policies, scenario_levels, own=own)
     if own and level_name(OWN) not in names:
-        text = ",".join(names)
-        raise UserError(f"`pov` drives at `level` own or all, not at `level` {text}")
+        raise UserError(f"`pov` drives at `level` own or all, not at `level` {','.join(names)}")
     return tuple(level for name, level in by_name.items() if name in names)
 
 

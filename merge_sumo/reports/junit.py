@@ -21,7 +21,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.comparison import WORSE, Change, Comparison, Step, compare_against
+from merge_sumo.studies.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
 from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.system.folders import check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
@@ -117,7 +117,7 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
         if one.change is not Change.BOTH or one.judged:
             case = f"case {one.b.index}: {described(one.b.case)}"
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
-            if one.change in WORSE:
+            if one.change in GOT_WORSE:
                 _wrong(test, "failure", REGRESSION, one.became)
             if one.change is Change.ACCEPTED:
                 etree.SubElement(test, "skipped", message=f"accepted: {one.became}")

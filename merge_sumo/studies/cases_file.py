@@ -23,7 +23,7 @@ from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.studies.comparison import WORSE, Change, ComparedCase, Comparison, passes, short
+from merge_sumo.studies.comparison import GOT_WORSE, Change, ComparedCase, Comparison, passes, short
 from merge_sumo.system.folders import make_place, write_new
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import Record, convert, read_toml, to_json, toml_value
@@ -124,7 +124,7 @@ class CasesFile(Run):
         for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
             notes += [] if old == new else [f"- {old.strip()}", f"+ {new.strip()}"]
         for index, one in ((one.b.index, one) for one in cases):
-            if one.change in WORSE:
+            if one.change in GOT_WORSE:
                 why = cause(one.b, now.motions([index]).get(index))
                 notes.append(f"case {index}, {one.change}: {why}")
             elif reason := self.accepted.get(index):

@@ -38,6 +38,7 @@ from merge_sumo.system.result import Result
 from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.chance import RunsOfCase, by_case, one_per_case
 from merge_sumo.verdict.episode import Episode
+from merge_sumo.verdict.plausibility import behind
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 
@@ -71,7 +72,7 @@ class Change(StrEnum):
     BOTH = "pass with both"
 
 
-WORSE: Final = (Change.BROKE, Change.WORSE)
+GOT_WORSE: Final = (Change.BROKE, Change.WORSE)
 
 
 def passes(outcome: Outcome) -> bool:
@@ -302,7 +303,7 @@ class Comparison(Result):
     @property
     def worse(self) -> bool:
         """Whether a case broke or lost too much margin, or the last version tested no case."""
-        got_worse = any(one.change in WORSE for step in self.steps for one in step.cases)
+        got_worse = any(one.change in GOT_WORSE for step in self.steps for one in step.cases)
         return got_worse or not any(o.is_tested for o in self.versions[-1].outcomes)
 
     @property
@@ -334,7 +335,7 @@ class Comparison(Result):
             verdict = judge(version.outcomes, version.tolerated)
             place = f"{version.folder} " if version.folder else "now "
             text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
-            text += verdict.trouble_lines()
+            text += [*verdict.trouble_lines(), *(f"  {one}" for one in behind(version.outcomes))]
         text += [
             f"level {level_name(level)}: FMC {' -> '.join(row)}"
             for level, row in self.fmc().items()

@@ -29,10 +29,10 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
-    return [*often, *_behind(outcomes), *_one_verdict(outcomes, criterion)]
+    return [*often, *behind(outcomes), *_one_verdict(outcomes, criterion)]
 
 
-def _behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
+def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield in how many cases a driver fails behind M, where a verdict stands already."""
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:

@@ -235,6 +235,14 @@ def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
     assert not found.worse
 
 
+def test_a_rerun_says_what_fails_behind_m_now(command_line, run, tmp_path):
+    (tmp_path / "ends.py").write_text(
+        "def act(seen):\n    return 0.0 if seen.x_vut_m < 5 else 1 / 0\n"
+    )
+    said = command_line("rerun", run.folder, 0, "--vut", f"{tmp_path / 'ends.py'}:act")
+    assert "  in 1 case an error ends the follow-up, the first in case 0: ZeroDivision" in said.out
+
+
 def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
     command_line, run, tmp_path, monkeypatch
 ):
