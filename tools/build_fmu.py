@@ -64,12 +64,20 @@ int fmi3ExitInitializationMode(Unit* u) { return 0; }
 int fmi3SetFloat64(Unit* u, const unsigned* r, size_t n, const double* v, size_t m) {
     return set(u, r, n, v);
 }
+int fmi3SetFloat32(Unit* u, const unsigned* r, size_t n, const float* v, size_t m) {
+    for (size_t i = 0; i < n; i++) u->v[r[i]] = v[i];
+    return 0;
+}
 int fmi3SetInt64(Unit* u, const unsigned* r, size_t n, const long long* v, size_t m) {
     for (size_t i = 0; i < n; i++) u->v[r[i]] = v[i];
     return 0;
 }
 int fmi3GetFloat64(Unit* u, const unsigned* r, size_t n, double* v, size_t m) {
     return get(u, r, n, v);
+}
+int fmi3GetFloat32(Unit* u, const unsigned* r, size_t n, float* v, size_t m) {
+    for (size_t i = 0; i < n; i++) v[i] = u->v[r[i]];
+    return 0;
 }
 int fmi3GetBoolean(Unit* u, const unsigned* r, size_t n, bool* v, size_t m) {
     for (size_t i = 0; i < n; i++) v[i] = u->v[r[i]] != 0.0;
@@ -89,6 +97,7 @@ NAMES = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps", "acceleration_mps2")
 
 TYPES = {
     "number": ("Real", "Float64"),
+    "single": ("Real", "Float32"),
     "boolean": ("Boolean", "Boolean"),
     "integer": ("Integer", "Int64"),
 }
@@ -97,25 +106,25 @@ MORE = {"merge": (5, "output"), "v_mps": (6, "output"), "seed": (7, "parameter")
 """References and causalities of variables that a unit may have besides."""
 
 
-def description(version: str, names: Sequence[str], more: Mapping[str, str]) -> str:
+def description(version: str, names: Sequence[str], of: str, more: Mapping[str, str]) -> str:
     """Return the modelDescription.xml of four inputs, an output, and more variables by type."""
     second = version == "2.0"
     causalities = dict(zip(names, ["input"] * 4 + ["output"], strict=True))
-    listed = [(name, i, c, "number") for i, (name, c) in enumerate(causalities.items())]
+    listed = [(name, i, c, of) for i, (name, c) in enumerate(causalities.items())]
     listed += [(name, *MORE[name], kind) for name, kind in more.items()]
     variables, outputs = "", ""
     for index, (name, reference, causality, kind) in enumerate(listed, start=1):
-        of = TYPES[kind][not second]
+        tag = TYPES[kind][not second]
         start = "" if causality == "output" else ' start="0"'
-        continuous = causality != "parameter" and kind == "number"
+        continuous = causality != "parameter" and kind in ("number", "single")
         variability = "continuous" if continuous else "discrete"
         variability = "fixed" if causality == "parameter" else variability
         head = f'name="{name}" valueReference="{reference}" causality="{causality}"'
         head += f' variability="{variability}"'
         variables += (
-            f"<ScalarVariable {head}><{of}{start}/></ScalarVariable>"
+            f"<ScalarVariable {head}><{tag}{start}/></ScalarVariable>"
             if second
-            else f"<{of} {head}{start}/>"
+            else f"<{tag} {head}{start}/>"
         )
         if causality == "output":
             of_2, of_3 = f'<Unknown index="{index}"/>', f'<Output valueReference="{reference}"/>'
@@ -157,11 +166,13 @@ def build_fmu(
     version: str = "2.0",
     names: Sequence[str] = NAMES,
     fault: str = "",
+    kind: str = "number",
     **more: str,
 ) -> Path:
     """Write the FMU; `fault` is C that runs in the fourth step of an episode with v_POV > 30.
 
-    `more` are types of further variables, as `merge="boolean"`: "number", "boolean", "integer".
+    `kind` is the type of state and acceleration, `more` are those of further variables, as
+    `merge="boolean"`: names of `TYPES`.
     """
     found = compiler()
     if found is None:
@@ -173,7 +184,7 @@ def build_fmu(
             [found, "-shared", "-fPIC", "-w", "-o", str(library), str(source), "-lm"], check=True
         )
         with zipfile.ZipFile(path, "x") as archive:
-            archive.writestr("modelDescription.xml", description(version, names, more))
+            archive.writestr("modelDescription.xml", description(version, names, kind, more))
             binaries = "linux64" if version == "2.0" else "x86_64-linux"
             archive.write(library, f"binaries/{binaries}/vut.so")
     return path

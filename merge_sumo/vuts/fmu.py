@@ -23,7 +23,7 @@ MERGE: Final = "merge"
 SEED: Final = "seed"
 """What a unit need not have: an output, whether to merge, and an input or a parameter."""
 NAMES: Final = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
-_FLOATS: Final = ("Real", "Float64")
+_FLOATS: Final = ("Real", "Float64", "Float32")
 _BOOLEAN: Final = "Boolean"
 _INTEGERS: Final = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
 
@@ -97,11 +97,13 @@ class Unit:
             output = self._checked(variables, names.get(OUTPUT, OUTPUT))
         wish = optional(MERGE, "output", (*_FLOATS, _BOOLEAN))
         self.seed = optional(SEED, "input parameter", (*_FLOATS, *_INTEGERS))
-        self.input_places = [place for place, _ in inputs]
-        self.input_references = [variable.valueReference for _, variable in inputs]
-        self.output_references = [output.valueReference]
-        self.wish_references = [] if wish is None else [wish.valueReference]
-        self.wish_is_number = wish is not None and wish.type in _FLOATS
+        self.output, self.wish = output, wish
+        self.inputs: dict[str, tuple[list[int], list[int]]] = {}
+        """Places in the state and references, by type: a unit takes those of a type at once."""
+        for place, variable in inputs:
+            places, references = self.inputs.setdefault(variable.type, ([], []))
+            places.append(place)
+            references.append(variable.valueReference)
 
     def _checked(
         self, variables: dict[str, Any], name: str, types: tuple[str, ...] = _FLOATS
@@ -116,6 +118,8 @@ class Unit:
                 f"the variable {name!r} of {self._path} is a {variable.type}: it must be a "
                 f"{either(types)}"
             )
+        if variable.dimensions:
+            raise UserError(f"the variable {name!r} of {self._path} is an array: name a number")
         return variable
 
     @cached_property
@@ -193,15 +197,12 @@ class FmuVut(PerCorridor):
         instance, unit = self._instances[corridor], self._unit
         self._set(instance, seen)
         instance.doStep(seen.t_s, DT_S)
-        read = instance.getReal if unit.version == "2" else instance.getFloat64
-        acceleration = float(read(unit.output_references)[0])
+        acceleration = float(_value(instance, unit.output))
         if unit.reaches:
             acceleration = (acceleration - seen.v_vut_mps) / DT_S
-        if not unit.wish_references:
+        if unit.wish is None:
             return acceleration
-        if unit.wish_is_number:
-            return acceleration, as_merge(float(read(unit.wish_references)[0]))
-        return acceleration, bool(instance.getBoolean(unit.wish_references)[0])
+        return acceleration, as_merge(float(_value(instance, unit.wish)))
 
     def close(self) -> None:
         """Free the instances and remove the unpacked unit."""
@@ -210,10 +211,13 @@ class FmuVut(PerCorridor):
         self._unit.remove()
 
     def _set(self, instance: Any, seen: Seen) -> None:
-        unit = self._unit
-        values = [seen[1 + place] for place in unit.input_places]
-        write = instance.setReal if unit.version == "2" else instance.setFloat64
-        write(unit.input_references, values)
+        for kind, (places, references) in self._unit.inputs.items():
+            getattr(instance, f"set{kind}")(references, [seen[1 + place] for place in places])
+
+
+def _value(instance: Any, variable: Any) -> Any:
+    """Return the value of a variable; those of FMPy's instances are read by type."""
+    return getattr(instance, f"get{variable.type}")([variable.valueReference])[0]
 
 
 def _free(instance: Any) -> None:

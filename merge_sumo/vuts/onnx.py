@@ -29,6 +29,8 @@ WISH: Final = 1
 Decision = float | tuple[float, bool]
 """An acceleration, or it and whether to merge."""
 _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+_ANSWERS: Final = (*_DTYPES, "tensor(float16)")
+"""Types of outputs: an integer would be the index of an action, or a class, and no acceleration."""
 _SEEDS: Final[dict[str, Any]] = {**_DTYPES, "tensor(int64)": np.int64}
 
 
@@ -86,7 +88,18 @@ class Network:
                 f"{', '.join(STATE)}"
             )
         self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
-        outputs = self.run((0.0, 0.0, 0.0, 0.0))
+        output = self._session.get_outputs()[0]
+        if output.type not in _ANSWERS:
+            raise UserError(
+                f"{path} gives {output.name} {output.type}, and a VUT gives floats: the index of "
+                f"an action is no acceleration, so let the network give the {ACTIONS} values of "
+                "actions without ArgMax, or run it in a VUT in Python (FILE.py:CLASS) that answers "
+                "the acceleration of its action in m/s2"
+            )
+        try:
+            outputs = self.run((0.0, 0.0, 0.0, 0.0))
+        except Exception as error:
+            raise UserError(f"{path} cannot be run with an input (1, 4): {error}") from error
         if outputs.size not in (1, ACTIONS, 1 + WISH, ACTIONS + WISH):
             raise UserError(
                 f"{path} gives {outputs.size} numbers: a VUT gives one acceleration, or "

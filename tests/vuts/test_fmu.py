@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import tempfile
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from build_fmu import NAMES, build_fmu, compiler
+from build_fmu import NAMES, build_fmu, compiler, description
 from conftest import require, some
 from vut_contract import (
     LEVEL0_CLASS,
@@ -56,6 +57,26 @@ def test_an_fmu_drives_like_the_same_law_in_python_and_leaves_nothing(
         assert one.error is None
         assert np.array_equal(one.motion, other.motion)
     assert list(scratch.iterdir()) == []
+
+
+def test_variables_of_32_bits_are_as_good_as_those_of_64(unit):
+    cases = cases_of(6)
+    # An output of each kind: the speed reached would hide a wrong acceleration.
+    single = {
+        "acceleration": unit("3.0", kind="single", seed="single"),
+        "speed": unit("3.0", kind="single", v_mps="single"),
+        "speed alone": unit("3.0", v_mps="single"),
+    }
+    expected = run_cases(in_process(f"fmu:{unit('3.0')}"), cases)
+    for name, path in single.items():
+        for one, other in zip(run_cases(in_process(f"fmu:{path}"), cases), expected, strict=True):
+            assert one.error is None, name
+            assert one.motion[1:] == pytest.approx(other.motion[1:], abs=1e-3), name
+    lane = in_process(f"fmu:{unit('3.0', kind='single', merge='single')}")(2)
+    begin(lane)
+    assert lane.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
+    assert lane.wishes().tolist() == [STAY, MERGE]
+    lane.close()
 
 
 @pytest.mark.parametrize(
@@ -105,9 +126,17 @@ def test_a_binary_that_crashes_ends_its_own_case_alone(unit, version, fault, rea
 def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
     (tmp_path / "text.fmu").write_text("no unit")
     good, other = unit(), unit(names=("a", "b", "c", "d", "e"))
+    head = 'name="acceleration_mps2" valueReference="4" causality="output" variability="continuous"'
+    array = f'<Float64 {head}><Dimension start="3"/></Float64>'
+    with zipfile.ZipFile(tmp_path / "array.fmu", "x") as archive:
+        described = description("3.0", NAMES, "number", {})
+        assert f"<Float64 {head}/>" in described
+        described = described.replace(f"<Float64 {head}/>", array)
+        archive.writestr("modelDescription.xml", described)
     for spec, said in {
         tmp_path / "nothing.fmu": "there is no FMU",
         tmp_path / "text.fmu": "is no readable FMU",
+        tmp_path / "array.fmu": "is an array: name a number",
         other: "has none of the inputs",
         f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",
         f"{good}?v_vut_mps=wrong": "has no variable 'wrong'",

@@ -85,6 +85,9 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     network(tmp_path / "three.onnx", answer=[0.0, 1.0, 0.0])
     network(tmp_path / "word.onnx", answer=[0.0], seed=(onnx.TensorProto.INT32, [1]))
     network(tmp_path / "pair.onnx", answer=[0.0], seed=(onnx.TensorProto.INT64, [2]))
+    network(tmp_path / "flat.onnx", answer=[0.0], shape=[4])
+    network(tmp_path / "index.onnx", answer=[0, 0, 3, 0, 1], last="ArgMax")
+    network(tmp_path / "truth.onnx", answer=[0.0], last="IsNaN")
     good = network(tmp_path / "good.onnx", answer=[0.0])
     for spec, said in {
         tmp_path / "nothing.onnx": "there is no ONNX file",
@@ -93,6 +96,9 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
         tmp_path / "three.onnx": "gives 3 numbers",
         tmp_path / "word.onnx": "has the input seed tensor(int32) [1]: it is one number",
         tmp_path / "pair.onnx": "has the input seed tensor(int64) [2]: it is one number",
+        tmp_path / "flat.onnx": "cannot be run with an input (1, 4)",
+        tmp_path / "index.onnx": "gives answer tensor(int64), and a VUT gives floats: the index of",
+        tmp_path / "truth.onnx": "gives answer tensor(bool), and a VUT gives floats",
         f"{good}?decision_period_s=0": "decision_period_s is '0'",
         f"{good}?decision_period_s=often": "decision_period_s is 'often'",
         f"{good}?period=1": "there is no option 'period'",
