@@ -91,7 +91,7 @@ from merge_sumo.system.folders import (
     write_new,
 )
 from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import to_plain
+from merge_sumo.system.records import check_toml_size, to_plain
 from merge_sumo.system.result import Shown
 from merge_sumo.verdict.conflict import check_from
 from merge_sumo.verdict.episode import Episode
@@ -197,12 +197,15 @@ def _new_files(asked: verbs.Rerun | verbs.Compare) -> tuple[Path | None, Path | 
 
 def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
     """Write the page, or the cases file of now, and JUnit, where they are asked for."""
+    text = compared.text
+    if out is not None and text is not None:
+        check_toml_size(text.encode(errors="backslashreplace"), out)
     if junit is not None:
         write_junit_of_comparison(junit, compared)
     if out is None:
         return compared
-    text = comparison_page(compared) if compared.text is None else compared.text
-    write_new(out, text.encode(errors="backslashreplace"))
+    page = comparison_page(compared) if text is None else text
+    write_new(out, page.encode(errors="backslashreplace"))
     return replace(compared, page_command="")
 
 

@@ -26,7 +26,14 @@ from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import GOT_WORSE, Change, ComparedCase, Comparison, passes, short
 from merge_sumo.system.folders import make_place, write_new
 from merge_sumo.system.printable import printable
-from merge_sumo.system.records import Record, convert, read_toml, to_json, toml_value
+from merge_sumo.system.records import (
+    Record,
+    check_toml_size,
+    convert,
+    read_toml,
+    to_json,
+    toml_value,
+)
 from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.chance import one_per_case
@@ -75,10 +82,12 @@ class CasesFile(Run):
             self.criterion.check(scenario)
             del record["cases"]
             self._take(path, {**record, "scenario": scenario.to_record()}, path)
-            self.outcomes, self.tolerance, self.torn = [], head.tolerance, False
+            self.tolerance, self.torn = head.tolerance, False
+            self._by_index = dict[int, Outcome]()
             self.accepted = dict[int, str]()
             for line in head.cases:
                 self._add(line)
+            self.outcomes = list(self._by_index.values())
         except UserError as error:
             at = f"case {line.get('index')!r:.40}: " if line else ""
             raise UserError(f"the cases file {path}: {at}{error}") from error
@@ -99,19 +108,18 @@ class CasesFile(Run):
             raise UserError(f"verdict is {verdict!r:.60}, but by margin and end it is {judged}")
         if accepted is not None and not (isinstance(accepted, str) and accepted.strip()):
             raise UserError(f"accepted is {accepted!r:.60}: it must be a reason")
-        if any(outcome.index == known.index for known in self.outcomes):
+        if outcome.index in self._by_index:
             raise UserError("its index is there twice")
         if sentences := outside_of_the_pool(outcome.case):
             raise UserError(sentences[0].removeprefix("note: "))
-        self.outcomes.append(outcome)
+        self._by_index[outcome.index] = outcome
         self.accepted |= {outcome.index: accepted} if accepted else {}
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the file has no such case."""
-        found = {outcome.index: outcome for outcome in self.outcomes}
-        if index not in found:
+        if index not in self._by_index:
             raise UserError(f"{self.folder} has no case {index}")
-        return found[index]
+        return self._by_index[index]
 
     def judged(self, compared: Comparison, path: Path) -> Comparison:
         """Return a comparison of cases by what the file allows; its text is that for a path."""
@@ -183,9 +191,11 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
     """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
+    content = cases_toml(run, outcomes, path, run.settings.vut).encode()
+    check_toml_size(content, path)
     if path != target:
         make_place(target)
-    write_new(path, cases_toml(run, outcomes, path, run.settings.vut).encode())
+    write_new(path, content)
     return path
 
 

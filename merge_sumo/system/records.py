@@ -53,6 +53,7 @@ WORDS: Final[dict[Any, str]] = {
 }
 """Types of fields in words; another type is a table of names and values."""
 MAX_TOML_BYTES: Final = 1 << 20
+"""A larger file is not read, and so not written: some 6,000 cases."""
 _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
 
 
@@ -170,8 +171,10 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     Raises `UserError` where it cannot be read or is no TOML.
     """
     try:
-        if not path.is_file() or path.stat().st_size > MAX_TOML_BYTES:
-            raise UserError(f"cannot read the {what} {path}: it is no file, or a giant one")
+        if not path.is_file():
+            raise UserError(f"cannot read the {what} {path}: it is no file")
+        if (size := path.stat().st_size) > MAX_TOML_BYTES:
+            raise UserError(f"cannot read the {what} {path}: {_too_large(size)}")
         text = path.read_text(encoding="utf-8")
     except OSError as error:
         raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
@@ -181,6 +184,16 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
         return text, tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"the {what} {path} is no TOML: {error}") from error
+
+
+def check_toml_size(content: bytes, path: Path) -> None:
+    """Raise `UserError` where a file of this content is one that `read_toml` refuses."""
+    if len(content) > MAX_TOML_BYTES:
+        raise UserError(f"cannot write {path}: {_too_large(len(content))}; name fewer cases")
+
+
+def _too_large(size: int) -> str:
+    return f"it has {size:,} bytes, and at most {MAX_TOML_BYTES:,} are read"
 
 
 def toml_value(value: object) -> str:
