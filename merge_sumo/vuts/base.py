@@ -121,6 +121,8 @@ class Vut:
     vut_type: Mapping[str, str] | None = None
     """Attributes of the SUMO vType with which SUMO itself drives; None if it does not."""
     files: tuple[Path, ...] = ()  # files of the user's that it is made of, as far as they are known
+    data: tuple[Path, ...] = ()
+    """Of the files those that are no code: it has read them, and may write them as it drives."""
     parameters: Mapping[str, float] | None = None
     """Numbers that its spec may set, with their present values; None where its driver has them."""
     no_pov: str = ""  # why it cannot drive a POV; "" where it can

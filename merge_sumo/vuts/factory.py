@@ -12,7 +12,7 @@ from typing import Any
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import Files, hashed
-from merge_sumo.system.printable import quoted
+from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.trust import check_code
 from merge_sumo.system.workers import workers_or_cores
@@ -88,13 +88,13 @@ class VutFactory:
     def __call__(self, corridors: int, world: object = None) -> Driver:
         """Return a driver for corridors 0 to `corridors` - 1 of a world of SUMO, if there is one.
 
-        Raises `UserError` where the files of the VUT have changed since this was made.
+        Raises `UserError` where the code of the VUT has changed since this was made.
         """
-        then, now = self.files or {}, hashed(self.vut.files)
-        if set(then.values()) != set(now.values()):
+        then, now = self.files or {}, hashed(set(self.vut.files) - set(self.vut.data))
+        if other := [name for name, sha256 in now.items() if sha256 not in then.values()]:
             raise UserError(
-                f"the files of the VUT {self.spec} are not those with which this began: let them "
-                "be while it runs, and let all workers have the same"
+                f"{printable(other[0])}, code of the VUT {self.spec}, is not as it was when this "
+                "began: let it be while it runs, and let all workers have the same"
             )
         return self.vut.make(corridors, world)
 

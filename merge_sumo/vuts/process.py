@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shlex
 import shutil
@@ -10,6 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
@@ -124,6 +126,24 @@ def split_command(command: str) -> list[str]:
             "you would in a terminal"
         )
     return arguments
+
+
+CODE_FOLLOWS: Final = ("-c", "-e", "-m")
+"""Behind these an interpreter is given its code by name or as a text."""
+
+
+def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
+    """Return the files of a command that are code: others are what it reads and writes.
+
+    These are its program and, where that is one that this machine has for all, as an interpreter,
+    the first file behind it.
+    """
+    program, *others = arguments
+    words = [program]
+    if shutil.which(Path(program).name) is not None:
+        options = itertools.takewhile(lambda word: word not in CODE_FOLLOWS, others)
+        words += itertools.islice(filter(os.path.isfile, options), 1)
+    return tuple(filter(Path.is_file, map(Path, words)))
 
 
 class Program:

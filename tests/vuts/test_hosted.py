@@ -19,9 +19,11 @@ from misbehaviours import STUBBORN
 from processes import none_left, wait_for
 
 from merge_sumo.drivers.base import Scene, VutLostError
+from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23, as_merge, lane_of
 from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import HostedVut
 from merge_sumo.vuts.process import append
@@ -103,6 +105,25 @@ def Vut(seen):
             assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
     finally:
         vut.close()
+
+
+def test_what_it_reads_may_be_its_to_write_and_its_code_is_not(spec, tmp_path):
+    (tmp_path / "helper.py").touch()
+    count = tmp_path / "count.txt"
+    count.write_text("1")
+    source = """
+import pathlib, helper
+COUNT = pathlib.Path(__file__).with_name("count.txt").read_text()
+def Vut(seen):
+    return 1.0
+"""
+    factory = VutFactory.of(spec(source))
+    assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py", "count.txt"}
+    count.write_text("2")
+    factory(1).close()
+    (tmp_path / "helper.py").write_text("changed = True")
+    with pytest.raises(UserError, match=r"helper\.py, code of the VUT .*, is not as it was"):
+        factory(1)
 
 
 def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):

@@ -257,6 +257,30 @@ def test_a_command_that_never_connects_is_told_how():
         run_cases(factory("traci:" + command, connect_s=0.3), cases_of(1))
 
 
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("{python} -u c.py {{port}} log.txt", "c.py"),
+        ("{python} -c pass log.txt", None),
+        ("./controller log.txt", "controller"),
+    ],
+)
+def test_only_code_must_stay_as_it_is_while_it_runs(command, code, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("c.py", "log.txt", "controller"):
+        Path(name).write_text("print(1)\n", encoding="utf-8")
+    Path("controller").chmod(0o755)
+    vut = factory("traci:" + command.format(python=Path(sys.executable).name), connect_s=0.1)
+    assert list(vut.files) == [code] * (code is not None)
+    Path("log.txt").write_text("a line of the controller's\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"no TraCI client connected|before it connected|started"):
+        run_cases(vut, cases_of(1))
+    if code is not None:
+        Path(code).write_text("print(2)\n", encoding="utf-8")
+        with pytest.raises(UserError, match=f"{code}, code of the VUT .* is not as it was"):
+            vut(1)
+
+
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
     for port in ("0", "70000"):
         with pytest.raises(UserError, match="the port is a number"):

@@ -28,16 +28,21 @@ class LoadedFiles:
         """Listen; there is no way to stop that, so make one in a process of its own."""
         self._read: set[str] = set()
         self._written: set[str] = set()
+        self._libraries: set[str] = set()
         self._not_theirs = tuple(f"{folder}{os.sep}" for folder in _not_theirs())
         self._before = set(sys.modules)
         sys.addaudithook(self._audit)
 
     def files(self) -> set[str]:
         """Return the paths of the files so far."""
+        return self.code() | set(filter(self._is_theirs, self._read - self._written))
+
+    def code(self) -> set[str]:
+        """Return those of modules and libraries."""
         modules: list[Any] = [m for n, m in list(sys.modules.items()) if n not in self._before]
         imported = [str(getattr(module, "__file__", None) or "") for module in modules]
         sources = {os.path.realpath(file) for file in imported if file}
-        return {path for path in sources | self._read - self._written if self._is_theirs(path)}
+        return set(filter(self._is_theirs, sources | self._libraries))
 
     def _is_theirs(self, path: str) -> bool:
         # Compiled modules stand for their sources, which are in `sys.modules`.
@@ -49,14 +54,14 @@ class LoadedFiles:
             return
         if event == "open":
             path, mode, flags = arguments
+            reads = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) == 0
+            files = self._read if reads and not set(mode or "") & set("wax+") else self._written
         elif event == "ctypes.dlopen":
-            path, mode, flags = *arguments, None, os.O_RDONLY
+            (path,), files = arguments, self._libraries
         else:
             return
         if not isinstance(path, str | bytes):
             return  # a descriptor, opened before
-        reads = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR) == 0
-        files = self._read if reads and not set(mode or "") & set("wax+") else self._written
         with suppress(OSError, ValueError):  # the name is none; the VUT shall hear it from `open`
             files.add(os.path.realpath(os.fsdecode(path)))
 

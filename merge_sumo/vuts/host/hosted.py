@@ -76,6 +76,7 @@ def hosted_vut(spec: VutSpec, options: VutOptions, alike: VutSpec) -> Vut:
         max_corridors=facts.max_corridors,
         max_workers=facts.max_workers,
         files=tuple(map(Path, facts.files)),
+        data=tuple(map(Path, facts.data)),
     )
 
 

@@ -102,11 +102,16 @@ class _Hosting:
         kind = KINDS[asked.spec.kind]
         self._loaded = LoadedFiles()
         self._vut = kind.prepare(asked.spec, options)
-        return Facts(self._vut.max_corridors, self._vut.max_workers, self._files())
+        files = self._files()
+        data = sorted(set(files) - self._named() - self._loaded.code())
+        return Facts(self._vut.max_corridors, self._vut.max_workers, files, data)
 
     def _files(self) -> list[str]:
+        return sorted(self._named() | self._loaded.files())
+
+    def _named(self) -> set[str]:
         assert self._vut is not None, "opened first"  # noqa: S101
-        return sorted({str(file.resolve()) for file in self._vut.files} | self._loaded.files())
+        return {str(file.resolve()) for file in self._vut.files}
 
     def _act(self, driver: Driver, content: bytes) -> bytes:
         begun, scene = wire.unpack_scene(content)

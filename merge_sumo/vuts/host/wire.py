@@ -115,6 +115,7 @@ class Facts(msgspec.Struct, frozen=True):
     max_corridors: int | None
     max_workers: int | None
     files: list[str]
+    data: list[str]
 
 
 class Lost(msgspec.Struct, frozen=True):

@@ -15,7 +15,6 @@ import socket
 import sys
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
-from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
@@ -34,7 +33,7 @@ from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
-from merge_sumo.vuts.process import GRACE_S, Program, append, split_command
+from merge_sumo.vuts.process import GRACE_S, Program, append, code_of, split_command
 from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door
 from merge_sumo.vuts.traci.server import FaultError
@@ -60,7 +59,7 @@ def traci_vut(spec: VutSpec, options: VutOptions) -> Vut:
             raise UserError(f"{spec}: the port is a number from 1 to 65535")
     else:
         command = split_command(spec.argument)
-    files = tuple(Path(word) for word in command or () if Path(word).is_file())
+    files = code_of(command) if command else ()
     for file in files:
         check_code(file)
 
