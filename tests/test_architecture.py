@@ -346,6 +346,24 @@ def test_no_file_runs_a_shell_or_hidden_code_follows_an_entity_or_listens_beyond
     assert {module: calls for module, calls in found.items() if calls} == {}
 
 
+def set_on_others(source: str, room: str) -> set[str]:
+    """Return the attributes that a source sets on what it imports from another room."""
+    nodes = nodes_of(source)
+    froms = [n for n in nodes if isinstance(n, ast.ImportFrom) and n.module]
+    others = [n for n in froms if layer_of(str(n.module)) not in {room, ""}]
+    names = {alias.asname or alias.name for n in others for alias in n.names}
+    set_here = [n for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)]
+    return {ast.unparse(n) for n in set_here if ast.unparse(n.value) in names}
+
+
+def test_what_a_room_has_is_whole_before_another_is_imported():
+    added = "from merge_sumo.scenario.scenario import MergeScenario\nMergeScenario.measures = None"
+    assert set_on_others(added, "verdict") == {"MergeScenario.measures"}
+    assert set_on_others(added, "scenario") == set()
+    found = {f: set_on_others(f.read_text("utf-8"), layer_of(module_of(f))) for f in FILES}
+    assert {file: names for file, names in found.items() if names} == {}
+
+
 LINES_OF_A_FILE = 600
 LINES_OF_A_FUNCTION = 60
 

@@ -196,13 +196,10 @@ class Scenario:
     """Name of the kind in `SCENARIO_KINDS`."""
     case_type: ClassVar[type[Any]]
     """The `Case` of the kind."""
-    measures: ClassVar[Callable[..., Any]]
+    measures: ClassVar[Callable[..., Any] | None]
     """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
     lines of the road (None: nothing is measured before M), and whether the last way out is searched
-    for."""
-    score: ClassVar[Callable[..., Any] | None] = None
-    """Gives the score of the paper's criterion by a trajectory, the same as `measures`, in less
-    time; None where a kind has no such function."""
+    for. None where it is a merge, which `verdict/score.py` measures."""
     levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
     """POV levels that the kind has."""
     notation: ClassVar[Mapping[str, Notation]]
@@ -415,6 +412,7 @@ class MergeScenario(Scenario):
     """
 
     kind: ClassVar[str] = "merge"
+    measures: ClassVar[Callable[..., Any] | None] = None
     notation: ClassVar[Mapping[str, Notation]] = {
         "x_pov0_m": Notation("x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
         "v_pov0_mps": Notation("v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),

@@ -30,6 +30,7 @@ from merge_sumo.verdict.score import (
     Outcome,
     margin_of,
     measure,
+    merge_score,
 )
 from merge_sumo.verdict.severity import Severity
 from merge_sumo.verdict.temporal import check_formula, robustness, try_formula
@@ -156,9 +157,9 @@ class Criterion:
 
     def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
         """Return the verdict on an episode, the same as that of its outcome."""
-        score = trajectory.case.scenario.score
-        if self.is_papers and score is not None:
-            found = CaseVerdict(margin_of(score(trajectory)), trajectory.end.is_tested)
+        if self.is_papers and trajectory.case.scenario.measures is None:
+            # The score of a merge takes less time than all of its measures.
+            found = CaseVerdict(margin_of(merge_score(trajectory)), trajectory.end.is_tested)
             return found._replace(is_tested=found.is_tested or found.failed)
         return self.judged(trajectory, lines).verdict
 

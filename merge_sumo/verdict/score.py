@@ -22,7 +22,6 @@ from merge_sumo.scenario.scenario import (
     POV,
     VEHICLES,
     VUT,
-    MergeScenario,
     Scenario,
     Vehicle,
     lane_of,
@@ -353,9 +352,8 @@ def measure_all(
     """Return the same of episodes of one scenario, which takes less time than one by one."""
     if not trajectories:
         return []
-    measured = trajectories[0].case.scenario.measures(
-        trajectories, lines, avoidability=avoidability
-    )
+    of_kind = trajectories[0].case.scenario.measures or measure_merges
+    measured = of_kind(trajectories, lines, avoidability=avoidability)
     if not further_measures():
         return list(measured)
     return [
@@ -504,7 +502,3 @@ def _post_encroachment_time(trajectory: Trajectory) -> float | None:
         t_pov = trajectory.t_end_s - float(x_pov_m[-1]) / v_end
     assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
     return abs(t_pov - t_vut)
-
-
-MergeScenario.measures = staticmethod(measure_merges)
-MergeScenario.score = staticmethod(merge_score)
