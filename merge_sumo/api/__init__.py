@@ -31,7 +31,7 @@ from merge_sumo.api.asked import (
     stated_again,
     today,
 )
-from merge_sumo.api.campaigns import concluded, notice_untrained
+from merge_sumo.api.campaigns import concluded, notice_povs
 from merge_sumo.api.cases import given_case, recorded_case
 from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.verb import verb
@@ -118,7 +118,7 @@ def campaign(asked: verbs.Campaign) -> CampaignRun:
     settings, where = settings_for(asked)
     folder = dated(settings.vut) if asked.out is None else Path(asked.out)
     plan = resolve(settings)
-    notice_untrained(settings, plan, asked)
+    notice_povs(settings, plan, asked)
     return concluded(settings, plan, folder, where, asked)
 
 

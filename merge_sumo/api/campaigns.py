@@ -20,7 +20,14 @@ from merge_sumo.errors import notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
 from merge_sumo.reports.report import check_report, write_report
-from merge_sumo.scenario.scenario import LEVELS, MergeScenario, Scenario, level_name
+from merge_sumo.scenario.scenario import (
+    LEVELS,
+    OWN,
+    MergeScenario,
+    Scenario,
+    lane_of,
+    level_name,
+)
 from merge_sumo.studies.counterfactuals import AVOIDANCE, avoidance
 from merge_sumo.studies.explanation import note_explanation
 from merge_sumo.studies.share import note_shares
@@ -114,10 +121,8 @@ def _write_findings(
     write_report(done, result.summary, counted("surrogates of the report", "levels"))
 
 
-def notice_untrained(
-    settings: CampaignSettings, plan: SimulationPlan, asked: verbs.Campaign
-) -> None:
-    """Warn with a `Notice` where learned POVs are missing, or were not trained on the scenario."""
+def notice_povs(settings: CampaignSettings, plan: SimulationPlan, asked: verbs.Campaign) -> None:
+    """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT."""
     levels = set(LEVELS) & set(settings.scenario.levels)
     if asked.level == "all" and not levels <= set(settings.levels):
         present = ", ".join(map(level_name, settings.levels))
@@ -131,4 +136,12 @@ def notice_untrained(
         notice(
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
             f"`merge-sumo scenario check {quoted(name)}{option}` says in what it differs"
+        )
+    own, by_sumo = plan.povs.own, plan.vut.vut.vut_type is not None
+    on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None
+    if on_lane and own is not None and own.vut.vut_type is not None and not by_sumo:
+        # SUMO's drivers make room for a car beside them where its lane-change model asks them to.
+        notice(
+            f"note: until the VUT has merged, the POV {own.spec} keeps its speed: on an "
+            "acceleration lane SUMO's drivers see only a VUT that SUMO drives, too (sumo:MODEL)"
         )

@@ -145,7 +145,9 @@ class World:
             except libsumo.TraCIException as error:
                 said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
                 reason = said.removeprefix("Error: ") or error
-                raise UserError(f"SUMO cannot load the net {self.road.path}: {reason}") from error
+                raise UserError(
+                    f"SUMO cannot load the net {self.road.path} and its vehicle types: {reason}"
+                ) from error
         vehicle = libsumo.vehicle
         self._add, self._remove = vehicle.add, vehicle.remove
         names = VEHICLES[: self.vehicles]

@@ -88,6 +88,18 @@ class Network:
                 f"{', '.join(STATE)}"
             )
         self._input, self._dtype = inputs[0].name, _DTYPES[inputs[0].type]
+        self._check_output(path)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        text = period_s or metadata.get(PERIOD) or str(DT_S)
+        try:
+            self.period_steps = round(float(text) / DT_S)
+        except (ValueError, OverflowError):
+            self.period_steps = 0
+        if self.period_steps < 1:
+            raise UserError(f"{path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
+
+    def _check_output(self, path: Path) -> None:
+        """Raise `UserError` where the network does not run, or its output is none of a VUT."""
         output = self._session.get_outputs()[0]
         if output.type not in _ANSWERS:
             raise UserError(
@@ -106,14 +118,6 @@ class Network:
                 f"{ACTIONS} values of actions, from the hardest braking to the hardest "
                 "acceleration, and perhaps one number more, which is whether to merge"
             )
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        text = period_s or metadata.get(PERIOD) or str(DT_S)
-        try:
-            self.period_steps = round(float(text) / DT_S)
-        except (ValueError, OverflowError):
-            self.period_steps = 0
-        if self.period_steps < 1:
-            raise UserError(f"{path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
 
     def run(self, state: tuple[float, ...], seed: int = 0) -> np.ndarray[Any, Any]:
         """Return the flat output for one state, and a seed for a network that takes one."""

@@ -29,6 +29,17 @@ SHARED_OPTIONS: Final = {
     *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
     *("jmAdvance",),
 }
+LANE_CHANGE_OPTIONS: Final = {
+    *("lcStrategic", "lcStrategicLookahead", "lcLookaheadLeft", "lcAssertive", "lcSigma"),
+    *("lcCooperative", "lcCooperativeSpeed", "lcCooperativeMinSpeed", "lcCooperativeRoundabout"),
+    *("lcCooperativeHelpTime", "lcCooperativeHelpThreshold"),
+    *("lcSpeedGain", "lcSpeedGainRight", "lcSpeedGainLookahead", "lcSpeedGainRemainTime"),
+    *("lcKeepRight", "lcKeepRightAcceptanceTime", "lcContRight", "lcOpposite", "lcOvertakeRight"),
+    *("lcOvertakeDeltaSpeedFactor", "lcMaxSpeedLatStanding", "lcMaxSpeedLatFactor"),
+    "lcMaxDistLatStanding",
+}
+"""Those of SUMO's lane-change model LC2013; -1 turns some of them off. The others that SUMO knows
+are of its sublane model, which does not drive here."""
 ACC_OPTIONS: Final = {
     *("speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
     *("gapControlGainSpeed", "gapControlGainSpace", "collisionAvoidanceGainSpeed"),
@@ -67,13 +78,14 @@ def sumo_vut(spec: VutSpec, _options: VutOptions) -> Vut:
     if model not in MODELS:
         raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
     own, defaults = MODELS[model]
-    known = SHARED_OPTIONS | own
+    known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
     chosen = spec.numbers()
     for name, value in chosen.items():
         if name not in known:
             raise spec.has_no(name, known)
-        if value < 0.0:
-            raise UserError(f"{spec}: {name} is {value}: give a number from 0 up")
+        least = -1 if name in LANE_CHANGE_OPTIONS else 0
+        if value < least:
+            raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
 
     def make(corridors: int, world: object) -> Driver:
         if not isinstance(world, World):

@@ -16,6 +16,7 @@ from plans import plan_for
 from processes import none_left
 from vut_contract import cases_of, factory
 
+from merge_sumo.api import open_run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
@@ -219,3 +220,25 @@ class TestACampaign:
             assert_refused(call(command, "--vut", "design1", *arguments), said)
         left = {path.name for path in Path().iterdir()} - {"__pycache__"}
         assert left == {"my_pov.py"}
+
+
+@pytest.mark.parametrize(
+    ("vut", "named", "scenario", "is_said"),
+    [
+        ("gap", "sumo:IDM", "us23-lane", True),
+        ("sumo:Krauss", "sumo:IDM", "us23-lane", False),
+        ("gap", "sumo:IDM", "us23", False),
+        ("gap", "my_pov.py:Pov", "us23-lane", False),
+    ],
+)
+def test_a_campaign_says_where_a_pov_of_sumo_does_not_see_the_vut(
+    call, vut, named, scenario, is_said
+):
+    pov(KEEPS)
+    asked = ("--vut", vut, "--pov", named, "--level", "own", "--scenario", scenario, *FEW)
+    code, _, err = call("campaign", *asked, "--out", "run", "--quiet")
+    assert code == 0
+    said = "until the VUT has merged, the POV sumo:IDM keeps its speed"
+    assert (said in err) is is_said
+    slowed = [one.measures.pov_slowdown_mps > 1e-6 for one in open_run("run").run.outcomes]
+    assert not (is_said and any(slowed))

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 from vut_contract import cases_of, factory, run_cases, run_on
@@ -13,8 +16,9 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
+from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.world import World
-from merge_sumo.vuts.sumo_model import MODELS
+from merge_sumo.vuts.sumo_model import LANE_CHANGE_OPTIONS, MODELS
 
 FREE = MergeCase(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
 """The POV is gone before the VUT arrives."""
@@ -63,6 +67,48 @@ def test_what_sumo_does_not_have_is_refused_in_a_sentence(spec, said):
     with pytest.raises(UserError, match="sumo:") as refused:
         factory(spec)
     assert said in str(refused.value)
+
+
+OF_SUBLANES = {
+    *("lcSublane", "lcPushy", "lcPushyGap", "lcImpatience", "lcTimeToImpatience", "lcAccelLat"),
+    *("lcTurnAlignmentDistance", "lcLaneDiscipline", "lcSpeedGainUrgency"),
+}
+UNTOLD = {
+    *("lcContRight", "lcCooperativeMinSpeed", "lcCooperativeHelpTime"),
+    "lcCooperativeHelpThreshold",
+}
+"""What SUMO takes, and does not tell."""
+
+
+def test_the_lane_change_attributes_are_those_of_sumos_schema_and_reach_its_model():
+    schema = Path(sumo_program("sumo")).parents[1] / "data" / "xsd" / "types" / "route.xsd"
+    known = set(re.findall(r'name="(\w+)" type', schema.read_text()))
+    assert {name for name in known if name.startswith("lc")} == LANE_CHANGE_OPTIONS | OF_SUBLANES
+    named = "&".join(f"{name}=0.25" for name in sorted(LANE_CHANGE_OPTIONS))
+    with World(1, vut_type=factory(f"sumo:Krauss?{named}").vut.vut_type, scenario=US23) as world:
+        world.place(0, [(-200.0, 30.0), (-182.0, 18.0)])
+        tell, vut = world._libsumo.vehicle.getParameter, world._ids[VUT]
+        told = {name: tell(vut, f"laneChangeModel.{name}") for name in LANE_CHANGE_OPTIONS - UNTOLD}
+    assert set(told.values()) == {"0.25"}
+
+
+def test_lane_change_parameters_decide_where_it_merges():
+    scenario = named_scenario("us23-lane")
+    early, late = (
+        np.mean([t.x_vut_m[-1] for t in run_on(factory(f"sumo:Krauss{named}"), scenario, 0, 20)])
+        for named in ("?lcAssertive=5", "?lcStrategic=0")
+    )
+    assert early + 50.0 < late
+
+
+def test_a_value_that_sumo_refuses_is_refused_in_its_words():
+    for named, said in (
+        ("lcAssertive=-2", "lcAssertive is -2: give a number from -1 up"),
+        ("lcPushy=1", "it has no parameter 'lcPushy': choose from"),
+        ("lcOvertakeDeltaSpeedFactor=3", "Attribute lcOvertakeDeltaSpeedFactor. Must be between"),
+    ):
+        with pytest.raises(UserError, match=re.escape(said)):
+            run_cases(factory(f"sumo:IDM?{named}"), [FREE])
 
 
 @pytest.mark.parametrize("name", ["IDM", "Krauss", "ACC", "EIDM"])
