@@ -74,13 +74,13 @@ def _out(help: str, shown: str | None = None, **more: Any) -> Any:
 
 def _page() -> Any:
     return _out(
-        "New HTML page to write: what changed, and in each such case both motions in one picture.",
+        "New page (.html) to write: what changed, and each such case with both motions.",
         metavar="FILE",
     )
 
 
 def _junit() -> Any:
-    return option(None, Path, "New file to write for CI: JUnit XML.", WHERE, metavar="FILE")
+    return option(None, Path, "New file to write for CI: JUnit XML (.xml).", WHERE, metavar="FILE")
 
 
 def _any_scenario(help: str) -> Any:
@@ -258,7 +258,7 @@ class Probability(Recorded):
         0.95, float, "Chance that the interval holds the probability.", VERDICT
     )
     seed: int = seed_option("Same seed, same cases.")
-    out: AnyPath | None = _out("New file to write.", "RUN/probability.json", metavar="FILE")
+    out: AnyPath | None = _out("New file (.json) to write.", "RUN/probability.json", metavar="FILE")
     engine: str | None = _engine()
 
 
@@ -361,7 +361,8 @@ class Compare(Asked):
     Everything is read from the records. Cases that two campaigns share are paired; where each has
     cases of its own, regions of failures are compared, as a hint.
 
-    Exit code 1 when a case broke, or the last version was tested in no case.
+    Exit code 1 when a case broke, when a version passes in a smaller share of its own cases than
+    the one before it, by Fisher's exact test, or when the last version was tested in no case.
 
     Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
     """

@@ -47,10 +47,10 @@ from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError, notice
 from merge_sumo.options import AnyPath, AnyRun
 from merge_sumo.reports import exports, figures
-from merge_sumo.reports.comparison_page import comparison_page
+from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
-from merge_sumo.reports.junit import write_junit_of_comparison
+from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.reproduction_page import write_reproduction
@@ -68,6 +68,7 @@ from merge_sumo.studies import (
 )
 from merge_sumo.studies import probability as estimates
 from merge_sumo.studies import repair as mending
+from merge_sumo.studies import rerun as rerunning
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import Comparison
@@ -85,6 +86,7 @@ from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
     check_new,
+    check_new_file,
     check_own,
     dated,
     make_folder,
@@ -175,23 +177,30 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     """Run recorded cases again with a changed VUT."""
     before = recorded(asked.run)
     indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
-    chosen = comparison.chosen(before, indices, asked.level)
-    out, junit = _new_files(asked)
-    whole = out is None or (out.suffix == SUFFIX and len(chosen) == len(before.outcomes))
-    if isinstance(before, CasesFile) and not whole:
-        raise UserError(f"`out` of a cases file is one, too: NAME{SUFFIX}, of all cases")
+    chosen = rerunning.chosen(before, indices, asked.level)
+    out, junit = _new_files(asked, SUFFIX if isinstance(before, CasesFile) else PAGE)
+    some = len(chosen) < len(before.outcomes)
+    if isinstance(before, CasesFile) and out is not None and some:
+        raise UserError("`out` of a cases file has all cases: name none of them, and no level")
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
-        compared = comparison.rerun(study, chosen)
+        compared = rerunning.rerun(study, chosen)
     if isinstance(before, CasesFile):
         compared = before.judged(compared, out or before.folder)
     return _written(compared, out, junit)
 
 
-def _new_files(asked: verbs.Rerun | verbs.Compare) -> tuple[Path | None, Path | None]:
-    """Return the new files of a comparison; `UserError` where one cannot be, or both are one."""
-    out, junit = path_of(asked.out, new=True), path_of(asked.junit, new=True)
-    if out is not None and out == junit:
-        raise UserError(f"`out` and `junit` name the same file {out}: give each its own")
+def _new_files(
+    asked: verbs.Rerun | verbs.Compare, ending: str = PAGE
+) -> tuple[Path | None, Path | None]:
+    """Return the new files of a comparison, whose `out` has an ending.
+
+    Raises `UserError` where one cannot be.
+    """
+    out, junit = path_of(asked.out), path_of(asked.junit)
+    if out is not None:
+        check_new_file(out, endings=(ending,))
+    if junit is not None:
+        check_new_file(junit, "`junit`", JUNIT)
     return out, junit
 
 

@@ -35,7 +35,6 @@ from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
-from merge_sumo.system.folders import check_new_file
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
 from merge_sumo.verbs import Benchmark, Campaign, GroundTruth, SearchOfTest
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
@@ -99,10 +98,8 @@ def opened_truths(
         yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
 
 
-def path_of(path: AnyPath | None, *, new: bool = False) -> Path | None:
-    """Return what a person names as a path; `UserError` where it is to be of a new file."""
-    if path is not None and new:
-        check_new_file(Path(path))
+def path_of(path: AnyPath | None) -> Path | None:
+    """Return what a person names as a path."""
     return None if path is None else Path(path)
 
 

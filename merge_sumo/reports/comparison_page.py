@@ -16,7 +16,6 @@ from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.system.folders import replace_own
-from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.cause import cause
 
 SHOWN: Final = 200
@@ -29,7 +28,9 @@ DRAWN: Final = (
 """Changes of which a section has both motions of each case; the template says what they mean."""
 SEEN: Final = 0.005
 """In m, m/s and m/s2: motions that differ by less look alike."""
-AGAINST_PAGE: Final = f"{AGAINST}.html"
+PAGE: Final = ".html"
+"""Ending of a page: a browser shows a file with another one as source."""
+AGAINST_PAGE: Final = f"{AGAINST}{PAGE}"
 """Page in the folder of a campaign against an earlier version."""
 STYLES: Final = ("report.css", "comparison.css")
 
@@ -49,7 +50,6 @@ def comparison_page(compared: Comparison) -> str:
         "comparison.html.jinja",
         styles=STYLES,
         compared=compared,
-        counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
         steps=[(step, _maps(step), _sections(step, compared)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
         most=MOST_REGIONS,

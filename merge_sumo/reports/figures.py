@@ -53,9 +53,7 @@ STYLE: Final[Any] = {
 
 def check_figure(path: Path) -> None:
     """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
-    if path.suffix not in KINDS:
-        raise UserError(f"`figure` is {path}: end it in {' or '.join(KINDS)}")
-    check_new_file(path, "`figure`")
+    check_new_file(path, "`figure`", KINDS)
     require_matplotlib()
 
 

@@ -23,7 +23,7 @@ from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
 from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.system.folders import check_new, check_new_file, write_new
+from merge_sumo.system.folders import check_ending, check_new, check_new_file, write_new
 from merge_sumo.system.printable import printable
 from merge_sumo.verdict.campaign_verdict import GateResult, Verdict
 from merge_sumo.verdict.chance import by_case, undecided
@@ -33,12 +33,15 @@ CLASS: Final = "merge-sumo"
 FAILED: Final = "failed"
 """Type of a failure without a severity: the VUT never reached M, and the criterion speaks of it."""
 
+JUNIT: Final = (".xml",)
+"""Endings of the name of such a file."""
 REGRESSION: Final = "regression"
 """Type of a case that fails and passes with an earlier version."""
 
 
 def check_junit(path: Path, folder: Path) -> None:
     """Raise `UserError` where a campaign in `folder` cannot write this JUnit file later."""
+    check_ending(path, JUNIT, "`junit`")
     if path.absolute() == folder.absolute():
         raise UserError(f"`junit` is {path}, the folder of the campaign: choose a file")
     if path.parent.absolute() == folder.absolute():
@@ -113,6 +116,9 @@ def _gates(
 def _step(root: etree._Element, name: str, step: Step) -> None:
     """Add a suite of the cases that two versions ran."""
     suite = etree.SubElement(root, "testsuite", name=name)
+    if step.passes_less:
+        test = _test(suite, "share of cases that pass", f"{CLASS}.against", 0.0)
+        _wrong(test, "failure", REGRESSION, step.headline)
     for one in step.cases:
         if one.change is not Change.BOTH or one.judged:
             case = f"case {one.b.index}: {described(one.b.case)}"

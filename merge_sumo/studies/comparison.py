@@ -4,11 +4,12 @@ A version is what was recorded of it. Cases that two neighbours both ran are pai
 passes with the earlier one and does not pass with the later one broke. Where each has cases of its
 own, regions are compared: failures that are linked at the radius of FMC, and the cases that the
 other version has within that radius of one of them. They decide nothing: two searches of one
-version have cases on both sides of the edge of a region.
+version have cases on both sides of the edge of a region. That a version passes less often in its
+own search than the earlier one in its decides, where it is more than chance.
 
 `compare` reads recorded campaigns and runs nothing. `compare_against` reads a campaign that ran
-both versions (`campaigns/against.py`). `rerun` runs the recorded cases of one campaign again with a
-changed VUT. All return a `Comparison`.
+both versions (`campaigns/against.py`). `rerun` (`rerun.py`) runs the recorded cases of one campaign
+again with a changed VUT. All return a `Comparison`.
 """
 
 from __future__ import annotations
@@ -25,12 +26,10 @@ from scipy.spatial import cKDTree
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.coverage.fmc import fmc, radius_for, regions
-from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
-from merge_sumo.studies.run_study import RunStudy
+from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.version import Version
 from merge_sumo.system.printable import counted, quoted
 from merge_sumo.system.records import Record, to_plain
@@ -123,10 +122,7 @@ class ComparedCase:
         runs = [one for one in (self.runs_a, self.runs_b) if one is not None]
         if len(runs) < 2 or not any(one.varies for one in runs):
             return None
-        from scipy.stats import fisher_exact
-
-        table = [[one.failures, one.runs - one.failures] for one in runs]
-        return float(fisher_exact(table)[1])
+        return _fisher([(one.failures, one.runs) for one in runs])
 
     @property
     def became(self) -> str:
@@ -153,6 +149,13 @@ class ComparedCase:
             if runs is not None:
                 record |= {f"runs_{name}": runs.runs, f"failed_runs_{name}": runs.failures}
         return record
+
+
+def _fisher(shares: Sequence[tuple[int, int]]) -> float:
+    """Return the chance of two shares, (part, whole), as different or more where they are one."""
+    from scipy.stats import fisher_exact
+
+    return float(fisher_exact([[part, whole - part] for part, whole in shares])[1])
 
 
 def short(value: Any) -> Any:
@@ -234,12 +237,18 @@ class Step:
         after: number of the later one.
         cases: the cases that both ran, in the order of `paired`.
         regions: by level, what became of regions, where each has cases of its own.
+        chance: where there are such levels, and one sampler searched for both, the chance of
+            shares of passing cases there as different as these, or more, in equal versions, by
+            Fisher's exact test; else None.
+        passes_less: whether the later one passes in a smaller share, by more than chance.
     """
 
     before: int
     after: int
     cases: list[ComparedCase]
     regions: dict[int, list[Region]]
+    chance: float | None = None
+    passes_less: bool = False
 
     @property
     def transitions(self) -> dict[tuple[Change, str, str], int]:
@@ -251,6 +260,22 @@ class Step:
     def count(self, change: Change) -> int:
         """Return the number of cases of which that became."""
         return sum(case.change is change for case in self.cases)
+
+    @property
+    def headline(self) -> str:
+        """What pairs, regions and numbers say, in words."""
+        shared = counted(len(self.cases), "shared case") if self.cases else "no case is shared"
+        changes = [one for one in Change if one is Change.BROKE or self.count(one)]
+        became = ", ".join(f"{self.count(change)} {change}" for change in changes)
+        parts = [f"of {shared} {became}" if self.cases else shared]
+        if self.regions:
+            of_regions = Counter(one.change for found in self.regions.values() for one in found)
+            shown = [f"{of_regions[change]} {change}" for change in Change if change in of_regions]
+            parts.append(f"regions of failures: {', '.join(shown) or 'none'}")
+        if self.passes_less:
+            by = f"by Fisher's exact test p = {self.chance:.2g}"
+            parts.insert(0, f"{self.after} passes less often than {self.before}, {by}")
+        return "; ".join(parts)
 
     def table_lines(self) -> list[str]:
         """Return the table of transitions as lines."""
@@ -264,6 +289,8 @@ class Step:
         return {
             "before": self.before,
             "after": self.after,
+            "chance": self.chance,
+            "passes_less": self.passes_less,
             "transitions": [
                 {"change": change, "before": before, "after": after, "cases": number}
                 for (change, before, after), number in self.transitions.items()
@@ -302,29 +329,28 @@ class Comparison(Result):
 
     @property
     def worse(self) -> bool:
-        """Whether a case broke or lost too much margin, or the last version tested no case."""
+        """Whether a case broke or lost too much margin, or a version passes less often.
+
+        Also where the last version tested no case.
+        """
         got_worse = any(one.change in GOT_WORSE for step in self.steps for one in step.cases)
-        return got_worse or not any(o.is_tested for o in self.versions[-1].outcomes)
+        less = any(step.passes_less for step in self.steps)
+        return got_worse or less or not any(o.is_tested for o in self.versions[-1].outcomes)
+
+    @property
+    def counts(self) -> list[str]:
+        """What each version found, in words."""
+        return [judge(one.outcomes, one.tolerated).counts for one in self.versions]
 
     @property
     def headline(self) -> str:
-        """How much broke and was fixed, in a sentence."""
-        parts = []
-        for step in self.steps:
-            numbers = [f"{counted(step.count(Change.BROKE), 'case')} broke"]
-            numbers += [
-                f"{number} {change}"
-                for change in Change
-                if change is not Change.BROKE and (number := step.count(change))
-            ]
-            words = ", ".join(numbers) if step.cases else "no case is shared"
-            if step.regions:
-                became = Counter(one.change for found in step.regions.values() for one in found)
-                shown = [f"{became[change]} {change}" for change in Change if change in became]
-                words += f"; regions of failures: {', '.join(shown) or 'none'}"
-            many = len(self.steps) > 1
-            parts.append(f"from {step.before} to {step.after}: {words}" if many else words)
-        return "; ".join(parts)
+        """The failures of each version, and how much broke and was fixed, in a sentence."""
+        many = len(self.steps) > 1
+        steps = [
+            f"from {step.before} to {step.after}: {step.headline}" if many else step.headline
+            for step in self.steps
+        ]
+        return "; ".join((" -> ".join(self.counts), *steps))
 
     def lines(self) -> list[str]:
         """Return the numbers, version by version and step by step, and the first of the cases."""
@@ -421,17 +447,17 @@ def compare_against(run: Run) -> Comparison | None:
     outcomes = earlier.outcomes[: len(run.outcomes)]
     before = replace(Version.of(earlier), outcomes=outcomes, tolerated=run.tolerated)
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
-    return _of_two(before, Version.of(run), source)
+    return of_two(before, Version.of(run), source)
 
 
 def compare_episodes(before: Sequence[Episode], after: Run, vut: str) -> Comparison:
     """Compare a campaign with what another VUT does in its cases."""
     later = Version.of(after)
     earlier = later.with_vut(vut, before)
-    return _of_two(earlier, later, f"the cases come from the search of {after.vut}")
+    return of_two(earlier, later, f"the cases come from the search of {after.vut}")
 
 
-def _of_two(before: Version, after: Version, source: str) -> Comparison:
+def of_two(before: Version, after: Version, source: str) -> Comparison:
     """Return the comparison of two versions that ran the same cases."""
     return Comparison((before, after), (_step((before, after), 1),), source)
 
@@ -470,11 +496,19 @@ def _step(found: Sequence[Version], after: int) -> Step:
     earlier, later = found[after - 1], found[after]
     cases = paired(earlier.outcomes, later.outcomes, later.tolerated)
     regions_at = {}
+    own: tuple[list[Outcome], list[Outcome]] = [], []
     for level in sorted(set(earlier.levels) & set(later.levels)):
         sides = [[o for o in one.cases if o.case.level == level] for one in (earlier, later)]
         if sum(case.a.case.level == level for case in cases) < max(map(len, sides)):
             regions_at[level] = _regions(after, *sides)
-    return Step(after, after + 1, cases, regions_at)
+            own[0].extend(sides[0])
+            own[1].extend(sides[1])
+    if not regions_at or earlier.sampler != later.sampler:
+        return Step(after, after + 1, cases, regions_at)
+    (passed_a, ran_a), (passed_b, ran_b) = shares = [(sum(map(passes, o)), len(o)) for o in own]
+    chance = _fisher(shares)
+    less = chance <= SIGNIFICANT and passed_b * ran_a < passed_a * ran_b
+    return Step(after, after + 1, cases, regions_at, chance, less)
 
 
 def _regions(number: int, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> list[Region]:
@@ -532,57 +566,3 @@ def _box_in_words(cases: Sequence[Case]) -> str:
         span = low if low == high else f"{low} to {high}"
         parts.append(f"{coordinate.name} {span} {coordinate.unit}")
     return ", ".join(parts)
-
-
-def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[Outcome]:
-    """Return cases of a campaign by their indices, by default all, of some levels or of all.
-
-    Raises `UserError` for an index without a case, and where there is no such case.
-    """
-    found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
-    asked, there = names_of_levels(level), tuple(map(level_name, run.levels))
-    names = there if asked == ("all",) else asked
-    for name in (name for name in names if name not in there):
-        raise UserError(
-            f"{run.folder} has no cases at level {name!r}: it has {', '.join(there)}, or all"
-        )
-    found = [one for one in found if level_name(one.case.level) in names]
-    if not found:
-        raise UserError(f"{run.folder} has none of these cases: name others, or another level")
-    return found
-
-
-def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
-    """Run cases of a campaign again, with the settings of the study and their plan.
-
-    Raises `UserError` where net or POV are not the campaign's: then not only the VUT would have
-    changed.
-    """
-    run, settings = study.run, study.settings
-    levels = sorted({outcome.case.level for outcome in before})
-    study.check_same_system(levels, may_change=True)
-    # In another order than the campaign's, which a VUT that remembers would repeat.
-    order, by_index = before[::-1], dict[int, Episode]()
-    plan = study.plan.for_cases(len(before))
-    with workers_or_here(study.workers) as processes:
-        open_simulators(plan, processes)
-        for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
-            old = order[place]
-            by_index[old.index] = now.at(old.index, old.batch)
-            study.on_cases(1)
-    after = [by_index[outcome.index] for outcome in before]
-    search = f"merge-sumo campaign --vut {quoted(settings.vut)}"
-    if settings.vut != run.vut:
-        search += f" --against {quoted(run.vut)}"
-    source = (
-        f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
-        f"now alone fails may lie elsewhere: `{search}` searches there"
-    )
-    earlier = replace(Version.of(run), outcomes=before, levels=levels)
-    compared = _of_two(earlier, earlier.with_vut(settings.vut, after), source)
-    differing = [one for one in compared.steps[0].cases if one.change is not Change.BOTH]
-    indices = " ".join(str(one.b.index) for one in differing[:LISTED])
-    again = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
-    if settings.pov is not None:
-        again += f" --pov {quoted(settings.pov)}"
-    return replace(compared, page_command=again + OUT)

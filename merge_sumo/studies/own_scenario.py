@@ -15,12 +15,11 @@ from merge_sumo.campaigns.scenario_suggestion import (
     suggested_lane_m,
     unseen,
 )
-from merge_sumo.errors import UserError
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.scenario.scenario import MergeScenario, Scenario
-from merge_sumo.system.folders import check_new_file, write_new
+from merge_sumo.system.folders import check_ending, check_new_file, write_new
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.result import Shown
 
@@ -44,8 +43,7 @@ def write_scenario(asked: verbs.NewScenario) -> Shown:
     Raises `UserError` for a net without such a merge, and where something is there.
     """
     file, net = Path(asked.file), Path(asked.net)
-    if file.suffix != SUFFIX:
-        raise UserError(f"{file} is to be a scenario: name it NAME{SUFFIX}")
+    check_ending(file, (SUFFIX,), "FILE")
     picture = file.with_suffix(".svg")
     for path in (file, picture):
         check_new_file(path, "FILE")

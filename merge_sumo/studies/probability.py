@@ -240,7 +240,7 @@ def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) ->
         raise UserError(f"`confidence` is {asked.confidence}: choose 0.5 or more, and below 1")
     if asked.distribution is not None and asked.traffic is not None:
         raise UserError("choose a distribution or a traffic: a traffic states its own")
-    check_new_file(out)
+    check_new_file(out, endings=(".json",))
     study.check_same_system()
     traffic = None if asked.traffic is None else named_traffic(str(asked.traffic))
     if traffic is None:

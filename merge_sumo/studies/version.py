@@ -32,6 +32,7 @@ class Version:
         tolerated: share of its runs in which a case may fail.
         levels: POV levels.
         motions: gives its motions.
+        sampler: who chose its cases.
     """
 
     vut: str
@@ -40,13 +41,15 @@ class Version:
     tolerated: float
     levels: Sequence[int]
     motions: Motions
+    sampler: str
 
     @classmethod
     def of(cls, run: Run) -> Version:
         """Return a campaign as a version."""
         levels = sorted({*run.levels, *(outcome.case.level for outcome in run.outcomes)})
         folder = str(run.folder)
-        return cls(run.vut, folder, run.outcomes, run.tolerated, levels, run.trajectories)
+        known = run.outcomes, run.tolerated, levels, run.trajectories
+        return cls(run.vut, folder, *known, run.settings.sampler)
 
     def with_vut(self, vut: str, episodes: Sequence[Episode]) -> Version:
         """Return the version of another VUT in the same cases, by its episodes."""

@@ -14,7 +14,7 @@ import secrets
 import stat
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from datetime import datetime
 from itertools import chain, count
@@ -76,8 +76,19 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-def check_new_file(path: Path, option: str = "`out`") -> None:
-    """Raise `UserError` where no new file can be written at `path`, in a folder that is there."""
+def check_ending(path: Path, endings: Sequence[str], option: str = "`out`") -> None:
+    """Raise `UserError` where a name does not say to other programs what the file is."""
+    if path.suffix not in endings:
+        raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
+
+
+def check_new_file(path: Path, option: str = "`out`", endings: Sequence[str] = ()) -> None:
+    """Raise `UserError` where no new file can be written at `path`, in a folder that is there.
+
+    `endings` are those that its name may have; by default any.
+    """
+    if endings:
+        check_ending(path, endings, option)
     check_new(path, option)
     if not path.parent.is_dir():
         raise UserError(f"{option} is {str(path)!r}: there is no folder {path.parent}")

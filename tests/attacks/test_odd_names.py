@@ -78,7 +78,7 @@ class TestATerminal:
         folder = Path(shutil.copytree(made.folder, tmp_path / NASTY))
         code, out, err = on_ascii("compare", folder, folder)
         assert code == 0, err
-        assert out.startswith("0 cases broke")
+        assert " 0 broke" in out.splitlines()[0]
         assert err == ""
         assert "\x1b" not in out
         assert "\\x1b[31m" in out

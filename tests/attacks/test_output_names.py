@@ -125,6 +125,18 @@ def test_nothing_at_the_place_of_an_output_is_touched(
         assert tree(world) == before, name
 
 
+@pytest.mark.parametrize("writer", WRITERS)
+def test_a_file_has_a_name_by_which_others_know_what_it_is(world, no_cases, command_line, writer):
+    """A browser shows a page without `.html` as source."""
+    command, suffix = WRITERS[writer]
+    if not suffix or writer == "export cases":
+        pytest.skip("another name is that of a folder")
+    before = tree(world)
+    for name in ("changes", "changes.txt", f"changes{suffix}x"):
+        assert_refused(command_line(*shlex.split(command), name), f"end it in {suffix}")
+    assert tree(world) == before
+
+
 @pytest.mark.parametrize("name", some(ODD, "a b", "$(id)", "-rf", "\x1b[31mred", "日本", "new/sub"))
 def test_an_odd_name_is_a_name(world, command_line, name):
     before = tree(world)

@@ -116,7 +116,11 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
     ms.export("run", range(60), file_format="cases", out="named.toml")
     assert len(CasesFile(Path("named.toml")).outcomes) == 60, "those that are named"
     said = command_line("rerun", "c.toml", "--vut", "own.py:Own")
-    assert (said.code, said.out) == (0, "0 cases broke, 40 pass with both\n")
+    assert (said.code, said.out) == (
+        0,
+        "0 failures in 40 cases -> 0 failures in 40 cases; of 40 shared cases 0 broke, 40 pass "
+        "with both\n",
+    )
     for name, words in (
         ("Late", ", worse but passing: Safe: "),
         ("Blind", ", broke: "),
@@ -176,11 +180,11 @@ def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, 
     (line,) = (text for text in file.read_text().splitlines() if f"{{index = {index}," in text)
     edit(file, line, line.replace("},", ', accepted = "it waits\\u001b"},'))
     new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
-    assert_refused(command_line("rerun", file, index, "--out", new), "NAME.toml, of all cases")
+    assert_refused(command_line("rerun", file, index, "--out", new), "all cases: name none of them")
     ms.rerun(file, vut=WORSE, out=new)
     said = command_line("rerun", file, index, "--vut", WORSE, "--junit", junit)
     assert said.code == 0
-    assert said.out.startswith("0 cases broke, 1 accepted\n")
+    assert "of 1 shared case 0 broke, 1 accepted\n" in said.out
     assert f"case {index} is accepted (it waits\\x1b) and fails, not counted" in said.out
     assert len(etree.parse(junit).getroot().findall(".//skipped")) == 1
     assert CasesFile(new).accepted == {index: "it waits\x1b"}
@@ -259,7 +263,7 @@ def test_what_is_no_cases_file_is_refused_in_a_sentence(file, command_line, old,
 
 @on_us23
 def test_no_file_is_written_over_and_what_is_none_is_refused(file, command_line, tmp_path):
-    assert_refused(command_line("rerun", file, "--out", "p.html"), "--out of a cases file is one")
+    assert_refused(command_line("rerun", file, "--out", "p.html"), "end it in .toml")
     assert_refused(command_line("rerun", file, "--out", file), "exists")
     assert_refused(command_line("rerun", file, "--stress", "--junit", "j"), "leave indices")
     (line, *_) = (text for text in file.read_text().splitlines() if "{index" in text)

@@ -32,8 +32,8 @@ from merge_sumo.studies.comparison import (
     ComparedCase,
     Region,
     compare,
-    rerun,
 )
+from merge_sumo.studies.rerun import rerun
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.verdict.chance import RunsOfCase
 from merge_sumo.verdict.episode import Episode
@@ -155,6 +155,27 @@ class TestARegion:
         assert not compare([a, b]).worse, "two seeds of one VUT have such regions"
         assert "broke" not in str(compare([a, b]))
 
+    def test_of_a_version_that_passes_less_often_than_chance_explains_decides(self, call, tmp_path):
+        """The pairs are alike here: what each search found must be said first, and decide."""
+        shared = [(0.1, y / 9.0, "passes") for y in range(8)]
+        own = [(0.9, y / 9.0) for y in range(8)]
+        a = write(tmp_path / "a", *shared, *((x, y + 0.02, "passes") for x, y in own))
+        b = write(tmp_path / "b", *shared, *((x, y, "fails") for x, y in own))
+        files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
+        said = call("compare", a.folder, b.folder, *files)
+        first = said.out.splitlines()[0]
+        assert first.startswith("0 failures in 16 cases -> 8 failures (0 contacts) in 16 cases; ")
+        assert "2 passes less often than 1, by Fisher's exact test p = 0.0024" in first
+        assert "of 8 shared cases 0 broke, 8 pass with both" in first
+        assert said.code == 1
+        assert "Version 2 passes in a smaller share" in (tmp_path / "page.html").read_text()
+        assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "1"
+        found = compare([a, b]).to_record()
+        assert (found["worse"], found["steps"][0]["passes_less"]) == (True, True)
+        assert not compare([b, a]).worse, "it passes more often"
+        other = changed(tmp_path / "other", b, sampler="uniform")
+        assert not compare([a, other]).worse, "another sampler finds other shares in one version"
+
     @pytest.mark.parametrize(
         ("points", "change"),
         [
@@ -174,7 +195,10 @@ def test_three_versions_are_two_steps(tmp_path):
     c = write(tmp_path / "c", (0.5, 0.5, "passes"))
     found = compare([a, b, c])
     assert [step.count(Change.BROKE) for step in found.steps] == [1, 0]
-    assert found.headline == "from 1 to 2: 1 case broke; from 2 to 3: 0 cases broke, 1 fixed"
+    assert found.headline == (
+        "0 failures in 1 case -> 1 failure (0 contacts) in 1 case -> 0 failures in 1 case; from 1 "
+        "to 2: of 1 shared case 1 broke; from 2 to 3: of 1 shared case 0 broke, 1 fixed"
+    )
     assert [row[0] for row in found.fmc().values()] == ["0.0000"]
 
 
@@ -195,7 +219,7 @@ def test_a_list_that_is_cut_says_so_everywhere(call, tmp_path, monkeypatch):
     files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
     said = call("compare", a.folder, b.folder, *files)
     assert said.code == 1
-    assert "25 cases broke" in said.out
+    assert "of 25 shared cases 25 broke" in said.out
     assert "broke, the first 10 of 25:" in said.out
     root: Any = html.parse(tmp_path / "page.html").getroot()
     titles = root.xpath("//h2/text()")

@@ -25,6 +25,7 @@ WRITERS: Final = {
     "export": ("export run 0 1 --out", ""),
     "export csv": ("export run 0 --format csv --out", ""),
     "export cases": ("export run 0 --format cases --out", ".toml"),
+    "rerun": ("rerun run 0 --out", ".html"),
     "junit of rerun": ("rerun run 0 --junit", ".xml"),
     "export openscenario": ("export run 0 --format openscenario --out", ""),
     "train": ("train --only pov1 --out", ""),
