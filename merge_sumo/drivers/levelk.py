@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -174,10 +175,24 @@ class QNetwork:
     def from_tensors(cls, tensors: Mapping[str, FloatArray]) -> QNetwork:
         """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ...
 
-        The limit of braking, if the network has one, is a tensor of one number.
+        The limit of braking, if the network has one, is a tensor of one number. Raises `ValueError`
+        for tensors of other names, shapes or types: numpy would broadcast some of them.
         """
-        count = len(tensors) // 2
-        layers = [(tensors[f"{i}.weight"], tensors[f"{i}.bias"]) for i in range(count)]
+        count = max(len(tensors) // 2, 1)
+        names = [(f"{i}.weight", f"{i}.bias") for i in range(count)]
+        if set(tensors) - {LIMIT} != set(chain(*names)):
+            raise ValueError(f"its tensors are {sorted(tensors)}, and not 0.weight, 0.bias, ...")
+        layers = [(tensors[weight], tensors[bias]) for weight, bias in names]
+        inputs = layers[0][0].shape[1:]
+        for i, (weight, bias) in enumerate(layers):
+            fits = weight.ndim == 2 and weight.size and weight.shape == (*bias.shape, *inputs)
+            if not fits or weight.dtype.kind != "f" or bias.dtype.kind != "f":
+                raise ValueError(
+                    f"{i}.weight is {weight.shape} of {weight.dtype} and {i}.bias {bias.shape} of "
+                    f"{bias.dtype}, behind {inputs}: they must be floats, (outputs, inputs) and "
+                    "(outputs,), of which the next layer takes the outputs"
+                )
+            inputs = bias.shape
         return cls(layers, float(tensors[LIMIT].item()) if LIMIT in tensors else None)
 
     def limited(self, scenario: Scenario) -> Scenario:

@@ -79,10 +79,14 @@ def with_layers(
     tensors = {f"{i}.weight": weight for i, weight in enumerate(weights)}
     biases = {f"{i}.bias": np.zeros(len(weight)) for i, weight in enumerate(weights)}
     safetensors.numpy.save_file(tensors | biases, path)
-    known = networks(folder)
-    known[name]["sha256"] = hashlib.sha256(path.read_bytes()).hexdigest()
-    write(folder, known)
+    write(folder, with_hash(networks(folder), path))
     return folder
+
+
+def with_hash(known: dict, path: Path) -> dict:
+    """Return a manifest's networks in which one has the hash of its file."""
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    return {**known, path.stem: {**known[path.stem], "sha256": sha256}}
 
 
 def settings(policies: Path | None, **changes) -> CampaignSettings:
@@ -169,6 +173,38 @@ class TestAFolder:
         assert code == 2
         assert err.count("\n") == 1
         assert f"{name}.safetensors holds no action-value network: a weight is NaN" in err
+        assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize("name", ["pov1", "vut1"])
+    @pytest.mark.parametrize(
+        ("changed", "said"),
+        [
+            ({"1.bias": np.zeros((0, 5))}, "1.bias (0, 5)"),
+            ({"0.bias": np.zeros((0, 5))}, "0.bias (0, 5)"),
+            ({"0.bias": np.zeros(1)}, "0.bias (1,)"),
+            ({"1.weight": np.zeros((1, ACTIONS, 8))}, "1.weight is (1, 7, 8)"),
+            ({"1.weight": np.zeros((ACTIONS, 9))}, "1.weight is (7, 9)"),
+            ({"0.weight": np.zeros((8, FEATURES), dtype=np.int64)}, "of int64"),
+            ({"1.bias": np.zeros(ACTIONS, dtype=np.complex64)}, "of complex64"),
+            ({"0.weight": np.zeros((0, FEATURES)), "0.bias": np.zeros(0)}, "0.weight is (0, 26)"),
+            ({"a_min_mps2": np.zeros((2, 2))}, "can only convert an array of size 1"),
+            ({"2.weight": np.zeros((7, 7))}, "and not 0.weight, 0.bias, ..."),
+            (None, "its tensors are [], and not 0.weight"),
+        ],
+    )
+    def test_with_tensors_of_other_shapes_or_types_leaves_nothing(
+        self, call, same, tmp_path, name, changed, said
+    ):
+        folder, path = tmp_path / "policies", tmp_path / "policies" / f"{name}.safetensors"
+        with_layers(same, folder, name, [np.zeros((8, FEATURES)), np.zeros((ACTIONS, 8))])
+        tensors = {} if changed is None else safetensors.numpy.load_file(path) | changed
+        safetensors.numpy.save_file(tensors, path)
+        write(folder, with_hash(networks(folder), path))
+        vut = "level1" if name == "vut1" else "design2"
+        asked = ("--vut", vut, "--level", "1", "--cases", 4, "--policies", folder)
+        result = call("campaign", *asked, "--out", tmp_path / "run")
+        assert_refused(result, f"{name}.safetensors holds no action-value network: ")
+        assert said in result[2]
         assert not (tmp_path / "run").exists()
 
     @pytest.mark.parametrize(("name", "end"), [("pov1", End.SIM_ERROR), ("vut1", End.VUT_ERROR)])
