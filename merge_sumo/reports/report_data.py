@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any, Final
@@ -13,7 +12,7 @@ import numpy as np
 from merge_sumo.coverage.fmc import fmc, radius_for
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.road.drawing import road_data
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import Coordinate
 from merge_sumo.scenario.scenario import (
@@ -190,35 +189,6 @@ def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
     whole = [np.rint(np.clip(v / SPEED_UNIT_MPS, 0, 65535)).astype("<u2").tobytes() for v in speeds]
     first = np.cumsum([0, *map(len, speeds)]).tolist()
     return base64.b64encode(b"".join(whole)).decode(), dict(zip(motions, first, strict=False))
-
-
-def road_data(road: Corridor) -> dict[str, Any]:
-    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
-
-    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
-    """
-    at = road.lane_point(0.0, on_ramp=False)
-    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
-
-    def place(x: float, y: float) -> list[float]:
-        dx, dy = x - at.x_m, y - at.y_m
-        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
-        return [round(along, 2), round(left, 2)]
-
-    def points(path: LanePath) -> list[list[float]]:
-        return [
-            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
-            for piece in path.pieces
-            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
-        ]
-
-    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
-    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
-    return {
-        "main": points(road.mainline),
-        "ramp": points(road.ramp),
-        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
-    }
 
 
 def pairs_of(dims: int) -> list[Axes]:

@@ -1,16 +1,18 @@
-"""A road as an SVG picture: its lanes, the two paths, M, and where vehicles start.
+"""A road as an SVG picture, and as the lines that a player draws.
 
-An acceleration lane is drawn in a colour, with its gore and its end.
+The picture has its lanes, the two paths, M, and where vehicles start. An acceleration lane is drawn
+in a colour, with its gore and its end.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from lxml import etree
 
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.scenario.scenario import MergeScenario
 
 WIDTH_PX = 1000
@@ -70,6 +72,35 @@ def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
         )
         text.text = name
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
+
+
+def road_data(road: Corridor) -> dict[str, Any]:
+    """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
+
+    M is the origin of the plane, and the road goes on to the right: a net may lie anywhere.
+    """
+    at = road.lane_point(0.0, on_ramp=False)
+    ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
+
+    def place(x: float, y: float) -> list[float]:
+        dx, dy = x - at.x_m, y - at.y_m
+        along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
+        return [round(along, 2), round(left, 2)]
+
+    def points(path: LanePath) -> list[list[float]]:
+        return [
+            [round(piece.start_m + share * piece.length_m, 2), *place(x, y)]
+            for piece in path.pieces
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
+        ]
+
+    shapes = [piece.shape for path in (road.mainline, road.ramp) for piece in path.pieces]
+    lanes = [*road.surroundings, *dict.fromkeys(shapes)]
+    return {
+        "main": points(road.mainline),
+        "ramp": points(road.ramp),
+        "lanes": [[place(x, y) for x, y, _ in shape] for shape in lanes],
+    }
 
 
 def _line_of(

@@ -6,7 +6,8 @@
 
 The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
 [x_POV, v_POV, x_VUT, v_VUT] in m and m/s, and psi for a POV with a social value orientation;
-actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another scenario.
+actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another scenario. With
+`render_mode="rgb_array"` or `"human"` it is drawn as the player of the report draws a case.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import SVO, US23, Scenario
+from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario
 from merge_sumo.training.game import Game, of_two, pool_starts
+from merge_sumo.training.picture import GamePicture
 from merge_sumo.training.reward import Reward, RewardWeights, Role
 
 STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
 STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
 """Of an observation, in the units of the scenario."""
+FPS: Final = round(1.0 / (DECISION_STEPS * DT_S))
+"""A picture for each decision shows a game in real time."""
 
 
 class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
@@ -42,7 +46,11 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
     `AutoresetMode.NEXT_STEP`, which the wrappers of gymnasium expect.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata = {  # noqa: RUF012
+        "render_modes": ["rgb_array"],
+        "render_fps": FPS,
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
 
     def __init__(
         self,
@@ -53,18 +61,23 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         weights: RewardWeights | None = None,
         scenario: Scenario = US23,
         max_episode_steps: int | None = None,
+        render_mode: str | None = None,
     ) -> None:
         """Play `role` against `opponent`: "level0", or a policy such as "vut1" or "pov1".
 
         `svo` is psi of a POV of level 2, or "random" for one drawn anew for every game; psi is
         then part of the observation. The weights are those of the scenario unless they are given.
         A game is truncated by the scenario's timeout, or after `max_episode_steps` decisions where
-        that is earlier.
+        that is earlier. Raises `UserError` for what makes no game.
         """
         if role == "vut" and svo is not None:
             raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
         if max_episode_steps is not None and max_episode_steps < 1:
             raise UserError(f"max_episode_steps is {max_episode_steps}: it must be 1 or more")
+        if num_envs < 1:
+            raise UserError(f"num_envs is {num_envs}: it must be 1 or more")
+        if not (svo is None or svo == "random" or _is_psi(svo)):
+            raise UserError(f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2")
         self.num_envs, self.role, self.svo = num_envs, role, svo
         reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
         self.game = Game(role, _opponent(role, opponent), reward)
@@ -84,6 +97,8 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         self._state, self._svo_rad = np.zeros((num_envs, 4)), np.zeros(num_envs)
         self._decisions = np.zeros(num_envs, dtype=np.int64)
         self._ended = np.zeros(num_envs, dtype=bool)
+        self.render_mode = checked_mode(render_mode, self.metadata)
+        self._picture = None if render_mode is None else GamePicture(self.game.scenario)
 
     def reset(
         self,
@@ -101,9 +116,12 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
     def step(
         self, actions: NDArray[np.int64]
     ) -> tuple[FloatArray, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
-        """Take one decision in every game that has not ended; begin the others anew."""
+        """Take one decision in every game that has not ended; begin the others anew.
+
+        Raises `UserError` for what is no action.
+        """
         began = self._ended
-        a_mps2 = self.game.actions_mps2[np.asarray(actions)]
+        a_mps2 = self.game.actions_mps2[self._checked(actions)]
         self._state, reward, over = self.game.advance(self._state, self._svo_rad, a_mps2)
         self._decisions += 1
         terminated = over & ~began
@@ -112,6 +130,33 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
         if began.any():
             self._begin(np.flatnonzero(began))
         return self._observed(), np.where(began, 0.0, reward), terminated, truncated, {}
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a picture of each game; nothing without a `render_mode`."""
+        if self._picture is None:
+            return None
+        return tuple(map(self._picture.frame, self._state))
+
+    def show(self) -> None:
+        """Show the first game in a window."""
+        if self._picture is not None:
+            self._picture.show(self._state[0], FPS)
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Close the window."""
+        if self._picture is not None:
+            self._picture.close()
+
+    def _checked(self, actions: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return actions as an array, (K,); `UserError` where they are none."""
+        chosen = np.asarray(actions)
+        whole = chosen.shape == (self.num_envs,) and np.issubdtype(chosen.dtype, np.integer)
+        if not whole or (chosen < 0).any() or (chosen >= ACTIONS).any():
+            each = "" if self.num_envs == 1 else f" for each of {self.num_envs} games"
+            raise UserError(
+                f"an action is a whole number from 0 to {ACTIONS - 1}{each}: not {chosen!s:.60}"
+            )
+        return chosen
 
     def _begin(self, which: NDArray[np.int64]) -> None:
         self._state[which] = pool_starts(len(which), self._rng, self.game.scenario)
@@ -130,7 +175,7 @@ class MergeVectorEnv(VectorEnv[FloatArray, NDArray[np.int64], NDArray[Any]]):
 class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
     """One merging game, `merge_sumo/Merge-v0`."""
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -138,12 +183,13 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         opponent: str = "level0",
         svo: float | Literal["random"] | None = None,
         weights: RewardWeights | None = None,
-        render_mode: None = None,
+        render_mode: str | None = None,
         scenario: Scenario = US23,
     ) -> None:
-        """See `MergeVectorEnv`."""
-        self.render_mode = render_mode
-        self._games = MergeVectorEnv(1, role, opponent, svo, weights, scenario)
+        """See `MergeVectorEnv`; "human" shows a window, in which a game takes its real time."""
+        self.render_mode = checked_mode(render_mode, self.metadata)
+        drawn = None if render_mode is None else "rgb_array"
+        self._games = MergeVectorEnv(1, role, opponent, svo, weights, scenario, render_mode=drawn)
         self.observation_space = self._games.single_observation_space
         self.action_space = self._games.single_action_space
 
@@ -153,12 +199,39 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         """Begin a game from a start of the pool."""
         super().reset(seed=seed)
         observations, _ = self._games.reset(seed=int(self.np_random.integers(2**31)))
+        self._show()
         return observations[0], {}
 
     def step(self, action: np.int64) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Take one decision."""
         observations, reward, terminated, truncated, _ = self._games.step(np.array([action]))
+        self._show()
         return observations[0], float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the picture of the game; nothing where a window shows it, or without a mode."""
+        frames = self._games.render() if self.render_mode == "rgb_array" else None
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self._games.close()
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self._games.show()
+
+
+def checked_mode(mode: str | None, metadata: dict[str, Any]) -> str | None:
+    """Return a `render_mode`; `UserError` where an environment has no such mode."""
+    if mode is not None and mode not in metadata["render_modes"]:
+        modes = " or ".join(map(repr, metadata["render_modes"]))
+        raise UserError(f"there is no render_mode {mode!r}: choose {modes}, or leave it out")
+    return mode
+
+
+def _is_psi(svo: object) -> bool:
+    return isinstance(svo, int | float) and SVO.low <= svo < SVO.high
 
 
 def _opponent(role: Role, opponent: str) -> QNetwork | None:

@@ -17,7 +17,7 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.reports.report_data import road_data
+from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23

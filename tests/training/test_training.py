@@ -14,7 +14,6 @@ import pytest
 import torch
 from calling import invoke
 from export_policy import export_onnx
-from gymnasium.utils.env_checker import check_env
 from merges import LIKE_A_ROUNDABOUT
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
@@ -47,11 +46,6 @@ SMALL = helix.TrainingSettings(ddqn=TINY, refine=QUICK, check_cases=4)
 
 
 class TestEnvironments:
-    @pytest.mark.parametrize("role", ["pov", "vut"])
-    def test_the_single_environment_passes_gymnasiums_checker(self, role):
-        made = gymnasium.make(ENV_ID, role=role, opponent="level0")
-        check_env(made.unwrapped, skip_render_check=True)
-
     def test_a_step_is_half_a_second_of_eq_4_against_the_level0_vut(self):
         env = gymnasium.make(ENV_ID, role="pov", opponent="level0")
         (x_pov, v_pov, x_vut, v_vut), _ = env.reset(seed=1)

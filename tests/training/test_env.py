@@ -1,0 +1,130 @@
+"""Actions that are none, and the pictures of a game."""
+
+# mypy: disable-error-code="arg-type, union-attr, misc"
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import merge_sumo.reports
+from merge_sumo.errors import UserError
+from merge_sumo.training import picture
+from merge_sumo.training.env import MergeEnv, MergeVectorEnv
+from merge_sumo.training.registration import ENV_ID
+
+CSS = Path(merge_sumo.reports.__file__).with_name("templates") / "report.css"
+
+
+def pixels(colour):
+    """Return red, green and blue of a colour as CSS has it."""
+    return [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
+
+
+@pytest.fixture
+def no_screen(monkeypatch):
+    """Let windows be drawn nowhere."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+
+
+@pytest.mark.parametrize("action", [-1, 7, 2.0, 1.5, True, None, "3", [3]])
+def test_what_is_no_action_is_refused_in_a_sentence(action):
+    game, games = MergeEnv("vut"), MergeVectorEnv(2, "vut")
+    game.reset(seed=1)
+    games.reset(seed=1)
+    with pytest.raises(UserError, match="an action is a whole number from 0 to 6: not"):
+        game.step(action)
+    sentence = "a whole number from 0 to 6 for each of 2 games: not"
+    with pytest.raises(UserError, match=sentence):
+        games.step([action, action])
+    with pytest.raises(UserError, match=sentence):
+        games.step([3])
+
+
+def test_what_makes_no_game_is_refused_in_a_sentence():
+    with pytest.raises(UserError, match="num_envs is 0"):
+        MergeVectorEnv(0)
+    for svo in ("selfish", 2.0, float("nan")):
+        with pytest.raises(UserError, match=r"svo is .*: choose 'random', or 0 up to"):
+            MergeEnv("pov", "vut1", svo)
+    with pytest.raises(UserError, match="no render_mode 'ansi': choose 'rgb_array' or 'human'"):
+        MergeEnv(render_mode="ansi")
+
+
+@pytest.mark.parametrize("role", ["pov", "vut"])
+@pytest.mark.usefixtures("no_screen")
+def test_the_environment_passes_gymnasiums_checker_with_its_pictures(role):
+    check_env(gymnasium.make(ENV_ID, role=role, render_mode="rgb_array").unwrapped)
+
+
+def test_cars_are_drawn_to_scale_where_they_are_in_the_colours_of_the_player():
+    game = MergeEnv("vut", render_mode="rgb_array")
+    game.reset(seed=3)
+    has_ended = False
+    while not has_ended:
+        (x_pov_m, _, x_vut_m, _), _, has_ended, _, _ = game.step(5)
+    frame = game.render()
+    assert (frame.shape, frame.dtype) == ((240, 960, 3), np.uint8)
+    places = {
+        who: np.argwhere((frame == pixels(colour)).all(axis=2))
+        for who, colour in picture.COLOURS.items()
+    }
+    along = {who: of[:, 1] for who, of in places.items()}
+    # At M, where the paths have met, the view is as wide as both cars and 50 m, or 90 m.
+    px_per_m = 960.0 / max(abs(x_pov_m - x_vut_m) + 50.0, 90.0)
+    apart_m = (along["POV"].max() - along["VUT"].max()) / px_per_m
+    assert apart_m == pytest.approx(x_pov_m - x_vut_m, abs=0.3)
+    assert np.ptp(along["POV"]) + 1 == pytest.approx(5.0 * px_per_m, abs=2.0)
+    assert np.ptp(places["POV"][:, 0]) + 1 == pytest.approx(2.0 * px_per_m, abs=2.0)
+    css = CSS.read_text()
+    for name, colour in {**picture.COLOURS, "road": picture.ROAD}.items():
+        assert f"--{name.lower()}: {colour};" in css
+
+
+def test_a_vector_environment_has_a_picture_for_each_game():
+    games = gymnasium.make_vec(ENV_ID, num_envs=3, role="vut", render_mode="rgb_array")
+    games.reset(seed=1)
+    first, second, third = games.render()
+    assert not np.array_equal(first, second)
+    assert not np.array_equal(second, third)
+    assert MergeEnv().render() is None
+    assert MergeVectorEnv(2).render() is None
+
+
+@pytest.mark.usefixtures("no_screen")
+def test_a_window_shows_each_state_in_real_time(monkeypatch):
+    import pygame
+
+    waited = list[float]()
+    monkeypatch.setattr(pygame.time, "Clock", lambda: type("", (), {"tick": waited.append}))
+    game = MergeEnv("vut", render_mode="human")
+    game.reset(seed=3)
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
+    drawn = MergeEnv("vut", render_mode="rgb_array")
+    drawn.reset(seed=3)
+    assert np.array_equal(shown, drawn.render())
+    game.step(5)
+    assert game.render() is None
+    assert waited == [2, 2], "decisions a second"
+    game.close()
+    game.close()
+    assert pygame.display.get_surface() is None
+
+
+def test_where_nothing_can_be_drawn_a_sentence_says_so(monkeypatch):
+    game = MergeEnv("vut", render_mode="human")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(UserError, match=r"no screen for a window .*: take render_mode='rgb_array'"):
+        game.reset(seed=3)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "none-such")
+    with pytest.raises(UserError, match="no screen for a window"):
+        game.reset(seed=3)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    with pytest.raises(UserError, match="pictures need pygame: pip install"):
+        MergeEnv("vut", render_mode="rgb_array")
