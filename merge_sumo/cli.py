@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -15,9 +16,13 @@ from merge_sumo.commands.printing import say
 from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.limits import check_limits, exhausted
+from merge_sumo.system.printable import printable
 from merge_sumo.system.streams import prepare_streams
 
 __all__ = ["app", "campaigns", "inputs", "main", "studies"]
+
+FAULT: Final = 70
+"""Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
 
 
 @app.callback(invoke_without_command=True)
@@ -45,7 +50,8 @@ def main() -> None:
     """Run the command line; a `UserError` becomes one sentence and exit code 2.
 
     So does an error of the system that has run out of something. What a signal stopped ends with
-    128 + its number.
+    128 + its number. Any other error is a fault of this package, and ends with a code that is no
+    result: 1, which Python would give, is that of a gate that is met.
     """
     prepare_streams()
     for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers
@@ -61,12 +67,14 @@ def main() -> None:
         sys.exit(2)
     except Stopped as stopped:
         sys.exit(stopped.exit_code)
-    except (OSError, MemoryError, RuntimeError) as error:
-        sentence = exhausted(error)
-        if sentence is None:
-            raise
-        say(f"merge-sumo: {sentence}")
-        sys.exit(2)
+    except Exception as error:
+        if (sentence := exhausted(error)) is not None:
+            say(f"merge-sumo: {sentence}")
+            sys.exit(2)
+        for line in traceback.format_exc().splitlines():
+            typer.echo(printable(line), err=True)
+        say("merge-sumo: this is a fault of merge-sumo and no result: report it with these lines")
+        sys.exit(FAULT)
 
 
 if __name__ == "__main__":

@@ -55,6 +55,7 @@ EXIT_CODES = """
 | 0 | finished |
 | 1 | finished, with the result that the command describes below, such as a case that broke |
 | 2 | wrong usage, or a limit of the system (disk, memory, processes), with one sentence |
+| 70 | a fault of merge-sumo itself, with a traceback: no result |
 | 130, 141, 143 | stopped by Ctrl-C, by a closed pipe, by SIGTERM |
 """
 

@@ -93,6 +93,9 @@ class GroupedCommand(TyperCommand):
             except KeyboardInterrupt:
                 say("stopped")
                 raise
+            except (EOFError, BrokenPipeError) as error:
+                # Of a channel of ours: typer would take it for that of a terminal, and end with 1.
+                raise RuntimeError("a channel was closed") from error
 
 
 class CommandGroup(TyperGroup):

@@ -7,6 +7,7 @@ from functools import partial
 
 import pytest
 
+from merge_sumo import api, cli
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
@@ -114,3 +115,27 @@ class TestAWrongSignature:
             else partial(check_call, arguments=("seen",))
         )
         check(names["f"])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("line\x1b[2J"),
+        KeyError("x"),
+        OSError(9, "no"),
+        EOFError(),
+        BrokenPipeError(32, ""),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_fault_of_ours_is_a_traceback_and_no_result(monkeypatch, command_line, error):
+    def fails(**_):
+        raise error
+
+    monkeypatch.setattr(api, "vuts", fails)
+    code, out, err = command_line("vuts")
+    assert (code, out) == (cli.FAULT, "")
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert f"{type(error).__name__}" in err
+    assert err.endswith("this is a fault of merge-sumo and no result: report it with these lines\n")
+    assert "\x1b" not in err
