@@ -190,7 +190,7 @@ class Corridor:
 
     path: Path
     sha256: str
-    """Hash of the net file."""
+    """Hash of the net, unpacked."""
     mainline_edges: tuple[str, ...]
     ramp_edges: tuple[str, ...]
     mainline: LanePath

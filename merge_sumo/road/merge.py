@@ -40,11 +40,10 @@ def road_of(
     Raises `UserError` when the file is no plain file, is no SUMO net, or has no such merge.
     """
     path = net or default_net_path()
-    content = received.read_bytes(path, "the net", follow_links=True, limit=received.MAX_NET_BYTES)
+    content = received.read_net(path)
     edges = tuple(mainline), tuple(ramp)
     key = (path, hashlib.sha256(content).hexdigest(), *edges, room_after_m, lane_m)
     if key not in _found:
-        received.check_text(content, f"the net {path}")
         net_file = NetFile(path, content)
         _found[key] = find_corridor(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
     return _found[key]

@@ -15,6 +15,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.road import allowed, received
 from merge_sumo.system.suggestions import meant
 
 VEHICLE_CLASS: Final = "passenger"
@@ -72,41 +73,28 @@ class Link:
 
 
 class NetFile:
-    """The lanes and connections of a net.
+    """The lanes and connections of a net, as far as `allowed.ROAD_NET` lists them.
 
-    Raises `UserError` when the file is missing, or is no SUMO net.
+    Raises `UserError` when the file cannot be read, is no SUMO net, or has a wrong value.
     """
 
     def __init__(self, path: Path, content: bytes | None = None) -> None:
-        """Read the file at `path`, or take its content."""
+        """Read the file at `path`, or take its unpacked content."""
         self.path = path
+        self.content = received.read_net(path) if content is None else content
         try:
-            self.content = path.read_bytes() if content is None else content
-        except OSError as error:
-            raise UserError(f"cannot read the net {path}: {error.strerror}") from error
-        parser = etree.XMLParser(
-            # Whatever the file declares: another encoding could hide what was looked for.
-            encoding="utf-8",
-            resolve_entities=False,
-            no_network=True,
-            remove_comments=True,
-            remove_pis=True,
-        )
-        try:
-            self._root = etree.fromstring(self.content, parser)
-        except etree.XMLSyntaxError as error:
-            raise UserError(f"the net {path} is not readable XML: {error!s:.200}") from error
-        if self._root.tag != "net":
-            option = MAP_OPTIONS.get(str(self._root.tag))
+            self._root = allowed.road_net(self.content, path)
+        except received.OtherRootError as error:
+            option = MAP_OPTIONS.get(error.tag)
             made = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
             how = made if option else ""
-            raise UserError(f"{path} is no SUMO net: it does not begin with <net>{how}")
+            raise UserError(f"{path} is no SUMO net: it does not begin with <net>{how}") from error
         self._edges = {str(edge.get("id")): edge for edge in self._root.iterfind("edge")}
         self._known: dict[str, Lane] = {}
 
     @property
     def sha256(self) -> str:
-        """Hash of the file's bytes."""
+        """Hash of the unpacked bytes: a packed net is the same road."""
         return hashlib.sha256(self.content).hexdigest()
 
     def lanes(self, edge: str) -> tuple[Lane, ...]:

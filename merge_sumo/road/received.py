@@ -5,14 +5,17 @@ So no file that came from outside reaches SUMO or netconvert. It is read here, w
 is no plain file, without entities and within limits, and what goes on is a tree of the elements
 and attributes that `allowed.py` lists. What is not listed is dropped, since the scenario needs none
 of it; a value that is not what its attribute holds is refused, since dropping it would change the
-road or the record.
+road or the record. A net that a user names is read in the same way by every command.
 """
 
 from __future__ import annotations
 
+import gzip
+import io
 import os
 import re
 import stat
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,10 +27,14 @@ from merge_sumo.errors import UserError
 
 MAX_BYTES: Final = 4 * 2**20
 MAX_NET_BYTES: Final = 2**28
-"""Of a net that a user names: that of a city has 50 MB. A received scenario has one corridor."""
+"""Of a net that a user names, unpacked: that of a city has 50 MB."""
 MAX_ELEMENTS: Final = 5_000
-"""A corridor has some twenty and a record less than a thousand; a world has its net 32 times."""
-MAX_CHARS: Final = 2**16
+"""Of a file of a replay folder: a corridor has some twenty and a record less than a thousand."""
+MAX_NET_ELEMENTS: Final = 4_000_000
+"""Of a net that a user names: that of a city has 500,000."""
+GZIP: Final = b"\x1f\x8b"
+"""How packed files begin."""
+MAX_CHARS: Final = 2**20
 """Of the value of an attribute."""
 MAX_NUMBER_CHARS: Final = 64
 
@@ -44,11 +51,15 @@ class Values:
 
 @dataclass(frozen=True, slots=True)
 class Allowed:
-    """The attributes and children of an element, and the names of those that are `required`."""
+    """The attributes and children of an element, and the names of those that are `required`.
+
+    One that `may_go` is dropped where a value of it is wrong, since nothing depends on it.
+    """
 
     attributes: Mapping[str, Values] = field(default_factory=dict)
     children: Mapping[str, Allowed] = field(default_factory=dict)
     required: tuple[str, ...] = ()
+    may_go: bool = False
 
 
 def number(low: float, high: float) -> Values:
@@ -94,6 +105,26 @@ def read_bytes(path: Path, what: str, *, follow_links: bool, limit: int = MAX_BY
         raise UserError(f"cannot read {what} {path}: it is no plain file")
     if len(content) > limit:
         raise UserError(f"cannot read {what} {path}: it is larger than {limit // 2**20} MiB")
+    return content
+
+
+def read_net(path: Path) -> bytes:
+    """Return the bytes of a net that a user names, unpacked where it is packed by gzip.
+
+    Every command and kind of controller reads nets here, so all take the same ones. Raises
+    `UserError` for what is no plain file, cannot be unpacked, or is larger than `MAX_NET_BYTES`.
+    """
+    content = read_bytes(path, "the net", follow_links=True, limit=MAX_NET_BYTES)
+    if not content.startswith(GZIP):
+        return content
+    try:
+        with gzip.open(io.BytesIO(content)) as packed:
+            content = packed.read(MAX_NET_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise UserError(f"cannot unpack the net {path} ({error}): copy or pack it again") from error
+    if len(content) > MAX_NET_BYTES:
+        size = f"{MAX_NET_BYTES // 2**20} MiB"
+        raise UserError(f"cannot read the net {path}: unpacked it is larger than {size}")
     return content
 
 
@@ -146,6 +177,15 @@ def serialize(root: etree._Element) -> bytes:
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
 
 
+class OtherRootError(UserError):
+    """For a file of another kind; `tag` is the root that it has."""
+
+    def __init__(self, name: str, expected: str, tag: str) -> None:
+        """Say it of a file by its name."""
+        super().__init__(f"{name} has another root than <{expected}>")
+        self.tag = tag
+
+
 class _Cleaner:
     """Builds the allowed tree while the parser reads, and holds nothing else."""
 
@@ -164,7 +204,7 @@ class _Cleaner:
         parent, expected = self._open[-1]
         if self._dropped or tag not in expected:
             if parent is None:
-                raise UserError(f"{self._name} has another root than <{next(iter(expected))}>")
+                raise OtherRootError(self._name, next(iter(expected)), tag)
             self._dropped += 1
             return
         allowed = expected[tag]
@@ -172,9 +212,12 @@ class _Cleaner:
         for name, text in kept.items():
             values = allowed.attributes[name]
             if not (len(text) <= MAX_CHARS and values.include(text)):
-                local = name.rpartition("}")[2]
+                if allowed.may_go:
+                    self._dropped += 1
+                    return
+                which = f"{tag} {attributes.get('id', ''):.40}".rstrip()
                 raise UserError(
-                    f"{self._name} has an element {tag} whose {local} is not {values.words}"
+                    f"{self._name} has an element {which} whose {name} is not {values.words}"
                 )
         for name in allowed.required:
             if name not in kept:

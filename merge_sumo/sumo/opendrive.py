@@ -11,9 +11,8 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.road import received
+from merge_sumo.road import allowed, received
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
 
 NET: Final = "road.net.xml"
@@ -22,8 +21,6 @@ ENTRY: Final = "entry"
 """OpenDRIVE's type of an acceleration lane."""
 SAME_M: Final = 0.5
 """Distance of the ends of one lane in SUMO and in OpenDRIVE, at most."""
-MAX_ELEMENTS: Final = 10**6
-"""Of the net of a corridor, which a user chose: that of a city."""
 
 
 def opendrive(road: Corridor) -> bytes:
@@ -31,13 +28,13 @@ def opendrive(road: Corridor) -> bytes:
 
     Raises `UserError` when the net file is gone or is another one now, or netconvert refuses it.
     """
-    limit = received.MAX_NET_BYTES
-    content = received.read_bytes(road.path, "the net", follow_links=True, limit=limit)
+    content = received.read_net(road.path)
     if hashlib.sha256(content).hexdigest() != road.sha256:
         raise UserError(
             f"the net {road.path} is not the one that was driven in: it changed; put that one there"
         )
-    net = received.cleaned(content, allowed.NET, f"the net {road.path}", MAX_ELEMENTS)
+    limit = received.MAX_NET_ELEMENTS
+    net = received.cleaned(content, allowed.NET, f"the net {road.path}", limit)
     with scratch_folder() as stage:
         (stage / NET).write_bytes(net)
         arguments = [

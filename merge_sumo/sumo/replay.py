@@ -15,11 +15,10 @@ import numpy as np
 from lxml import etree
 
 from merge_sumo.errors import UserError, notice
-from merge_sumo.road import received
+from merge_sumo.road import allowed, received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.received import Allowed
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, VEHICLES, VUT
-from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.replay_folder import (
     CONFIG,

@@ -15,10 +15,9 @@ import msgspec
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.road import received
+from merge_sumo.road import allowed, received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
-from merge_sumo.sumo import allowed
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
 NET: Final = "road.net.xml"
@@ -49,11 +48,8 @@ class _Setup(msgspec.Struct, frozen=True):
 
 def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
     """Write what a shadow SUMO loads; `UserError` for a net that cannot be read."""
-    name = f"the net {road.path}"
-    content = received.read_bytes(
-        road.path, "the net", follow_links=True, limit=received.MAX_NET_BYTES
-    )
-    (folder / NET).write_bytes(received.cleaned(content, allowed.ROAD_NET, name))
+    net = allowed.road_net(received.read_net(road.path), road.path)
+    (folder / NET).write_bytes(received.serialize(net))
     (folder / TYPES).write_bytes(_types(road, scenario))
     setup = _Setup(road, VEHICLES[: scenario.vehicles])
     (folder / SETUP).write_bytes(msgspec.json.encode(setup, enc_hook=str))

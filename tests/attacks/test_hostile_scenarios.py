@@ -23,10 +23,9 @@ import pytest
 from processes import cpu_s
 
 from merge_sumo.errors import UserError
-from merge_sumo.road import received
+from merge_sumo.road import allowed, received
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.sumo import allowed
 from merge_sumo.sumo import opendrive as opendrive_module
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
@@ -289,13 +288,13 @@ OF_A_KIND: dict[tuple[str, str], dict[str, Edit]] = {
             f'<edge id="e"><lane id="e_0" shape="{"1,1 " * 50_000}"/></edge>'
         ),
         "a net with coordinates that are none": instead('x="2000.000000"', 'x="nan"'),
-        "a net with a projection of a file": instead('"!"', '"+proj=utm +nadgrids={SECRET}"'),
-        "a net with a schema of its own": instead(SCHEMA, "http://{HOST}/net.xsd"),
         "a net with an id that is a path": instead('id="main_end"', 'id="../{SECRET}"'),
         "a net with an endless list of ids": instead('incLanes=""', f'incLanes="{"a" * 60_000}|"'),
     },
     (NET, IDENTICAL): {
         **{f"{name} in the net": added(text) for name, text in ADDITIONAL.items()},
+        "a net with a projection of a file": instead('"!"', '"+proj=utm +nadgrids={SECRET}"'),
+        "a net with a schema of its own": instead(SCHEMA, "http://{HOST}/net.xsd"),
         "a net with a controlled link": instead(
             'dir="s" state="Z"', 'dir="s" state="Z" tl="M" linkIndex="0" via="{SECRET}"'
         ),

@@ -244,17 +244,29 @@ def edited(old: str, new: str):
         (lambda text: text[:500], "not readable XML"),
         (lambda text: "<routes/>", "is no SUMO net: it does not begin with <net>"),
         (lambda text: "<osm/>", "make one of it: `netconvert --osm-files .* -o NAME.net.xml`"),
-        (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'), "is no number"),
-        (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "is no number"),
+        (
+            edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'),
+            "r1_0 whose length is",
+        ),
+        (
+            edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'),
+            "r1_0 whose length is",
+        ),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="1,1 1,1"'), "r1_0 has no length"),
-        (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="here"'), "is no number"),
+        (
+            edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="here"'),
+            "r1_0 whose shape is",
+        ),
         (edited(r'(id="r1_0" index="0" )', r'\1disallow="all" '), "no lane of edge r1 is open"),
         (edited(r'(<connection from="r1" [^>]*)via="[^"]*"', r'\1via=":x_0"'), "over lane :x_0"),
         (edited(r'<connection from="r1" [^>]*/>', ""), "edge r1 does not lead to edge out; in do"),
         (edited('<junction id="m" type="priority"', '<junction id="m" type="x"'), "of type x"),
         (edited('(<junction id="m" .*)incLanes="[^"]*"', r"\1"), "no junction at the end of lane"),
-        (edited('(<junction id="m" .*) x="[^"]*"', r'\1 x="far"'), "coordinate of junction m"),
+        (
+            edited('(<junction id="m" .*) x="[^"]*"', r'\1 x="far"'),
+            "junction m whose x is",
+        ),
     ],
 )
 def test_a_broken_net_is_refused_in_one_sentence(straight_net, tmp_path, edit, said):

@@ -4,8 +4,10 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 import os
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,17 +19,20 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
+from merge_sumo.road import received
 from merge_sumo.road.drawing import road_data
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.sumo import shadow_sumo
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import (
     HOLD_STEPS,
     write_scenario,
 )
+from merge_sumo.sumo.world import World
 from merge_sumo.verdict.score import Outcome, measure
 
 LANE_WIDTH_M = 3.2
@@ -194,7 +199,76 @@ def test_the_report_draws_cars_where_they_are_with_m_as_origin_and_the_road_to_t
     assert len(drawn["lanes"]) >= len(road.surroundings) + 4
 
 
+def packed(text: str) -> bytes:
+    return gzip.compress(text.encode())
+
+
+def replaced(old: str, new: str):
+    def replace(text: str) -> bytes:
+        assert old in text
+        return text.replace(old, new).encode()
+
+    return replace
+
+
+FAR_EDGES = "".join(
+    f'<edge id="x{n}" from="a{n}" to="b{n}"><lane id="x{n}_0" index="0" speed="9" length="9" '
+    f'shape="0,{n} 9,{n}"/></edge>'
+    for n in range(received.MAX_ELEMENTS // 4)
+)
+FAR_JUNCTIONS = "".join(
+    f'<junction id="a{n}" type="dead_end" x="0" y="{n}" incLanes="" intLanes="" shape="0,0 0,1"/>'
+    f'<junction id="b{n}" type="dead_end" x="9" y="{n}" incLanes="x{n}_0" intLanes="" '
+    'shape="0,0 0,1"/>'
+    for n in range(received.MAX_ELEMENTS // 4)
+)
+ODD = {
+    "packed": packed,
+    "of a town": lambda text: text.replace(
+        '<junction id="M"', f'{FAR_EDGES}{FAR_JUNCTIONS}<junction id="M"'
+    ).encode(),
+    "of an older schema": replaced("http://sumo.dlr.de/", "http://sumo.sf.net/"),
+    "with a long id": replaced('"ramp_start"', f'"cluster_{"1234567890_" * 60}"'),
+    "with ids of other characters": replaced('"ramp_start"', '"Köln/A3(Süd)=[1]@2"'),
+    "with a name of other characters": replaced('name="', 'name="A\u00a03\u200b'),
+    "with a file of heights": replaced(
+        'projParameter="!"', 'projParameter="+proj=utm +zone=32 +geoidgrids=egm96.gtx +no_defs"'
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ODD)
+def test_a_net_that_is_taken_once_is_taken_by_every_kind_of_controller_and_export(tmp_path, name):
+    path = tmp_path / "a.net.xml"
+    path.write_bytes(ODD[name](default_net_path().read_text(encoding="utf-8")))
+    road = road_of(path)
+    assert (road.mainline, road.ramp) == (road_of().mainline, road_of().ramp)
+    shadow_sumo.write_files(tmp_path, road, US23)
+    assert b"main_out" in (tmp_path / shadow_sumo.NET).read_bytes()
+    assert b"<road " in opendrive(road)
+    with World(1, road, scenario=US23) as world:
+        world.advance()
+
+
 class TestRoadOf:
+    def test_finds_the_same_road_in_a_packed_net(self, tmp_path):
+        (tmp_path / "us23.net.xml.gz").write_bytes(gzip.compress(default_net_path().read_bytes()))
+        road = road_of(tmp_path / "us23.net.xml.gz")
+        assert replace(road, path=default_net_path()) == road_of()
+
+    @pytest.mark.parametrize(
+        ("content", "said"),
+        [
+            (gzip.compress(b"<net>" + b" " * received.MAX_NET_BYTES), "unpacked it is larger than"),
+            (gzip.compress(b"<net/>")[:-3], "cannot unpack the net .*: copy or pack it again"),
+            (b"\x1f\x8bmore", "cannot unpack the net .*: copy or pack it again"),
+        ],
+    )
+    def test_refuses_what_cannot_be_unpacked(self, tmp_path, content, said):
+        (tmp_path / "a.net.xml.gz").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            road_of(tmp_path / "a.net.xml.gz")
+
     def test_finds_a_merge_once_and_again_when_the_file_was_changed(self, tmp_path, monkeypatch):
         path = FOREIGN["zipper"][0](tmp_path)
         edges = (["in", "out"], ["r0", "r1", "out", "out2"])
