@@ -25,7 +25,7 @@ LOADER_FAILED: Final = 127
 SUMO_VERSION: Final = "1.28.0"
 """The one whose motions are known; pyproject.toml pins the same."""
 PROGRAM_LIMIT_S: Final = 15.0
-"""Time that SUMO has for an episode, and netconvert for a net; both need a tenth of a second."""
+"""Time that SUMO has for an episode; it needs a tenth of a second."""
 
 SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""

@@ -19,6 +19,8 @@ NET: Final = "road.net.xml"
 ROAD: Final = "road.xodr"
 ENTRY: Final = "entry"
 """OpenDRIVE's type of an acceleration lane."""
+CONVERSION_LIMIT_S: Final = 180.0
+"""Time that netconvert has for a net; it needs 10 s for that of a city."""
 SAME_M: Final = 0.5
 """Distance of the ends of one lane in SUMO and in OpenDRIVE, at most."""
 
@@ -44,7 +46,7 @@ def opendrive(road: Corridor) -> bytes:
             *("--opendrive-output.straight-threshold", "180"),
             *("--precision", "6", "--no-warnings", "true", "--xml-validation", "never"),
         ]
-        ended = run_program("netconvert", arguments, stage)
+        ended = run_program("netconvert", arguments, stage, CONVERSION_LIMIT_S)
         if ended.code == 0 and (stage / ROAD).is_file():
             return _with_paths((stage / ROAD).read_bytes(), road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")

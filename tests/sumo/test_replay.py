@@ -286,7 +286,7 @@ CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
     *(
         (
             lambda record, number=number: record[ROW][0].set("pos", number),
-            "vehicle whose pos is not a number",
+            "vehicle pov whose pos is not a number",
         )
         for number in ("nan", "inf", "1e8", "", "0x10", "1_0", "\u0661")
     ),
