@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,13 @@ from merge_sumo.vuts.registry import KINDS
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 NAMED_FILE = re.compile(r"(?<![\w/])((?:merge_sumo|tests|tools)/[\w/-]+\.py)\b")
 PAGES = [*ROOT.glob("docs/**/*.md"), ROOT / "README.md", *(ROOT / page for page in SHOWN)]
+
+
+def defined_in(file: Path) -> set[str]:
+    """Return the names of the functions and classes of a file."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    kinds = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef
+    return {node.name for node in ast.walk(tree) if isinstance(node, kinds)}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
@@ -45,6 +53,37 @@ class TestTheArchitecture:
         files = set(re.findall(r"`(\w+/[\w/]+\.py)`", way))
         assert 1 < len(files) <= 8
         assert all((ROOT / "merge_sumo" / file).is_file() for file in files)
+
+    def test_names_files_that_are_there(self):
+        named = set(re.findall(r"`([\w/]+(?:\.py|/))`", self.PAGE))
+        assert len(named) > 30
+        below = (ROOT, ROOT / "merge_sumo")
+        assert [name for name in named if not any((one / name).exists() for one in below)] == []
+
+    def test_names_functions_and_classes_that_are_there(self):
+        names = {name for file in (ROOT / "merge_sumo").rglob("*.py") for name in defined_in(file)}
+        named = set(re.findall(r"`(?:\w+\.)?(?!py`)([A-Za-z_]\w+)(?:\([\w, ]*\))?`", self.PAGE))
+        assert len(named) > 15
+        assert named - names == set()
+
+    def test_names_functions_in_the_files_that_have_them(self):
+        where = re.compile(r"`(\w+)(?:\([\w, ]*\))?`(?:, then `(\w+)`,)? (?:in |\()`([\w/]+\.py)`")
+        named = where.findall(self.PAGE)
+        assert len(named) >= 6
+        for *functions, file in named:
+            assert {*functions} - {""} <= defined_in(ROOT / "merge_sumo" / file), (functions, file)
+
+    def test_names_all_that_run_cases_beside_evaluate(self):
+        (rule,) = re.findall(r"^- \*\*One plan.*$", self.PAGE, re.MULTILINE)
+        named = {file for file in re.findall(r"`(\w+/\w+\.py)`", rule) if "/" in file}
+        calls = re.compile(r"(?<!def )\b(?:rollout|Simulator)\((?!Simulator)")
+        package = ROOT / "merge_sumo"
+        calling = {
+            path.relative_to(package).as_posix()
+            for path in package.rglob("*.py")
+            if path.parent.name != "engine" and calls.search(path.read_text(encoding="utf-8"))
+        }
+        assert calling == named - {"campaigns/plan.py", "engine/rollout.py"}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
