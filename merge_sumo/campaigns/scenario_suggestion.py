@@ -146,10 +146,9 @@ def about(road: Corridor) -> list[str]:
     if road.is_one_path:
         paths = [("lane of all vehicles", road.mainline, road.mainline_edges)]
     for name, path, edges in paths:
+        # Those after M, too: all drive on there.
         limits = ", ".join(
-            f"{limit:g} m/s from {max(start_m, -path.before_m):.0f} m"
-            for start_m, limit in path.speed_limits_mps()
-            if start_m < 0.0
+            f"{limit:g} m/s from {start_m:.0f} m" for start_m, limit in path.speed_limits_mps()
         )
         lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
     m = road.lane_point(0.0, on_ramp=road.lane_m is None)
@@ -168,9 +167,9 @@ def about(road: Corridor) -> list[str]:
             f"share of {share:.2f} of the acceleration lane",
         ]
     lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
-    first = "ramp" if road.mainline_approach.yields else "mainline"
-    yields = road.mainline_approach.yields or road.ramp_approach.yields
-    lines.append(f"right of way: the {first} goes first" if yields else "right of way: none first")
+    yields = road.mainline_approach.yields, road.ramp_approach.yields
+    first = {(True, False): "the ramp goes", (False, True): "the mainline goes"}
+    lines.append(f"right of way: {first.get(yields, 'neither road goes')} first")
     if road.lane_drop:
         lines.append("one path comes to M on a lane that ends")
     return lines

@@ -33,6 +33,8 @@ SURROUNDINGS_M: Final = 500.0
 """Distance to M up to which lanes beside the paths are drawn."""
 POINT_M: Final = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
+FOLLOWED_EDGES: Final = 5
+"""How many edges behind those that a user names are searched for where both paths meet."""
 
 
 def find_corridor(
@@ -216,8 +218,8 @@ def _split(
     common = next((edge for edge in ramp if edge in mainline), None)
     if common is None:
         raise net.broken(
-            f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet; name the "
-            "edge behind the merge point as the last one of both"
+            f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet"
+            f"{_how_they_meet(net, mainline, ramp)}"
         )
     # A mainline may go round a ring and come by the edge again.
     again = common in mainline[1:]
@@ -236,6 +238,35 @@ def _split(
             f"before it: {' or '.join(net.edges_into(common)) or 'the net has none'}"
         )
     return (mainline[: at[0]], ramp[: at[1]]), max(tails, key=len)
+
+
+def _how_they_meet(net: NetFile, mainline: _Edges, ramp: _Edges) -> str:
+    """Return what to name instead of two paths that never meet: few edges more, if that helps."""
+    onward: list[dict[str, _Edges]] = []
+    for path in (mainline, ramp):
+        reached = dict.fromkeys(path[1:], path)  # the merge is behind the first one
+        latest = [path] if path else []
+        for _ in range(FOLLOWED_EDGES):
+            latest = [(*edges, name) for edges in latest for name in _following(net, edges[-1])]
+            latest = [edges for edges in latest if edges[-1] not in reached]
+            reached = {edges[-1]: edges for edges in reversed(latest)} | reached
+        onward.append(reached)
+    mainlines, ramps = onward
+    both = [(mainlines[edge], ramps[edge]) for edge in mainlines if edge in ramps]
+    if not both:
+        return (
+            f", nor do they within {FOLLOWED_EDGES} edges more: name the edge behind the merge "
+            "point as the last one of both"
+        )
+    mainline, ramp = min(both, key=lambda pair: (len(pair[0]) + len(pair[1]), pair))
+    edge = next(edge for edge in ramp if edge in mainline)
+    return f'; both lead to edge {edge}: name "{" ".join(mainline)}" and "{" ".join(ramp)}"'
+
+
+def _following(net: NetFile, edge: str) -> list[str]:
+    """Return the edges to which lanes of an edge lead that cars may drive on."""
+    names = {name for lane in net.lanes(edge) for name in net.edges_from(lane)}
+    return sorted(name for name in names if net.is_open_to_cars(name))
 
 
 def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
@@ -263,6 +294,44 @@ def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
 def _meeting(
     net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
 ) -> _Meeting:
+    """Return the meeting of the paths; where they have none, say what follows on them."""
+    if (found := _met(net, own, tail, layers)) is not None:
+        return found
+    last, reason = tail[-1], "mainline and ramp have no lane in common up to the end of edge"
+    ends = {lane.id: lane for lane in net.lanes(last)}
+    main_to, ramp_to = (
+        " or ".join(sorted({name for id_ in path[-1] for name in net.edges_from(ends[id_])}))
+        for path in layers
+    )
+    leads = (
+        f"the ramp's lane leads to {ramp_to or 'no edge'} and the mainline's to "
+        f"{main_to or 'no edge'}"
+    )
+    onward: list[_Edges] = [()]
+    for _ in range(FOLLOWED_EDGES):
+        onward = [
+            (*edges, name) for edges in onward for name in _following(net, (last, *edges)[-1])
+        ]
+        for edges in onward:
+            whole = [_layers(net, one + tail + edges, len(one)) for one in own]
+            found = _met(net, own, tail + edges, whole)
+            if found is not None and not (
+                # Where the mainline leads elsewhere, its lane does not end.
+                found.drop is found.mainline and net.edges_from(found.mainline.source)
+            ):
+                what = "the edge that follows" if len(edges) == 1 else "the edges that follow"
+                raise net.broken(
+                    f"{reason} {last}: {leads}; name {what} on both: {' '.join(edges)}"
+                )
+    raise net.broken(
+        f"{reason} {last}: {leads}, and up to {FOLLOWED_EDGES} edges on they come to no common "
+        "lane, so no merge is needed there"
+    )
+
+
+def _met(
+    net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
+) -> _Meeting | None:
     """Return the meeting of the paths: by connections, or where a lane of one of them ends."""
     mainline, ramp = (path[len(edges) :] for path, edges in zip(layers, own, strict=True))
     for place, edge in enumerate(tail):
@@ -276,16 +345,7 @@ def _meeting(
         links = _lane_drop(net, mainline[place], ramp[place], tail[place : place + 2])
         if links is not None:
             return _Meeting(*links, place=place + 1)
-    last = tail[-1]
-    following = sorted({name for lane in net.lanes(last) for name in net.edges_from(lane)})
-    raise net.broken(
-        f"mainline and ramp have no lane in common up to the end of edge {last}; "
-        + (
-            f"name the edge that follows on both: {' or '.join(following)}"
-            if following
-            else "the ramp's lane goes on beside the mainline, and no merge is needed"
-        )
-    )
+    return None
 
 
 def _lane_drop(

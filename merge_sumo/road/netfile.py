@@ -123,19 +123,28 @@ class NetFile:
         ]
 
     def edges_into(self, edge: str) -> list[str]:
-        """Return the edges from which a connection leads into an edge."""
+        """Return the edges from which a connection leads into an edge, turning back left out."""
         sources = {
             str(connection.get("from"))
             for connection in self._root.iterfind("connection")
-            if connection.get("to") == edge
+            if connection.get("to") == edge and not _turns_back(connection)
         }
         return sorted(name for name in sources if not name.startswith(":"))
 
     def edges_from(self, lane: Lane) -> list[str]:
-        """Return the edges to which a connection leads from a lane."""
+        """Return the edges to which a connection leads from a lane, turning back left out."""
         elements = self._connections.get((lane.edge, str(lane.index)), ())
-        names = {str(element.get("to")) for element in elements if _open_to_cars(element)}
+        names = {
+            str(element.get("to"))
+            for element in elements
+            if _open_to_cars(element) and not _turns_back(element)
+        }
         return sorted(name for name in names if not name.startswith(":"))
+
+    def is_open_to_cars(self, edge: str) -> bool:
+        """Return whether cars may drive on a lane of an edge."""
+        lanes = self._edges[edge].iterfind("lane") if edge in self._edges else ()
+        return any(map(_open_to_cars, lanes))
 
     def junction(self, source: Lane) -> tuple[str, str]:
         """Return id and type of the junction at the end of a lane; `UserError` without one."""
@@ -278,6 +287,11 @@ def _lane(lane: etree._Element) -> Lane:
 def _point(text: str) -> Point:
     x, y, *z = map(float, text.split(","))
     return x, y, z[0] if z else 0.0
+
+
+def _turns_back(connection: etree._Element) -> bool:
+    """Whether a connection leads to the opposite direction of its road."""
+    return connection.get("dir") in ("t", "T")
 
 
 def _open_to_cars(element: etree._Element) -> bool:

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from foreign_nets import FOREIGN, edge, node, plain, straight
+from foreign_nets import FOREIGN, edge, lane, node, plain, straight
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import DRAWN_MIN_M, LanePath, Piece
@@ -214,7 +214,9 @@ def test_a_start_before_the_path_is_refused(corridor):
     [
         ("in out", "r9 out", "has no edge r9: did you mean r[01] or r[01]"),
         ("in :m_0", "r1 out", "has no edge :m_0"),
-        ("in out", "r1", "never meet; name the edge behind the merge point"),
+        ("in out", "r1", 'never meet; both lead to edge out: name "in out" and "r1 out"'),
+        ("in", "r0", 'never meet; both lead to edge out: name "in out" and "r0 r1 out"'),
+        ("out", "out2", "never meet, nor do they within 5 edges more: name the edge behind"),
         ("in r1 out", "r0 out", "edge in does not lead to edge r1; r0 do"),
         ("in out", "r0 out", "edge r0 does not lead to edge out; in and r1 do"),
         ("out out2", "r1 out", "mainline begins with edge out, which the other path uses too"),
@@ -228,6 +230,51 @@ def test_what_is_no_merge_is_refused_in_one_sentence(straight_net, mainline, ram
         find_corridor(straight_net, mainline.split(), ramp.split())
     assert "\n" not in str(error.value)
     assert str(straight_net.path) in str(error.value)
+
+
+NAMED = [
+    (
+        *("in acc", "ramp acc"),
+        "the ramp's lane leads to exit or mid and the mainline's to mid; name the edges that "
+        "follow on both: mid out",
+    ),
+    (
+        *("in acc mid", "ramp acc mid"),
+        "the ramp's lane leads to no edge and the mainline's to out; name the edge that follows on "
+        "both: out",
+    ),
+    (
+        *("back acc", "ramp acc"),
+        "up to 5 edges on they come to no common lane, so no merge is needed there",
+    ),
+    ("in", "ramp", 'both lead to edge acc: name "in acc" and "ramp acc"'),
+    ("exit", "out", ", nor do they within 5 edges more"),
+    ("acc mid", "ramp acc mid", "name an edge before it: in or ramp"),
+]
+
+
+@pytest.mark.parametrize(("mainline", "ramp", "said"), NAMED)
+def test_what_is_named_to_follow_on_both_leads_to_a_merge(tmp_path, mainline, ramp, said):
+    """An acceleration lane over two edges, with an exit and with places to turn back."""
+    net = NetFile(
+        plain(
+            tmp_path,
+            node("a", -800, 0) + node("n", -300, 0) + node("k", 0, 0) + node("d", 200, 0)
+            + node("b", 700, 0) + node("r", -500, -90) + node("x", 100, -100),
+            edge("in", "a", "n", 2, 36, priority=9) + edge("acc", "n", "k", 3, 36, priority=9)
+            + edge("mid", "k", "d", 3, 36, priority=9) + edge("out", "d", "b", 2, 36, priority=9)
+            + edge("back", "k", "n", 1, 36) + edge("exit", "k", "x", 1, 20)
+            + edge("ramp", "r", "n", 1, 22, priority=3),
+            lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
+            + lane("mid", 1, "out", 0) + lane("mid", 2, "out", 1),
+        )
+    )  # fmt: skip
+    assert net.content.count(b'dir="t"') == 4
+    with pytest.raises(UserError, match=re.escape(said)):
+        find_corridor(net, mainline.split(), ramp.split())
+    road = find_corridor(net, ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
+    assert road.acceleration_lane.lanes == ("acc_0", "mid_0")
+    assert road.acceleration_lane.exits == ()
 
 
 def edited(old: str, new: str):

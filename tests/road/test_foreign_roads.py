@@ -7,6 +7,7 @@ from __future__ import annotations
 import gzip
 import math
 import os
+import re
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,6 +18,7 @@ from foreign_nets import FOREIGN, LANES, lane_corridor_of
 from handmade import write_run
 from lxml import etree
 
+from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road import received
@@ -248,6 +250,22 @@ def test_a_net_that_is_taken_once_is_taken_by_every_kind_of_controller_and_expor
     assert b"<road " in opendrive(road)
     with World(1, road, scenario=US23) as world:
         world.advance()
+
+
+@pytest.mark.parametrize(
+    ("name", "first"),
+    [("priority", "the mainline goes first"), ("zipper", "neither road goes first")],
+)
+def test_a_road_says_who_goes_first_and_its_limits_behind_m(tmp_path, name, first):
+    build, mainline, ramp = FOREIGN[name]
+    net = build(tmp_path)
+    text = re.sub(r'(id="out_\d" .*?speed=)"[\d.]+"', r'\1"1.39"', net.read_text())
+    net.write_text(text)
+    lines = api.new_scenario(tmp_path / "a.toml", net=net, mainline=mainline, ramp=ramp).lines()
+    assert f"right of way: {first}" in lines
+    assert all(
+        re.search(r"limits: .* m/s from -\d.*, 1\.39 m/s from 0 m", line) for line in lines[1:3]
+    )
 
 
 class TestRoadOf:
