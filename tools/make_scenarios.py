@@ -16,20 +16,22 @@ from matplotlib.figure import Figure
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.simulator import Simulator
+from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.verdict.score import Outcome, measure
 
 STYLES: dict[str, dict[str, Any]] = {
-    "POV": {"color": "#e69f00"},
-    "VUT": {"color": "#0072b2"},
-    "car ahead": {"color": "#009e73", "linestyle": "--"},
-    "car behind": {"color": "#a6518b", "linestyle": ":"},
+    "POV": {"color": COLOURS["pov"]},
+    "VUT": {"color": COLOURS["vut"]},
+    "car ahead": {"color": COLOURS["ahead"], "linestyle": "--"},
+    "car behind": {"color": COLOURS["behind"], "linestyle": ":"},
 }
 """Lines of the vehicles, in the order of their rows."""
 SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
@@ -94,11 +96,11 @@ def draw(trajectory: Trajectory, title: str, path: Path) -> None:
     left, right = figure.subplots(1, 2)
     time_s = [step * DT_S for step in range(len(trajectory.motion))]
     vehicles = trajectory.motion.shape[1]
-    for axes, column, unit in ((left, 0, "distance to M in m"), (right, 1, "speed in m/s")):
+    for axes, column, unit in ((left, 0, X_AXIS), (right, 1, "speed, m/s")):
         for row, (label, style) in enumerate(STYLES.items()):
             if row < vehicles:
                 axes.plot(time_s, trajectory.motion[:, row, column], label=label, **style)
-        axes.set_xlabel("time in s")
+        axes.set_xlabel("time, s")
         axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
     left.axhline(0.0, color="black", linewidth=0.8)

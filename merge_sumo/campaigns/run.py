@@ -179,6 +179,18 @@ class Run:
         return may_stop and has_converged(self.outcomes, self.tolerated)
 
     @property
+    def simulated_s(self) -> float:
+        """Simulated time of all cases with the follow-up; up to M where the motion is lost."""
+        steps = {one.index: round(one.measures.t_end_s / DT_S) for one in self.outcomes}
+        for batch in {one.batch for one in self.outcomes}:
+            with suppress(*UNREADABLE_NPZ):
+                read = read_arrays(batch_file(self.folder, batch), "index", "rows")
+                ran = np.maximum(read["rows"], 1) - 1
+                whole = dict(zip(read["index"].tolist(), ran.tolist(), strict=True))
+                steps |= {one: int(whole[one]) for one in steps.keys() & whole}
+        return round(sum(steps.values()) * DT_S, 1)
+
+    @property
     def interruption(self) -> str:
         """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
         fewer = len(self.outcomes) < self.settings.cases and not self.settings.stop_when_converged

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.campaigns.run import AGAINST, Run
-from merge_sumo.reports.pages import page
+from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
@@ -111,12 +111,12 @@ def _differ_s(earlier: FloatArray | None, later: FloatArray | None) -> float | N
 
 
 def _charts(earlier: FloatArray | None, later: FloatArray | None) -> list[dict[str, Any]]:
-    """Return speeds and distances to M of all cars in both motions, over the same axes."""
+    """Return speeds and positions of all cars in both motions, over the same axes."""
     known = [
         (name, one) for name, one in (("earlier", earlier), ("later", later)) if one is not None
     ]
     charts = []
-    for title, k in (("speed, m/s", 1), ("distance to M, m", 0)) if known else ():
+    for title, k in (("speed, m/s", 1), (X_AXIS, 0)) if known else ():
         values = np.concatenate([one[:, :, k].ravel() for _, one in known])
         low, high = float(values.min()), float(values.max())
         # The VUT lies on top.

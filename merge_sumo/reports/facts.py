@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Final
 
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, Run, failures
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
 from merge_sumo.campaigns.settings import named_again
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
@@ -288,8 +288,8 @@ def _repeats(run: Run) -> Iterator[Fact]:
 
 def _motion(run: Run, unsure: set[int]) -> Iterator[Fact]:
     worst = failures(run.cases)
-    driven_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
-    yield Fact("simulated time", driven_s / 3600.0, "h", OUTCOMES, "t_end_s")
+    key = f"t_end_s; the follow-up by {TRAJECTORIES}/"
+    yield Fact("simulated time", run.simulated_s / 3600.0, "h", OUTCOMES, key)
     if not worst:
         return
     yield Fact(WORST, worst[0].index, "", OUTCOMES, "lowest margin")

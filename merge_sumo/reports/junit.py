@@ -5,7 +5,7 @@ timeout are a `failure`, an error of the VUT or of the simulation an `error`, an
 undecided is `skipped`. The type of a failure is its severity: contact, conflict, harsh or safe.
 A first suite has the gates, whether anything was tested, and the facts as properties. A campaign
 against an earlier version of the VUT has a suite of the cases that one of both fails, in which what
-broke is a `failure`. Times are simulated seconds.
+broke is a `failure`. Times are simulated seconds, up to M.
 """
 
 from __future__ import annotations

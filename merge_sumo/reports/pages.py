@@ -18,6 +18,8 @@ from merge_sumo.system.printable import counted, printable, quoted
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+X_AXIS: Final = "x, m (0 at M, negative before it)"
+"""The label of positions over time, in all charts."""
 TEMPLATES: Final = Path(__file__).parent / "templates"
 ERROR_CHARACTERS: Final = 2000
 """Of a message or a setting in a page; the files of the run folder have the whole."""
@@ -55,7 +57,7 @@ def environment() -> Environment:
         loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True
     )
     made.globals |= {"level_name": level_name, "counted": counted, "quoted": quoted}
-    made.globals |= {"described": described}
+    made.globals |= {"described": described, "x_axis": X_AXIS}
     made.filters["shown"] = lambda value: printable(str(value)[:ERROR_CHARACTERS])
     return made
 

@@ -13,6 +13,7 @@ from typing import Any
 from lxml import etree
 
 from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.scenario.scenario import MergeScenario
 
 WIDTH_PX = 1000
@@ -53,11 +54,11 @@ def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
         _line(root, [point[:2] for point in shape], "#dfdcd5", LANE_M)
     _line(root, paths[False], "#c9c7c1", LANE_M)
     _line(root, paths[True], "#c9c7c1", LANE_M)
-    _line(root, window, "#e69f00", LANE_M / 2.0)
+    _line(root, window, COLOURS["pov"], LANE_M / 2.0)
     marks = [
-        (scenario.x_vut0_m, True, "#0072b2", "VUT"),
+        (scenario.x_vut0_m, True, COLOURS["vut"], "VUT"),
         (0.0, scenario.lane_m is None, "#d55e00", "M"),
-        (scenario.x_pov0_m[0], False, "#e69f00", "POV"),
+        (scenario.x_pov0_m[0], False, COLOURS["pov"], "POV"),
     ]
     if scenario.lane_m is not None:
         # At its very end the path of the ramp is on the mainline.

@@ -19,11 +19,12 @@ from typing import Any, Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, load_libsumo, scratch_folder
 from merge_sumo.sumo.child import Channel, ChildDiedError, SumoChild, channel_of
 from merge_sumo.sumo.replay import check_display
-from merge_sumo.sumo.replay_folder import COLOURS, WINDOW, beside, view_settings
+from merge_sumo.sumo.replay_folder import WINDOW, beside, view_settings
 from merge_sumo.system.interrupt import stopping_in_order
 
 LEAST_M: Final = 120.0
@@ -146,8 +147,7 @@ class Window(AbstractContextManager["Window"]):
         """Give the cars the colours that they have in a replay."""
         vehicle = self.vehicle
         for name in vehicle.getIDList():
-            colour = [round(255 * float(part)) for part in COLOURS[_car(name)].split(",")]
-            vehicle.setColor(name, (*colour, 255))
+            vehicle.setColor(name, (*rgb(_car(name)), 255))
 
     def _look(self) -> None:
         """Write the speeds beside the cars, and let the view follow the VUT.

@@ -25,6 +25,7 @@ from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
@@ -74,13 +75,6 @@ PALE: Final = "0.93,0.93,0.90"
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that a person sees how it ended."""
 
-COLOURS: Final = {
-    "pov": "0.90,0.62,0",
-    "vut": "0,0.45,0.70",
-    "ahead": "0,0.62,0.45",
-    "behind": "0.65,0.32,0.56",
-}
-"""Of the cars, as in the report."""
 NAMES: Final = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
 TEXT: Final = "text"
 """Parameter of a point of interest that is shown."""
@@ -208,7 +202,7 @@ def _types(trajectory: Trajectory) -> etree._Element:
             root,
             "vType",
             id=name,
-            color=COLOURS[name],
+            color=_colour(name),
             guiShape="passenger/sedan",
             length=f"{length_m:g}",
             minGap="0",
@@ -277,6 +271,11 @@ def view_settings(
     etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
+
+
+def _colour(vehicle: str) -> str:
+    """Return the colour of a vehicle as SUMO writes it."""
+    return ",".join(f"{part / 255.0:.2f}" for part in rgb(vehicle))
 
 
 def _text(of: str, size: str, colour: str) -> dict[str, str]:
@@ -368,7 +367,7 @@ def labels_of(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etr
     y = picture.y_m + LEGEND * picture.height_m
     for row, name in enumerate(cars):
         x = picture.x_m + (row - (len(cars) - 0.5) / 2.0) * apart_m
-        _label(root, name, (x, y), "", COLOURS[name], dot_m)
+        _label(root, name, (x, y), "", _colour(name), dot_m)
         middle = x + (DOT + 0.5 * LETTER * len(NAMES[name])) * picture.width_m
         _label(root, f"{name}-name", (middle, y - RAISED * picture.height_m), NAMES[name])
     return root

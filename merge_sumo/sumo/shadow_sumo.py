@@ -17,6 +17,7 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road import allowed, received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
@@ -25,7 +26,7 @@ TYPES: Final = "types.add.xml"
 SETUP: Final = "setup.json"
 COMMANDED_VUT: Final = 38
 """Speed mode of the VUT as it departs: its limits of acceleration act, SUMO's checks do not."""
-COLOURS: Final = (230, 64, 38, 255), (26, 89, 230, 255)
+COLOURS: Final = (*rgb("pov"), 255), (*rgb("vut"), 255)
 """Of the cars of the mainline, and of the VUT."""
 FASTEST_MPS: Final = 45.0
 """Speed that a car can drive wherever the road allows less; the limit of the shipped road."""

@@ -15,13 +15,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.scenario.scenario import Scenario
 
 BACKGROUND: Final = "#ffffff"
 ROAD: Final = "#c9c7c1"
 INK: Final = "#1c2228"
-COLOURS: Final = {"POV": "#e69f00", "VUT": "#0072b2"}
-"""Those of the player (`reports/templates/report.css`)."""
 SIZE_PX: Final = (960, 240)
 FINER: Final = 2
 """The picture is drawn so many times larger, and made smaller, so that edges are smooth."""
@@ -117,9 +116,8 @@ class GamePicture:
         is_above = fronts[0, 1] > fronts[1, 1]
         for (who, (x_m, v_mps)), front in zip(moving.items(), fronts, strict=True):
             rear = self._place(who, x_m - self._lengths_m[who])
-            self._line(
-                canvas, COLOURS[who], pixels(np.array([rear, front])), CAR_WIDTH_M * px_per_m
-            )
+            ends = pixels(np.array([rear, front]))
+            self._line(canvas, COLOURS[who.lower()], ends, CAR_WIDTH_M * px_per_m)
             text = self._font.render(f"{who} {v_mps:.1f} m/s", True, INK)
             x, y = pixels(np.array([(rear + front) / 2.0]))[0]
             aside = 2.4 * px_per_m + text.get_height() / 2.0

@@ -45,4 +45,4 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
                 # These stop short of M and can wait there, if the POV moves on.
                 avoidable[driving] |= bool((cars[-1, :, 1] > 0.0).all())
                 break
-    return float(starts[avoidable][-1] * DT_S) if avoidable.any() else None
+    return round(float(starts[avoidable][-1]) * DT_S, 1) if avoidable.any() else None

@@ -61,6 +61,20 @@ def test_are_what_the_lines_of_the_folder_say(made, facts):
     assert sum(untested) == 3
 
 
+def test_the_simulated_time_has_the_follow_up(run, tmp_path):
+    up_to_m_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
+    driven_s = sum(0.1 * (len(run.trajectory(one.index).whole) - 1) for one in run.outcomes)
+    assert run.simulated_s == pytest.approx(driven_s)
+    assert driven_s > up_to_m_s + len(run.outcomes), "more than a second a case"
+    (found,) = (fact for fact in CampaignRun(run).facts if fact.name == "simulated time")
+    assert found.value == pytest.approx(driven_s / 3600.0)
+    lost = tmp_path / "lost"
+    lost.mkdir()
+    for name in ("campaign.json", "outcomes.jsonl"):
+        (lost / name).write_bytes((run.folder / name).read_bytes())
+    assert Run(lost).simulated_s == pytest.approx(up_to_m_s)
+
+
 def test_stand_once_each_with_a_file_of_the_folder(made):
     found = CampaignRun(made).facts
     assert set(Counter((fact.name, fact.level) for fact in found).values()) == {1}

@@ -13,13 +13,14 @@ from test_report import data_of, text_of
 
 from merge_sumo.api import CampaignRun
 from merge_sumo.campaigns.run import Run
+from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.reports.report import report_page
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.verdict.severity import Severity, meanings
 
 LANE = named_scenario("us23-lane")
 OF_M = (
-    *("due at M (at constant speed)", "distance to M, m", "M, where a merge is expected"),
+    *("due at M (at constant speed)", X_AXIS, "M, where a merge is expected"),
     "M = 0, where a merge is expected",
 )
 """What M, the place at which a merge is expected, is still named in."""

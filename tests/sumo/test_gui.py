@@ -17,8 +17,9 @@ from PIL import Image
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
+from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.sumo.replay_folder import COLOURS, LABELS, VIEW
+from merge_sumo.sumo.replay_folder import LABELS, VIEW
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.conflict import Conflict
 
@@ -110,9 +111,7 @@ def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
 def car(image: np.ndarray, who: str) -> np.ndarray:
     """Return the pixels of a car, which is below the labels."""
     labels = round(LABELS_SHARE * image.shape[0])
-    return np.array([labels, 0]) + places(
-        image[labels:], tuple(255.0 * float(part) for part in COLOURS[who].split(","))
-    )
+    return np.array([labels, 0]) + places(image[labels:], rgb(who))
 
 
 def test_the_cars_meet(pictures):
@@ -151,6 +150,6 @@ def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pi
         assert len(places(top, (26.0, 26.0, 26.0))) > 100, "a text"
         for who in ("pov", "vut"):
             (named,) = set(re.findall(f"--{who}: #([0-9a-f]{{6}})", css.partition("@media")[0]))
-            rgb = tuple(255.0 * float(part) for part in COLOURS[who].split(","))
-            assert rgb == pytest.approx(tuple(bytes.fromhex(named)), abs=2.0)
-            assert len(places(top, rgb)) > 20, "a dot of the legend"
+            colour = rgb(who)
+            assert colour == pytest.approx(tuple(bytes.fromhex(named)), abs=2.0)
+            assert len(places(top, colour)) > 20, "a dot of the legend"

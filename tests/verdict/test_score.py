@@ -190,6 +190,12 @@ class TestMeasures:
         # 2 t^2 = 6, t = 1.73 s, 28.6 m; accelerating by 2 m/s2 it is t^2 = 6, 2.45 s, 55 m.
         assert measures.last_avoidable_s == pytest.approx((100 - 28.6) / 20, abs=0.1)
 
+    def test_the_last_way_out_is_a_time_of_the_record(self):
+        """Not 6.6000000000000005, as 66 times 0.1 is."""
+        for start_m in range(-200, -50):
+            found = measure(eq4(start_m, 20.0, 0.0, start_m, 20.0, 0.0)).last_avoidable_s
+            assert repr(found) == f"{found:.1f}"
+
     def test_a_collision_right_at_the_start_was_not_avoidable(self):
         measures = measure(eq4(-4.0, 20.0, 0.0, -4.0, 20.0, 0.0))
         assert measures.is_close

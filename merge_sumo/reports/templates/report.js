@@ -312,10 +312,10 @@ function whyCharts(i) { // why it failed: until when something could be done, an
   drawAxes(byId("why-changes"), found.axes);
   return [moments(byId("why-time"), i)];
 }
-function moments(svg, i) { // both distances to M, and the last moments at which something helps
+function moments(svg, i) { // both positions, and the last moments at which something helps
   const { until, x } = moving, end = until * DT;
-  const lines = vehicles.map((name, who) => ({ name, points: x[who].slice(0, until + 1).map((place, t) => [t * DT, -place]) }));
-  const dots = [{ name: "merged", x: end, y: -x[VUT][until] }];
+  const lines = vehicles.map((name, who) => ({ name, points: x[who].slice(0, until + 1).map((place, t) => [t * DT, place]) }));
+  const dots = [{ name: "merged", x: end, y: x[VUT][until] }];
   const yRange = range(lines.flatMap(({ points }) => points.map(([, y]) => y)));
   const chart = plot(svg, { xRange: [0, end], yRange, xLabel: "time, s", lines, dots }), [top, bottom] = [8, 162];
   const never = cases.kind[i] !== null && cases.last_avoidable_s[i] === null, closes = never ? 0 : cases.last_avoidable_s[i];
