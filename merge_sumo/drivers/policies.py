@@ -146,10 +146,13 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
 
 
 def _content(path: Path) -> bytes:
-    """Return the bytes of a file; OSError where it is none, or a giant one."""
+    """Return the bytes of a file; OSError where it is none, or too large."""
     found = path.stat()
-    if not stat.S_ISREG(found.st_mode) or found.st_size > MOST_BYTES:
-        raise OSError(errno.EINVAL, "it is no file, or a giant one", str(path))
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "it is no file", str(path))
+    if found.st_size > MOST_BYTES:
+        told = f"it has {found.st_size:,} bytes, and at most {MOST_BYTES:,} are read"
+        raise OSError(errno.EFBIG, told, str(path))
     return path.read_bytes()
 
 

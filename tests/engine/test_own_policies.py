@@ -139,9 +139,18 @@ class TestAShippedLibrary:
 
 
 class TestAFolder:
-    @pytest.mark.parametrize("what", ["gone", "another", "a pipe", "a folder", "a giant"])
+    @pytest.mark.parametrize(
+        ("what", "sentence"),
+        [
+            ("gone", ""),
+            ("another", ""),
+            ("a pipe", "it is no file"),
+            ("a folder", "it is no file"),
+            ("a giant", f"it has {MOST_BYTES + 1:,} bytes, and at most {MOST_BYTES:,} are read"),
+        ],
+    )
     def test_whose_networks_are_not_those_of_its_manifest_leaves_nothing(
-        self, same, tmp_path, what
+        self, same, tmp_path, what, sentence
     ):
         folder = Path(shutil.copytree(same, tmp_path / "policies"))
         network = folder / "pov1.safetensors"
@@ -155,7 +164,7 @@ class TestAFolder:
         elif what == "a giant":
             with network.open("wb") as file:
                 file.truncate(MOST_BYTES + 1)
-        with pytest.raises(UserError, match=r"pov1\.safetensors"):
+        with pytest.raises(UserError, match=rf"pov1\.safetensors.*{sentence}"):
             run_campaign(settings(folder), tmp_path / "run")
         assert not (tmp_path / "run").exists()
 
