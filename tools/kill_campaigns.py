@@ -1,7 +1,8 @@
 """Kill campaigns and resume them: `python tools/kill_campaigns.py --kills 100`.
 
 Every campaign is killed once (SIGKILL), at a place drawn from a seed, and resumed; then its
-outcomes must be those of a campaign that nobody disturbed, byte for byte. The places take turns:
+outcomes must be those of a campaign that nobody disturbed, byte for byte, and what it left in the
+folder for temporary files must be gone. The places take turns:
 
     moment  any time between the start and the end of the campaign
     sync    between a write and its sync to the disk, of any file of the journal
@@ -176,6 +177,9 @@ def main() -> None:
     load_libsumo()
     same = 0
     with tempfile.TemporaryDirectory() as scratch:
+        temporary = Path(scratch) / "tmp"
+        temporary.mkdir()
+        tempfile.tempdir = os.environ["TMPDIR"] = str(temporary)
         expected, whole_s = {}, 0.0
         for sampler in SAMPLERS:
             folder = Path(scratch) / sampler
@@ -196,11 +200,12 @@ def main() -> None:
             )
             resumed = ended(forked(partial(again, folder)))
             equal = resumed == 0 and (folder / OUTCOMES).read_bytes() == expected[sampler]
-            same += equal
+            left = [path.name for path in temporary.iterdir()]
+            same += equal and not left
             state = f"after {lines} outcomes" if there else "before there was a folder"
             print(
                 f"{kill + 1:4d} {place:7s} {sampler:9s} exit {code:3d} {state}, resumed: "
-                f"{'the same' if equal else 'NOT THE SAME'}",
+                f"{'the same' if equal else 'NOT THE SAME'}{f', LEFT {left}' if left else ''}",
                 flush=True,
             )
     print(f"the same outcomes.jsonl after {same} of {chosen.kills} kills")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -35,6 +34,7 @@ from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
+from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.system.workers import HERE_S, AnyWorkers, Workers
 from merge_sumo.verbs import Benchmark, Campaign, GroundTruth, SearchOfTest
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
@@ -92,7 +92,7 @@ def opened_truths(
     passing = is_here(settings.vut) or is_here(settings.pov or "")
     with (
         opened(where, plan, at_once=True) as workers,
-        tempfile.TemporaryDirectory(prefix="merge-sumo-") as folder,
+        ScratchFolder() as folder,
         Bars(shown=where.progress) as bars,
     ):
         yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import DT_S
+from merge_sumo.system.scratch import ScratchFolder
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
@@ -55,7 +56,7 @@ def scratch_folder() -> Iterator[Path]:
                 f"SUMO cannot use the folder for temporary files {str(above)!r}: set TMPDIR to one "
                 "without commas, colons, percent signs, ${ and what is not UTF-8 in its name"
             )
-        made = tempfile.TemporaryDirectory(prefix="merge-sumo-", ignore_cleanup_errors=True)
+        made = ScratchFolder()
     except OSError as error:
         raise UserError(
             f"cannot write a temporary folder: {error.strerror}; set TMPDIR to a folder"

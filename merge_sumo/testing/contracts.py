@@ -42,6 +42,7 @@ from merge_sumo.scenario.kinds import SCENARIO_KINDS, scenario_of_record
 from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import World
+from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.verdict.criteria import NamedCriterion
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.measures import Measure
@@ -127,10 +128,16 @@ class CriterionContract:
         assert self.criterion.about
 
 
+_kept: Final[list[ScratchFolder]] = []
+"""Folders that stay until the process ends."""
+
+
 @cache
 def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
     """Return a campaign in SUMO at level 0; its folder stays until the process ends."""
-    folder = Path(tempfile.mkdtemp(prefix="merge-sumo-contract-")) / "run"
+    scratch = ScratchFolder()
+    _kept.append(scratch)
+    folder = Path(scratch.name) / "run"
     keywords: dict[str, Any] = {"level": 0, "sampler": "uniform", "cases": 20, "seed": 1}
     return api.campaign(vut, out=folder, scenario=scenario, progress=False, **keywords).run
 

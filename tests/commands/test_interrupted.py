@@ -108,6 +108,7 @@ def test_what_was_stopped_is_made_to_the_byte_and_nothing_stays(name, run, tmp_p
         removed(world.root / ("new" if (world.root / "new").exists() else "curves.svg"))
         again, out, err = world.run(*given(world, verb, 2))
     assert again in (0, 1), err
+    assert world.left_in_temporary() == []
     if not verb.resume:
         assert said(out) == told
     assert made(world) == expected

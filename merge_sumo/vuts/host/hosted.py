@@ -29,6 +29,7 @@ from merge_sumo.scenario.signals import Left
 from merge_sumo.system.blame import Blame, how_it_ended
 from merge_sumo.system.hashing import Files, changed, hashed
 from merge_sumo.system.pulse import AwakeClock
+from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.system.spawning import python_command
 from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
@@ -172,9 +173,7 @@ class Host:
 
     def _start(self) -> None:
         # What is killed leaves its temporary files behind: they are in a folder of ours.
-        self._scratch = tempfile.TemporaryDirectory(
-            prefix="merge-sumo-", ignore_cleanup_errors=True
-        )
+        self._scratch = ScratchFolder()
         their_in, self._to = os.pipe()
         self._from, their_out = os.pipe()
         their_lifeline, self._lifeline = os.pipe()
