@@ -20,7 +20,11 @@ class UserError(Exception):
 
     def _render_traceback_(self) -> list[str]:
         """Return what a notebook shows: the sentence says what to do, and no line of ours helps."""
-        return [f"{type(self).__name__}: {self}"]
+        return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", ())]
+
+
+class WorkersLostError(UserError):
+    """The cluster whose workers ran the cases is gone: what has run may be kept."""
 
 
 class Notice(UserWarning):

@@ -16,7 +16,7 @@ from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings, controllers
 from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.errors import notice
+from merge_sumo.errors import WorkersLostError, notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
 from merge_sumo.reports.report import check_report, write_report
@@ -84,11 +84,13 @@ def concluded(
             )
             result = CampaignRun(done, asked.gates)
             _write_findings(result, plan, present, bars, check)
-    except (KeyboardInterrupt, Stopped) as stop:
+    except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)
-            again = controllers(asdict(settings)).items()
-            named = "".join(f", {name}={spec!r}" for name, spec in again)
+            again = controllers(asdict(settings))
+            if isinstance(where.workers, str):
+                again["workers"] = where.workers
+            named = "".join(f", {name}={spec!r}" for name, spec in again.items())
             stop.add_note(f"stopped; go on with ms.resume({str(folder)!r}{named})")
         raise
     if junit is not None:

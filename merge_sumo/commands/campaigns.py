@@ -46,8 +46,8 @@ def campaign(
     asked = given.keywords
     folder = folder_of(asked["out"], resume, vut)
 
-    def how_to_go_on() -> str:
-        return _how_to_go_on(folder, list(asked["gates"]), asked["junit"])
+    def how_to_go_on() -> str | None:
+        return _how_to_go_on(folder, list(asked["gates"]), asked["junit"], asked["workers"])
 
     with stoppable("batch", how_to_go_on) as check:
         if resume is None:
@@ -60,9 +60,11 @@ def campaign(
     raise typer.Exit(0 if run.passed else 1)
 
 
-def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
+def _how_to_go_on(
+    folder: Path, gates: list[str], junit: Path | None, workers: int | str | None
+) -> str | None:
     if not folder.exists():
-        return "stopped before the first case; nothing was written"
+        return None
     from merge_sumo import api
 
     # None of these is a setting of the campaign that its folder would bring.
@@ -70,7 +72,9 @@ def _how_to_go_on(folder: Path, gates: list[str], junit: Path | None) -> str:
     words += [f"--gate {quoted(gate)}" for gate in gates]
     if junit is not None:
         words.append(f"--junit {quoted(junit)}")
-    return f"stopped; go on with: merge-sumo campaign {' '.join(words)}"
+    if isinstance(workers, str):
+        words.append(f"--workers {quoted(workers)}")
+    return f"go on with: merge-sumo campaign {' '.join(words)}"
 
 
 @app.verb(verbs.RunCase)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 import typer
 
 from merge_sumo import options, verbs
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import Notice, UserError, WorkersLostError
 from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Interrupt, Stopped
 from merge_sumo.system.printable import printable, quoted
@@ -83,15 +83,25 @@ def folder_of(out: Path | None, resume: Path | None, what: str) -> Path:
 
 @contextmanager
 def stoppable(unit: str, how_to_go_on: Callable[[], str | None]) -> Iterator[Callable[[], None]]:
-    """Give the `check` of a verb: at Ctrl-C the running `unit` ends, and a sentence is printed."""
+    """Give the `check` of a verb: at Ctrl-C the running `unit` ends, and a sentence is printed.
+
+    It says how to go on, unless that is None because nothing was written. So does the `UserError`
+    where a cluster is gone.
+    """
     try:
         with Interrupt(f"finishing the running {unit}; once more stops at once") as interrupt:
             yield interrupt.check
     except Stopped:
         sentence = how_to_go_on()
-        if sentence is not None:
-            say(sentence)
+        say(
+            f"stopped; {sentence}"
+            if sentence
+            else "stopped before the first case; nothing was written"
+        )
         raise
+    except WorkersLostError as lost:
+        sentence = how_to_go_on()
+        raise UserError(f"{lost}; {sentence}" if sentence else str(lost)) from lost
 
 
 @contextmanager

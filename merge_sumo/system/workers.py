@@ -7,6 +7,7 @@ sees which one. A worker that dies takes nothing with it: its chunks run again.
 from __future__ import annotations
 
 import atexit
+import logging
 import math
 import multiprocessing
 import multiprocessing.util
@@ -28,16 +29,17 @@ from concurrent.futures import (
     wait,
 )
 from concurrent.futures.process import ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from importlib import import_module
 from multiprocessing.synchronize import Semaphore
 from numbers import Integral
 from typing import Any, Final, Generic, TypeVar
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, WorkersLostError, notice
 from merge_sumo.system.blame import Blame
 from merge_sumo.system.limits import check_threads
+from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.system.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK: Final = 500
@@ -72,22 +74,24 @@ class Workers(AbstractContextManager["Workers"]):
         count: int,
         *,
         died: tuple[type[Exception], ...] = (BrokenExecutor,),
+        gone: tuple[type[Exception], ...] = (CancelledError,),
         recycle_after: int | None = None,
         on_close: Callable[[], None] | None = None,
         here_s: float | None = None,
     ) -> None:
         """Open an executor with `count` workers.
 
-        `died` is what a future raises when its worker is dead. The executor is closed and opened
-        anew after a death, and after `recycle_after` chunks per worker. With `here_s` it is opened
-        only when work in this process has taken so many seconds.
+        `died` is what a future raises when its worker is dead, `gone` what it raises when all of
+        them are out of reach. The executor is closed and opened anew after a death, and after
+        `recycle_after` chunks per worker. With `here_s` it is opened only when work in this process
+        has taken so many seconds.
         """
         self.count = count
         self._open = open_executor
         self._here_s, self._here_items = here_s, 0
         """Seconds that this process goes on for, and items that it has begun; None for no more."""
         self._limit_s = here_s or 0.0
-        self._died = died
+        self._died, self._gone = died, gone
         self._recycle_after = recycle_after
         self._on_close = on_close
         self._executor = open_executor() if here_s is None else InProcess()
@@ -106,9 +110,9 @@ class Workers(AbstractContextManager["Workers"]):
         """Yield (place in `items`, result) as chunks of `chunk` items, or `chunk_size`, end.
 
         `function` gives one result for each item of a chunk, is found by its name in other
-        processes, and may run twice; what it raises, this raises, and `UserError` when the executor
-        goes away. `lost` gives the result of an item that is to blame for the deaths of its
-        workers.
+        processes, and may run twice; what it raises, this raises, and `WorkersLostError` when the
+        executor goes away. `lost` gives the result of an item that is to blame for the deaths of
+        its workers.
         """
         chunks = cut(items, chunk or self.chunk_size(len(items)))
         for first, results in self.run_chunks(function, chunks, lost):
@@ -166,8 +170,10 @@ class Workers(AbstractContextManager["Workers"]):
                         self._broken = True
                         if ended.died(blame, alone, suspects):
                             yield ended.first, [lost(ended.items[0])]
-                    except CancelledError as error:  # we cancel only what nobody waits for
-                        raise UserError("the workers went away: look after the cluster") from error
+                    except self._gone as error:  # we cancel only what nobody waits for
+                        raise WorkersLostError(
+                            "the workers went away: look after the cluster"
+                        ) from error
                     else:
                         again = ran_again if ended.struck else None
                         yield ended.first, [again(r) for r in results] if again else results
@@ -195,7 +201,7 @@ class Workers(AbstractContextManager["Workers"]):
         start_s = time.perf_counter()
         try:
             return self._executor.submit(function, items)
-        except self._died as error:
+        except (*self._died, *self._gone) as error:
             # It broke between two submissions: as if it had broken a moment later.
             future: Future[R] = Future()
             future.set_exception(error)
@@ -280,6 +286,12 @@ def open_workers(
     if isinstance(workers, str):
         return dask_workers(workers)
     count = workers_or_cores(workers)
+    if is_daemonic() and (count > 1 or apart):
+        notice(
+            "note: the cases run in this process, as a daemonic process, such as a worker of "
+            "multiprocessing.Pool, starts no others"
+        )
+        count, apart = 1, False
     if count == 1 and not apart:
         return Workers(InProcess, 1)
     threads = POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS)
@@ -297,6 +309,29 @@ def open_workers(
     return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s)
 
 
+def is_daemonic() -> bool:
+    """Return whether `multiprocessing` lets this process start no others."""
+    return multiprocessing.current_process().daemon
+
+
+DASK_LOGGERS: Final = ("distributed", "distributed.client", "tornado.application")
+"""As distributed's setting `logging` names them."""
+
+
+@contextmanager
+def _quiet(names: Sequence[str]) -> Iterator[None]:
+    """Log nothing: what matters to a person is said in a sentence."""
+    loggers = list(map(logging.getLogger, names))
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
 def dask_workers(address: str) -> Workers:
     """Return the workers of a running Dask cluster; `UserError` when there are none."""
     if "://" not in address:
@@ -306,24 +341,28 @@ def dask_workers(address: str) -> Workers:
         )
     try:
         from distributed import Client, KilledWorker
+        from distributed.client import ClosedClientError
     except ModuleNotFoundError as error:
         raise UserError(
             f"workers at {address} need Dask: run `pip install merge-sumo[dask]`"
         ) from error
-    try:
-        client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError, ImportError) as error:
-        raise UserError(f"there is no Dask scheduler at {address}: {error}") from error
-    count = len(client.scheduler_info(n_workers=-1)["workers"])
-    if count == 0:
-        client.close()
-        raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
-    return Workers(
-        lambda: client.get_executor(pure=False),
-        count,
-        died=(KilledWorker,),
-        on_close=client.close,
-    )
+    with ExitStack() as opened:
+        opened.enter_context(_quiet(DASK_LOGGERS))
+        try:
+            client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
+        except (OSError, ValueError, TypeError, ImportError) as error:
+            raise UserError(f"there is no Dask scheduler at {address}: {error}") from error
+        opened.callback(client.close)
+        count = len(client.scheduler_info(n_workers=-1)["workers"])
+        if count == 0:
+            raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
+        return Workers(
+            lambda: client.get_executor(pure=False),
+            count,
+            died=(KilledWorker,),
+            gone=(CancelledError, ClosedClientError),
+            on_close=opened.pop_all().close,
+        )
 
 
 class InProcess(Executor):
@@ -351,13 +390,14 @@ class LocalProcesses(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int, preload: str | None = None) -> None:
+        """Start them; RuntimeError where this process may start none."""
+        if is_daemonic():
+            raise RuntimeError("a daemonic process starts no others")
         spawn = multiprocessing.get_context("spawn")
         with without_cwd():  # its locks have a process of their own
             cores = spawn.Semaphore(os.cpu_count() or 1)
             # A worker that is killed leaves its temporary files behind.
-            self._scratch = tempfile.TemporaryDirectory(
-                prefix="merge-sumo-", ignore_cleanup_errors=True
-            )
+            self._scratch = ScratchFolder()
             given = cores, preload, self._scratch.name
             super().__init__(workers, spawn, _begin_worker, given)
         self.submit(int)  # with the first task they start

@@ -47,7 +47,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import to_json, to_plain
 from merge_sumo.system.spawning import forget_safe_path, without_cwd
-from merge_sumo.system.workers import leave_signals_to_parent
+from merge_sumo.system.workers import is_daemonic, leave_signals_to_parent
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network
 from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
@@ -121,6 +121,11 @@ def train_library(
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road_for(scenario)  # on which it is checked in the end
+    if is_daemonic():
+        raise UserError(
+            "a training starts a process for each network, and a daemonic process, such as a "
+            "worker of multiprocessing.Pool, starts none: train outside of it"
+        )
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,20 +11,24 @@ import sys
 import time
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from attacks import World
 from campaigning import campaign_settings, run_campaign
 from plans import plan_for
 from processes import wait_for
 
+from merge_sumo import api
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.engine.evaluate import _lost, run_cases
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError, WorkersLostError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.workers import (
+    InProcess,
     LocalProcesses,
     Workers,
     dask_workers,
@@ -222,7 +227,7 @@ def cluster(tmp_path):
         address = json.loads(contact.read_text())["address"]
         assert address.startswith("tcp://127.0.0.1:")
         assert wait_for(lambda: workers_at(address) == 2)
-        yield address, processes[1:]
+        yield address, processes[1:], processes[0]
     finally:
         for process in processes:
             process.kill()
@@ -238,10 +243,69 @@ def workers_at(address: str) -> int:
         return 0
 
 
+@pytest.fixture
+def daemonic(monkeypatch):
+    """Let this process be one that may start no others, as a worker of multiprocessing.Pool."""
+    process: Any = multiprocessing.current_process()
+    monkeypatch.setitem(process._config, "daemon", True)
+
+
+class TestADaemonicProcess:
+    @pytest.mark.parametrize("number", [2, None])
+    def test_runs_a_campaign_itself_with_a_note(self, daemonic, number, tmp_path):
+        keywords: dict[str, Any] = {"cases": 20, "seed": 1, "progress": False}
+        alone = api.campaign("design2", out=tmp_path / "alone", **keywords)
+        with pytest.warns(Notice, match="in this process"):
+            run = api.campaign("design2", out=tmp_path / "run", workers=number, **keywords)
+        texts = [(one.folder / OUTCOMES).read_bytes() for one in (alone, run)]
+        assert texts[0] == texts[1]
+
+    def test_searches_alone_on_workers_of_others(self, daemonic, tmp_path):
+        settings = campaign_settings(vut="design2", levels=(0, 1), cases=20, seed=1)
+        run = run_campaign(settings, tmp_path / "run", workers=Workers(InProcess, 2))
+        assert len(run.outcomes) == 20
+
+    def test_trains_nothing(self, daemonic, tmp_path):
+        helix = pytest.importorskip("merge_sumo.training.helix", exc_type=ImportError)
+        with pytest.raises(UserError, match="train outside of it"):
+            helix.train_library(tmp_path / "policies", scenario=US23)
+        assert not list(tmp_path.iterdir())
+
+
 class TestADaskCluster:
     @pytest.mark.slow
+    def test_that_is_gone_is_a_sentence_that_says_how_to_go_on(self, cluster, tmp_path):
+        address, _, scheduler = cluster
+        world = World(tmp_path / "world")
+        words = "campaign --vut design1 --level 0 --sampler uniform --cases 20000 --out run"
+        process = world.start(*words.split(), "--gate", "fmc>0.5", "--workers", address)
+        outcomes = world.root / "run" / OUTCOMES
+        assert wait_for(lambda: outcomes.exists() or process.poll() is not None)
+        scheduler.kill()
+        _, err = process.communicate(timeout=120)
+        assert process.returncode == 2, err
+        *before, last = err.splitlines()
+        assert last == (
+            "merge-sumo: the workers went away: look after the cluster; go on with: merge-sumo "
+            f"campaign --resume run --gate 'fmc>0.5' --workers {address}"
+        )
+        assert all(line.startswith(("design1 v level 0", "cases: ", "so far")) for line in before)
+
+    @pytest.mark.slow
+    def test_that_is_gone_leaves_a_note_in_python(self, cluster, tmp_path):
+        address, _, scheduler = cluster
+        folder = tmp_path / "run"
+        keywords: dict[str, Any] = {"sampler": "uniform", "level": 0, "progress": False}
+        keywords |= {"cases": 20_000, "out": folder, "workers": address}
+        with pytest.raises(WorkersLostError) as lost:
+            api.campaign("design1", on_case=lambda _: scheduler.kill(), **keywords)
+        note = f"stopped; go on with ms.resume({str(folder)!r}, workers={address!r})"
+        assert lost.value.__notes__ == [note]
+        assert lost.value._render_traceback_()[-1] == note
+
+    @pytest.mark.slow
     def test_gives_the_same_outcomes_although_a_worker_is_killed(self, cluster, expected, tmp_path):
-        address, (first, _) = cluster
+        address, (first, _), _ = cluster
         seen = []
 
         def on_case(outcome) -> None:
