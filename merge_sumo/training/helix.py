@@ -121,11 +121,7 @@ def train_library(
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road_for(scenario)  # on which it is checked in the end
-    if is_daemonic():
-        raise UserError(
-            "a training starts a process for each network, and a daemonic process, such as a "
-            "worker of multiprocessing.Pool, starts none: train outside of it"
-        )
+    _check_process()
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
@@ -154,6 +150,15 @@ def train_library(
             _keep(folder, trained, network, entry, check)
             if on_done is not None:
                 on_done(trained, check)
+
+
+def _check_process() -> None:
+    """Raise `UserError` where this process may start none for the networks."""
+    if is_daemonic():
+        raise UserError(
+            "a training starts a process for each network, and a daemonic process, such as a "
+            "worker of multiprocessing.Pool, starts none: train outside of it"
+        )
 
 
 def _take(folder: Path) -> None:
