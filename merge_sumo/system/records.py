@@ -197,7 +197,10 @@ def _too_large(size: int) -> str:
 
 
 def toml_value(value: object) -> str:
-    """Return plain values as TOML has them, in a line, numbers in full."""
+    """Return plain values as TOML has them, in a line, numbers in full.
+
+    Raises `UserError` for a text that is not UTF-8, as the name of a file may be.
+    """
     if isinstance(value, dict):
         named = []
         for name, of in value.items():
@@ -206,7 +209,10 @@ def toml_value(value: object) -> str:
         return f"{{{', '.join(named)}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
-    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if any("\ud800" <= letter <= "\udfff" for letter in text):
+        raise UserError(f"{value!r} is not UTF-8, and a TOML file cannot name it: rename the file")
+    return text
 
 
 def to_plain(value: object) -> Any:
