@@ -34,7 +34,8 @@ traffic also `ahead` and `behind`) in their present state, and runs as a library
 its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
 vehicle after the step, and the vehicles that departed and arrived during several steps. A \
 question about an unknown object is refused as by SUMO. Subscriptions to variables of an object \
-are available for all questions; there are no context subscriptions.
+are available for all questions, and context subscriptions for what is around a vehicle or a \
+junction, without filters. `getCollisions` tells of contacts, which change no motion.
 
 The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
 the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
@@ -48,8 +49,9 @@ controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lan
 `setPreviousSpeed` and `moveToXY` say what [a vehicle model of the controller's own]\
 (../tutorials/traci-controller.md#a-vehicle-model-of-your-own) has reached after the step; they go \
 before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Other commands are \
-accepted without effect (with one note in `controller.log`), or refused with a reason, as an error \
-of that command; the connection stays open. [Why SUMO decides](../decisions/traci-server.md).
+accepted without effect (with one note in `controller.log`; the last lines of a campaign name \
+those that could move a vehicle in SUMO), or refused with a reason, as an error of that command; \
+the connection stays open. [Why SUMO decides](../decisions/traci-server.md).
 """
 
 

@@ -32,7 +32,6 @@ SPEED_MODE_COMMANDED: Final = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
 SUMO_OPTIONS: Final = (
     *("--step-length", str(DT_S)),
-    *("--collision.action", "none"),
     *("--insertion-checks", "none"),
     *("--time-to-teleport", "-1"),
     *("--default.speeddev", "0"),
@@ -41,7 +40,9 @@ SUMO_OPTIONS: Final = (
     *("--no-warnings", "true"),
     *("--duration-log.disable", "true"),
 )
-"""Of every simulation."""
+"""Of every simulation, besides what it does about collisions."""
+NO_COLLISIONS: Final = ("--collision.action", "none")
+"""SUMO looks for none: measures say which vehicles touch."""
 NOT_A_NAME: Final = re.compile(r"[,:%\ud800-\udfff]|\$\{")
 """To SUMO a comma parts names, a colon parts host and port, and the others stand for something."""
 

@@ -23,8 +23,6 @@ CONVERSION_LIMIT_S: Final = 180.0
 """Time that netconvert has for a net; it needs 10 s for that of a city."""
 SAME_M: Final = 0.5
 """Distance of the ends of one lane in SUMO and in OpenDRIVE, at most."""
-SHORTEST_M: Final = 1e-3
-"""Of the lines of which a way over a junction is made: readers stumble over shorter ones."""
 
 
 def opendrive(road: Corridor) -> bytes:
@@ -92,20 +90,11 @@ def _mark_entry(element: etree._Element, road: Corridor) -> None:
 
 
 def _crossings(path: LanePath) -> Iterator[tuple[_Place, ...]]:
-    """Yield the lines on which a path goes over junctions, from road to road.
-
-    Without those that are as good as a point: there netconvert's own way fills the gap.
-    """
+    """Yield the lines on which a path goes over junctions, from road to road."""
     for internal, pieces in groupby(path.pieces, key=lambda piece: piece.is_internal):
-        if not internal:
-            continue
-        line: list[_Place] = []
-        for piece in pieces:
-            for x, y, _ in piece.shape:
-                if not line or math.dist(line[-1], (x, y)) >= SHORTEST_M:
-                    line.append((x, y))
-        if len(line) > 1:
-            yield tuple(line)
+        if internal:
+            points = [(x, y) for piece in pieces for x, y, _ in piece.shape]
+            yield (*(a for a, b in pairwise(points) if math.dist(a, b) > 1e-6), points[-1])
 
 
 def _joined(

@@ -24,6 +24,8 @@ from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_lib
 NET: Final = "road.net.xml"
 TYPES: Final = "types.add.xml"
 SETUP: Final = "setup.json"
+SHADOW_OPTIONS: Final = (*SUMO_OPTIONS, "--collision.action", "warn")
+"""It tells controllers of collisions, which change nothing."""
 COMMANDED_VUT: Final = 38
 """Speed mode of the VUT as it departs: its limits of acceleration act, SUMO's checks do not."""
 COLOURS: Final = (*rgb("pov"), 255), (*rgb("vut"), 255)
@@ -33,6 +35,8 @@ FASTEST_MPS: Final = 45.0
 WIDTH_M: Final = 1.8
 HEIGHT_M: Final = 1.5
 NAME_OF_VUT: Final = VEHICLES[VUT]
+ID_COUNT: Final = 0x01
+"""The variable of `getIDCount` in every domain."""
 SPEED_MARGIN_MPS: Final = 2.0
 """More than a vehicle gains in a step, unless a controller commands it without any limit."""
 
@@ -76,8 +80,8 @@ class ShadowSumo:
         )
         self.road, self._names = setup.road, setup.names
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
-        self._options = [*files, *SUMO_OPTIONS]
-        self._started = False
+        self._options = [*files, *SHADOW_OPTIONS]
+        self._started, self._asked = False, 0
         self.at_m: dict[str, float] = {}
         self.merged = self.wants_to_merge = self.was_forced = self.by_sumo = False
         on_ramp = {piece.lane for piece in self.road.ramp.pieces}
@@ -130,6 +134,23 @@ class ShadowSumo:
         except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
             given = ", ".join(f"{argument!r:.40}" for argument in arguments)
             raise RefusedError(f"{function} takes no ({given})") from error
+
+    def around(self, point: tuple[float, ...], domain: int, range_m: float) -> list[str]:
+        """Return the objects of a domain, by its number, around a point; raises as `call` does.
+
+        A context subscription finds them. What it found stays up to the next step, so that each has
+        a point of interest of its own.
+        """
+        self._asked += 1
+        name = f"around {self._asked}"
+        self.call("poi.add", name, *point[:2], COLOURS[0])
+        try:
+            self.call("poi.subscribeContext", name, domain, range_m, [ID_COUNT])
+            found = self.call("poi.getContextSubscriptionResults", name)
+            self.call("poi.unsubscribeContext", name, domain, range_m)
+        finally:
+            self.call("poi.remove", name)
+        return sorted(set(found) - {name})
 
     def enter(self, states: Mapping[str, State]) -> None:
         """Make a step in which the vehicles depart, and put them into their states."""

@@ -38,6 +38,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import (
+    NO_COLLISIONS,
     SPEED_MODE_COMMANDED,
     SUMO_OPTIONS,
     load_libsumo,
@@ -141,7 +142,7 @@ class World:
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
                 with _standard_error_into(messages):
-                    libsumo.start(["sumo", *files, *SUMO_OPTIONS])
+                    libsumo.start(["sumo", *files, *SUMO_OPTIONS, *NO_COLLISIONS])
             except libsumo.TraCIException as error:
                 said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
                 reason = said.removeprefix("Error: ") or error

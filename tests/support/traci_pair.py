@@ -21,11 +21,12 @@ from traci.storage import Storage
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
-from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_environment, sumo_program
+from merge_sumo.sumo.binding import sumo_environment, sumo_program
 from merge_sumo.sumo.shadow_sumo import (
     COLOURS,
     COMMANDED_VUT,
     NET,
+    SHADOW_OPTIONS,
     TYPES,
     ShadowSumo,
     _edges,
@@ -34,7 +35,6 @@ from merge_sumo.sumo.shadow_sumo import (
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.session import Session
 
-STEPS = 30
 IDS = {
     "vehicle": "vut",
     "vehicletype": "vut",
@@ -122,7 +122,7 @@ def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
     files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
     program = sumo_program("sumo")
     process = subprocess.Popen(
-        [program, *files, *SUMO_OPTIONS, "--remote-port", str(port)],
+        [program, *files, *SHADOW_OPTIONS, "--remote-port", str(port)],
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -165,12 +165,20 @@ def close_shadow() -> None:
 class Pair:
     """A session and a SUMO program in the same state: both cars on their way to M."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        pov: tuple[float, float] = (-300.0, 30.0),
+        change_mps: float = 0.05,
+        steps: int = 30,
+    ) -> None:
+        """Let both drive some steps from `pov`, x and v, on, and change their speeds in each."""
         road = road_of()
         self.session = Session(shadow(folder))
         self.process, self.real = open_program(folder)
         vehicle = self.real.vehicle
-        starts = {"pov": (road.mainline, -300.0, 30.0), "vut": (road.ramp, -182.0, 18.0)}
+        changes_mps = {"vut": change_mps, "pov": -change_mps}
+        starts = {"pov": (road.mainline, *pov), "vut": (road.ramp, -182.0, 18.0)}
         for name, (path, x_m, v_mps) in starts.items():
             self.real.route.add(f"route.{name}", _edges(path))
             point = path.point(x_m)
@@ -183,14 +191,14 @@ class Pair:
             for name, (path, _, _) in starts.items()
         }
         before = {name: v_mps for name, (_, _, v_mps) in starts.items()}
-        for step in range(STEPS):
+        for step in range(steps):
             self.session.answered()
             self.real.simulationStep()
             states = {}
             for name in starts:
                 vehicle.setSpeedMode(name, COMMANDED_VUT if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
-                vehicle.setSpeed(name, vehicle.getSpeed(name) + (0.05 if name == "vut" else -0.05))
+                vehicle.setSpeed(name, vehicle.getSpeed(name) + changes_mps[name])
                 v_mps = vehicle.getSpeed(name)
                 x_m = begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
                 states[name] = x_m, v_mps, (v_mps - before[name]) / DT_S

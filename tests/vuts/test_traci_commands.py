@@ -163,10 +163,36 @@ def test_what_is_refused_is_named(drive, domain, function, arguments):
 def test_devices_that_would_write_files_do_not_reach_sumo(drive, tmp_path):
     drive.begin()
     drive.ours.vehicle.setParameter("vut", "device.ssm.file", str(tmp_path / "written"))
+    drive.ours.vehicle.setParameter("vut", "has.ssm.device", "true")
     drive.step()
     with pytest.raises(traci.TraCIException, match="no device of type 'ssm' exists"):
         drive.ours.vehicle.getParameter("vut", "device.ssm.file")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_parameter_of_the_controllers_own_is_kept(drive):
+    drive.begin()
+    drive.both(lambda c: c.vehicle.setParameter("vut", "mine", "7"))
+    ours, real = drive.both(lambda c: c.vehicle.getParameter("vut", "mine"))
+    assert ours == real == "7"
+    drive.ours.vehicle.setParameter("pov", "mine", "7")
+    assert drive.ours.vehicle.getParameter("pov", "mine") == ""
+
+
+def test_what_is_commanded_in_vain_is_known_of_each_episode(drive):
+    drive.begin()
+    vehicle = drive.ours.vehicle
+    vehicle.setColor("vut", (1, 2, 3, 4))
+    vehicle.setParameter("vut", "mine", "7")
+    drive.ours.gui.trackVehicle("View #0", "vut")
+    vehicle.setSpeed("vut", 18.0)
+    assert drive.session.in_vain == set(), "in SUMO neither changes how a car drives"
+    vehicle.changeSublane("vut", 0.5)
+    vehicle.changeLane("vut", 0, 1.0)
+    lane = "vehicle.changeLane or vehicle.changeLaneRelative"
+    assert drive.session.in_vain == {"vehicle.changeSublane", lane}
+    drive.again()
+    assert drive.session.in_vain == set()
 
 
 def commanded(connection, function: str) -> str | None:
@@ -218,4 +244,4 @@ def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is
     assert tried > 200
     assert {name.partition(".")[0] for name, _ in called} <= {"vehicle", "vehicletype"}
     assert {object_id for _, object_id in called} == {"vut"}
-    assert not any(effects[name] is not Effect.CARRIED_OUT for name, _ in called)
+    assert {effects[name] for name, _ in called} == {Effect.CARRIED_OUT, Effect.OWN_KEYS}

@@ -38,6 +38,16 @@ def reference_commands() -> list[bytes]:
         tp.command(bytes((0xD4,)) + struct.pack("!dd", 0, 9) + tp.raw_string("vut") + b"\1@")
     )
     sent.append(tp.command(b"\xa4\x68" + tp.raw_string("vut") + tp.pack("d", 9.0)))
+    on_road, point = ("ramp", 10.0, 0), (1.0, 2.0)
+    places: list[tuple[bytes, str, tuple[object, ...]]] = [
+        (b"\xab\x82" + tp.raw_string(""), "trB", (2, on_road, 1)),
+        (b"\xab\x82" + tp.raw_string(""), "toBs", (3, point, 4, "ignoring")),
+        (b"\xab\x83" + tp.raw_string(""), "toou", (3, point, point, 1)),
+        (b"\xa4\x83" + tp.raw_string("vut"), "tru", (2, on_road, 1)),
+    ]
+    sent += [tp.command(head + kept._pack(form, *asked)) for head, form, asked in places]
+    around = struct.pack("!dd", 0, 9) + tp.raw_string("vut")
+    sent += [tp.command(b"\x84" + around + kept._pack("uDuu", d, 50.0, 1, 1)) for d in (0xA3, 0xA4)]
     return sent
 
 

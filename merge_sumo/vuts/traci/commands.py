@@ -19,6 +19,7 @@ class Effect(Enum):
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
     ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
     REACHED = "Taken as what a vehicle model of the controller's own reaches in the step"
+    OWN_KEYS = "Carried out by SUMO on the VUT, for keys without a dot"
     NOTHING = "Accepted, changes nothing"
     REFUSED = "Refused: the scenario and the campaign decide it"
 
@@ -44,20 +45,31 @@ CARRIED_OUT: Final = frozenset(
 ON_A_LANE: Final = frozenset({"vehicle.changeLane", "vehicle.changeLaneRelative"})
 """Commands that say on which lane the VUT is to drive, where there are two for it."""
 REACHED: Final = frozenset({"vehicle.setPreviousSpeed", "vehicle.moveToXY"})
+OWN_KEYS: Final = "vehicle.setParameter"
+"""A key with a dot is SUMO's: of its models, and of devices that write files."""
+LOOKS: Final = (
+    *("setColor", "setSignals", "setShapeClass", "setWidth", "setHeight", "setLine", "highlight"),
+    *("setEmissionClass", "setBoardingDuration"),
+)
 NOTHING: Final = frozenset(
     f"{domain}.{function}"
     for domain in ("vehicle", "vehicletype")
     for function in (
-        *("setColor", "setSignals", "setShapeClass", "setWidth", "setHeight", "setMass", "setLine"),
-        *("setLateralAlignment", "setMaxSpeedLat", "setMinGapLat", "setEmissionClass", "highlight"),
-        *("setBoardingDuration", "setImpatience", "setSpeedDeviation", "changeSublane"),
+        *(*LOOKS, "setMass", "setLateralAlignment", "setMaxSpeedLat", "setMinGapLat"),
+        *("setImpatience", "setSpeedDeviation", "changeSublane"),
         *("setRoutingMode", "setAdaptedTraveltime", "setEffort", "setVia", "updateBestLanes"),
         *("rerouteTraveltime", "rerouteEffort"),
     )
 )
-"""Looks and routes: the path holds anyway."""
+"""Looks, places across a lane, and routes: the path holds anyway."""
 ONLY_SEEN: Final = ("gui", "poi", "polygon")
 """Domains of what is only looked at."""
+
+
+def is_in_vain(functions: Sequence[str]) -> bool:
+    """Return whether commands that change nothing here change in SUMO how the VUT drives."""
+    domain, _, name = functions[-1].partition(".")
+    return domain in ("vehicle", "vehicletype") and name not in LOOKS
 
 
 @cache
@@ -69,6 +81,8 @@ def effect_of(functions: tuple[str, ...]) -> Effect:
         return Effect.ON_A_LANE
     if not REACHED.isdisjoint(functions):
         return Effect.REACHED
+    if OWN_KEYS in functions:
+        return Effect.OWN_KEYS
     accepted = any(
         function in NOTHING
         or function.endswith(".setParameter")
@@ -104,7 +118,8 @@ def call_of_command(functions: Sequence[str], object_id: str, reader: Reader) ->
         raise RefusedError(f"{function} takes no ({given})")
     if functions[0] == "vehicle.changeLane":
         # An offset has a third value behind it, which only marks it as one.
-        return functions[len(arguments) > len(("lane", "duration"))], [object_id, *arguments[:2]]
+        name = functions[len(arguments) > len(("lane", "duration"))]
+        return Call(name, [object_id, *arguments[:2]])
     if name == "openGap" and arguments[:2] == [-1.0, -1.0]:
-        return "vehicle.deactivateGapControl", [object_id]
-    return function, [object_id, *arguments]
+        return Call("vehicle.deactivateGapControl", [object_id])
+    return Call(function, [object_id, *arguments])

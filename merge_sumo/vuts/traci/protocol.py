@@ -19,14 +19,17 @@ API_VERSION: Final = 22
 """Of the TraCI of SUMO 1.28."""
 
 GET_VERSION, SIMULATION_STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
-GET_VEHICLE, GET_SIMULATION, SET_VEHICLE = 0xA4, 0xAB, 0xC4
+GET_VEHICLE, GET_JUNCTION, GET_SIMULATION, SET_VEHICLE = 0xA4, 0xA9, 0xAB, 0xC4
 """Identifiers of commands."""
-PARAMETER: Final = 0x7E
-"""The variable of `getParameter` and `setParameter` in every domain."""
 
 TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x07, 0x08, 0x09, 0x0B
 TYPE_STRING, TYPE_STRINGLIST, TYPE_COMPOUND, TYPE_DOUBLELIST, TYPE_COLOR = 0x0C, *range(0x0E, 0x12)
 """Types of values."""
+LON_LAT, ROADMAP = 0x00, 0x04
+"""Types of positions that are no points of the plane or of space, 0x01 and 0x03."""
+PLACES: Final = "goGOr"
+"""The letters of `pack` by the types of positions: on earth, in the plane, both with height, and on
+a road."""
 OK, NOT_IMPLEMENTED, ERROR = 0x00, 0x01, 0xFF
 """Results of commands."""
 
@@ -91,6 +94,21 @@ class Reader:
             return self.raw(self.integer()).decode("utf-8")
         except UnicodeDecodeError as error:
             raise ProtocolError("a string is not UTF-8") from error
+
+    def count(self) -> int:
+        """Return of how many values the compound is made whose type is next."""
+        if self.ubyte() != TYPE_COMPOUND:
+            raise ProtocolError("there is no compound where one is due")
+        return self._count(1)
+
+    def place(self) -> tuple[int, list[Any]]:
+        """Return the type and the coordinates of the position that is next."""
+        kind = self.ubyte()
+        if kind == ROADMAP:
+            return kind, [self.string(), self.double(), self.ubyte()]
+        if kind >= len(PLACES):
+            raise ProtocolError(f"type 0x{kind:02x} is no position")
+        return kind, [self.double() for _ in range(2 if PLACES[kind] in "go" else 3)]
 
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value with a type before it.
@@ -205,7 +223,7 @@ def pack(form: str, *values: Any) -> bytes:
     """Return typed values, one for each letter of `form`, as SUMO's own client packs them.
 
     Integer, double, string, signed and unsigned Byte, list of strings, list of floats, position in
-    the plane (o) and in space (O), colour, and polygon.
+    the plane (o) and in space (O), on earth (g, G) and on a road (r), colour, and polygon.
     """
     return packer()(form, *values)
 

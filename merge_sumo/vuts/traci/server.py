@@ -85,7 +85,8 @@ def _serve(channel: Channel, sumo: ShadowSumo) -> None:
             answer = {"fault": str(fault), "gone": fault.gone}
         except ClosedError:
             answer = {"closed": True}
-        channel.send({**answer, "notes": client.session.notes})
+        session = client.session
+        channel.send({**answer, "notes": session.notes, "in_vain": sorted(session.in_vain)})
 
 
 class Client:

@@ -21,9 +21,9 @@ from merge_sumo.vuts.traci import commands
 from merge_sumo.vuts.traci import protocol as tp
 from merge_sumo.vuts.traci.commands import Effect
 from merge_sumo.vuts.traci.protocol import (
+    GET_JUNCTION,
     GET_SIMULATION,
     GET_VEHICLE,
-    PARAMETER,
     Command,
     Reader,
     pack,
@@ -35,13 +35,13 @@ T = TypeVar("T")
 QUESTIONS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
 SET: Final = 0x20
-SUBSCRIBE: Final = 0x30
+SUBSCRIBE, AROUND = 0x30, -0x20
 RESPONSE: Final = 0x10
-"""Distances from there to the identifiers of a domain's commands and of its subscriptions, and from
-questions and subscriptions to those of their answers."""
+"""Distances from there to the identifiers of a domain's commands, of its subscriptions and of its
+context subscriptions, and from questions and subscriptions to those of their answers."""
 FOR_EVER: Final = -1073741824.0
-WITH_PARAMETER: Final = {(GET_VEHICLE, 0x68), (GET_VEHICLE, 0x78), (GET_VEHICLE, PARAMETER)}
-"""Domain and variable of getLeader, getFollower and getParameter."""
+WITH_PARAMETER: Final = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
+"""Functions whose variables have a parameter in a subscription."""
 OWN_TYPE: Final = f"{NAME_OF_VUT}@{NAME_OF_VUT}"
 """What SUMO calls the type of a vehicle that has numbers of its own."""
 STAYED: Final = (
@@ -57,13 +57,15 @@ EXPECTED: Final = 2
 
 @dataclass(frozen=True, slots=True)
 class Subscription:
-    """Variables of an object, sent from begin to end."""
+    """Variables of an object, or of those around it, sent from begin to end."""
 
     getter: int  # identifier of the questions of the object's domain
     object_id: str
     begin_s: float
     end_s: float
-    variables: tuple[tuple[int, bytes], ...]
+    around: tuple[int, float] | None = None
+    """Identifier of the questions of those around it, and how far away they are at most, in m."""
+    variables: tuple[tuple[int, bytes], ...] = ()
     """Numbers of the variables, each with its parameter as it was sent."""
 
 
@@ -80,6 +82,7 @@ class Session:
 
     Attributes:
         notes: sentences on what a command does less than in SUMO, once each.
+        in_vain: commands of this episode that change nothing here, and would in SUMO.
         expected: whether more vehicles may come.
         departed: vehicles that departed since the client was last answered; and `arrived`.
         subscriptions: in the order in which they were made.
@@ -89,6 +92,7 @@ class Session:
         self.sumo = sumo
         self.subscriptions: list[Subscription] = []
         self.notes: list[str] = []
+        self.in_vain: set[str] = set()
         self.expected = True
         self.departed: list[str] = []
         self.arrived: list[str] = []
@@ -114,6 +118,7 @@ class Session:
         """Make a step in which the vehicles depart; `seed` is a parameter of the VUT."""
         self._moved, self._reached_mps = [None, None], {}
         self._commands_speeds = False
+        self.in_vain.clear()
         self.sumo.enter(states)
         self.sumo.call("vehicle.setParameter", NAME_OF_VUT, "seed", str(seed))
         self.departed += states
@@ -187,8 +192,9 @@ class Session:
         if identifier - SET in QUESTIONS:
             self._set(identifier, reader)
             return b""
-        if identifier - SUBSCRIBE in QUESTIONS:
-            return self._subscribe(identifier - SUBSCRIBE, reader)
+        for kind in (SUBSCRIBE, AROUND):
+            if identifier - kind in QUESTIONS:
+                return self._subscribe(identifier - kind, reader, around=kind == AROUND)
         if identifier == tp.GET_VERSION:
             return tp.version_answer()
         if identifier == tp.SET_ORDER:
@@ -203,29 +209,34 @@ class Session:
             return own(self, object_id)
         if (getter, variable) not in named():
             raise RefusedError(f"merge-sumo does not answer {name_of(getter, variable)}")
-        function, arguments = call_of_question(named()[getter, variable], object_id, reader)
-        return packed(function, self.sumo.call(function, *arguments))
+        call = call_of_question(named()[getter, variable], object_id, reader)
+        for point in call.on_roads:
+            self.sumo.call("simulation.convertRoad", *point)
+        return packed(call, self.sumo.call(call.function, *call.arguments))
 
-    def _subscribe(self, getter: int, reader: Reader) -> bytes:
-        """Subscribe to variables of an object; return the first values.
+    def _subscribe(self, getter: int, reader: Reader, *, around: bool) -> bytes:
+        """Subscribe to variables of an object, or of those around it; return the first values.
 
         As in SUMO it adds to one that differs in its variables alone; one without variables ends
         all of the object.
         """
         begin_s, end_s, object_id = reader.double(), reader.double(), reader.string()
+        near = (reader.ubyte(), reader.double()) if around else None
+        of = near[0] if near else getter
         variables = []
         for _ in range(reader.ubyte()):
             variable = reader.ubyte()
-            with_parameter = (getter, variable) in WITH_PARAMETER
+            name = named().get((of, variable), ("",))[-1].partition(".")[2]
+            with_parameter = not near and name in WITH_PARAMETER
             variables.append((variable, reader.typed_bytes() if with_parameter else b""))
+        wanted = Subscription(getter, object_id, begin_s, end_s, near, tuple(variables))
         if not variables:
             self.subscriptions = [
                 kept
                 for kept in self.subscriptions
-                if (kept.getter, kept.object_id) != (getter, object_id)
+                if replace(kept, begin_s=begin_s, end_s=end_s, variables=()) != wanted
             ]
             return b""
-        wanted = Subscription(getter, object_id, begin_s, end_s, tuple(variables))
         others = []
         for kept in self.subscriptions:
             if replace(kept, variables=wanted.variables) == wanted:
@@ -238,18 +249,45 @@ class Session:
         return answer
 
     def _result(self, subscription: Subscription) -> bytes:
-        getter, object_id = subscription.getter, subscription.object_id
-        if getter == GET_VEHICLE and object_id:
+        getter, object_id, near = subscription.getter, subscription.object_id, subscription.around
+        if getter == GET_VEHICLE and (object_id or near):
             self._check_vehicle(object_id)
-        content = bytes((getter + SUBSCRIBE + RESPONSE,)) + tp.raw_string(object_id)
-        content += bytes((len(subscription.variables),))
+        kind = AROUND if near else SUBSCRIBE
+        content = bytes((getter + kind + RESPONSE,)) + tp.raw_string(object_id)
+        count = bytes((len(subscription.variables),))
+        if near is None:
+            return tp.command(content + count + self._values(getter, object_id, subscription))
+        of, range_m = near
+        found = self._around(getter, object_id, of, range_m)
+        content += bytes((of,)) + count + tp.raw_integer(len(found))
+        for name in found:
+            content += tp.raw_string(name) + self._values(of, name, subscription)
+        return tp.command(content)
+
+    def _values(self, getter: int, object_id: str, subscription: Subscription) -> bytes:
+        """Return the values of the variables of a subscription for an object of a domain."""
+        content = b""
         for variable, parameter in subscription.variables:
             try:
                 value, code = self._value(getter, variable, object_id, Reader(parameter)), tp.OK
             except RefusedError as refused:
                 value, code = pack("s", refused), tp.ERROR
             content += bytes((variable, code)) + value
-        return tp.command(content)
+        return content
+
+    def _around(self, getter: int, object_id: str, of: int, range_m: float) -> list[str]:
+        """Return the objects of a domain that are at most so far away from an object."""
+        if getter == GET_VEHICLE:
+            point = self.position(object_id)
+        elif getter == GET_JUNCTION:
+            point = self.sumo.call("junction.getPosition", object_id)
+        else:
+            raise RefusedError("there are context subscriptions of vehicles and junctions")
+        if of != GET_VEHICLE:
+            return self.sumo.around(point, of, range_m)
+        # SUMO may still have them where they were before they were put back.
+        names = sorted(self.sumo.at_m)
+        return [name for name in names if math.dist(point, self.position(name)) <= range_m]
 
     def _set(self, command: int, reader: Reader) -> None:
         """Have a command carried out, or note that it changes nothing, or refuse it."""
@@ -263,12 +301,20 @@ class Session:
         if command == tp.SET_VEHICLE:
             self._check_vehicle(object_id)
         self._knows_of_the_lane |= "Lane" in name
+        if effect is Effect.OWN_KEYS:
+            key, *value = reader.arguments() or [""]
+            if object_id == NAME_OF_VUT and "." not in str(key):
+                self.sumo.call(commands.OWN_KEYS, object_id, key, *value)
+                return
+            effect = Effect.NOTHING
         if effect is Effect.NOTHING or (effect is Effect.ON_A_LANE and not self.sumo.has_lane):
             self._note(f"{name} is accepted and changes nothing here")
+            if commands.is_in_vain(functions):
+                self.in_vain.add(name)
             return
         if object_id not in (NAME_OF_VUT, OWN_TYPE):
             raise RefusedError(f"{object_id!r} is not the controller's to command")
-        function, arguments = commands.call_of_command(functions, object_id, reader)
+        function, arguments, *_ = commands.call_of_command(functions, object_id, reader)
         if effect is Effect.REACHED:
             self._reach(function, [value for value in arguments if isinstance(value, float)])
             return
