@@ -17,7 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.limits import check_limits, exhausted
 from merge_sumo.system.printable import printable
-from merge_sumo.system.streams import prepare_streams, use_utf8
+from merge_sumo.system.streams import prepare_streams
 
 __all__ = ["app", "campaigns", "inputs", "main", "studies"]
 
@@ -53,7 +53,6 @@ def main() -> None:
     128 + its number. Any other error is a fault of this package, and ends with a code that is no
     result: 1, which Python would give, is that of a gate that is met.
     """
-    use_utf8()
     prepare_streams()
     for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")

@@ -34,7 +34,7 @@ from merge_sumo.verdict.campaign_verdict import (
 )
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.plausibility import doubts, mostly_clipped
+from merge_sumo.verdict.plausibility import doubts, in_vain, mostly_clipped
 from merge_sumo.verdict.score import Measures, Outcome
 from merge_sumo.verdict.summary import Summary, summarise
 
@@ -213,6 +213,7 @@ class CampaignRun(Result):
             *(f"{fact.name}: {fact.shown}" for fact in told),
             run.ran_again_in_words if run.settings.ran_again else None,
             *(f"note: {note}" for note in doubts(run.cases, run.criterion)),
+            *(f"note: {note}" for note in in_vain(run.settings.in_vain)),
             *self._against_lines(),
             f"report: {self.report_file}",
         ]
@@ -279,7 +280,8 @@ class CaseRun(Result):
 
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
-        return lines_of(self.outcome, self.trajectory, self._from_s)
+        notes = [f"note: {note}" for note in in_vain(dict.fromkeys(self.trajectory.in_vain, 1))]
+        return [*lines_of(self.outcome, self.trajectory, self._from_s), *notes]
 
 
 def campaign_of(run: AnyRun) -> CampaignRun:

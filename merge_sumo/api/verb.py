@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from collections.abc import Callable
 from dataclasses import fields
 from typing import ParamSpec, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.errors import UserError
 from merge_sumo.help_texts import with_names
 from merge_sumo.options import Asked
 from merge_sumo.system.suggestions import nearest
@@ -40,16 +38,8 @@ def verb(record: Callable[P, A]) -> Callable[[Callable[[A], R]], Callable[P, R]]
             asked = record(*args, **given)
             object.__setattr__(asked, "given", frozenset(given))
             # One thread: products are small, and the cores are for workers.
-            try:
-                with threadpool_limits(1):
-                    return do(asked)
-            except UnicodeEncodeError as error:
-                if (encoding := sys.getfilesystemencoding()) == "utf-8":
-                    raise
-                raise UserError(
-                    f"this Python has names of files in {encoding}, where {error.object!r} is none:"
-                    " start it with PYTHONUTF8=1"
-                ) from error
+            with threadpool_limits(1):
+                return do(asked)
 
         call.__name__, call.__qualname__, call.__module__ = (
             do.__name__,

@@ -14,7 +14,7 @@ from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve_earlier
 from merge_sumo.campaigns.repeats import repeat
-from merge_sumo.campaigns.run import AGAINST, FILES, RAN_AGAIN, Run, spread_failures
+from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failures
 from merge_sumo.campaigns.scheduler import OnCase, Scheduler
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.engine.evaluate import evaluate_chunks, open_simulators, workers_or_here
@@ -191,7 +191,7 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
     no campaign.
     """
     settings = version.settings
-    recorded = {k: v for k, v in before.record.items() if k != RAN_AGAIN}
+    recorded = {k: v for k, v in before.record.items() if k not in TALLIES}
     record = record_of(settings, version.plan)
     # Where policies are decides nothing: what is in them does.
     moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
@@ -217,8 +217,7 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
             f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
             "same, or begin a new campaign"
         )
-    if before.settings.ran_again:
-        record[RAN_AGAIN] = before.settings.ran_again
+    record |= {k: before.record[k] for k in TALLIES if k in before.record}
     return record if moved or grown else None
 
 

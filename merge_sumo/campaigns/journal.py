@@ -21,6 +21,7 @@ import numpy as np
 from merge_sumo.campaigns.run import (
     CHECKSUM,
     FILES,
+    IN_VAIN,
     OUTCOMES,
     RAN_AGAIN,
     SETTINGS,
@@ -109,8 +110,9 @@ class Journal:
     def append(self, *groups: Sequence[Episode]) -> None:
         """Write groups and sync them to the disk: several at once take little more time than one.
 
-        What their episodes say of loaded files and of cases that ran again goes into the settings.
-        Raises `UserError` when they cannot be written; what was there before stays.
+        What their episodes say of loaded files, of commands in vain, and of cases that ran again
+        goes into the settings. Raises `UserError` when they cannot be written; what was there
+        before stays.
         """
         paths = [batch_file(self.folder, group[0].outcome.batch) for group in groups]
         lines, arrays = zip(*map(_encoded, groups), strict=True)
@@ -135,6 +137,9 @@ class Journal:
             for name, loaded in zip(FILES, (episode.files, episode.pov_files), strict=True):
                 if loaded:
                     noted[name] = loaded | (noted.get(name) or {})  # what was known stays
+            for command in episode.trajectory.in_vain:
+                cases = noted.get(IN_VAIN) or {}
+                noted[IN_VAIN] = cases | {command: cases.get(command, 0) + 1}
             if episode.again:
                 noted[RAN_AGAIN] = noted.get(RAN_AGAIN, 0) + 1
         if noted != self.settings:

@@ -18,7 +18,7 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
@@ -54,6 +54,10 @@ NAME_CHARACTERS: Final = 300
 """Of the name of a VUT, where it is shown."""
 RAN_AGAIN: Final = "ran_again"
 """Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
+IN_VAIN: Final = "in_vain"
+"""Key of `campaign.json`: in how many cases the VUT gave a command that changed nothing."""
+TALLIES: Final = (RAN_AGAIN, IN_VAIN)
+"""What is counted as cases end, and no setting."""
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
 CHECKSUM: Final = "sha256"
@@ -79,6 +83,7 @@ class RecordedSettings(Search):
     require: str | None = None
     cases: int = 0
     ran_again: Annotated[int, Meta(ge=0)] = 0
+    in_vain: dict[str, Annotated[int, Meta(ge=1)]] = field(default_factory=dict)
     net_sha256: str | None = None
     vut_files: dict[str, str] | None = None
     pov_files: dict[str, str] | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -177,6 +177,10 @@ class Driver(ABC):
         """Return the signals of the last answers, by corridor."""
         return {}
 
+    def in_vain(self, corridor: int) -> Collection[str]:
+        """Return the commands of this episode that were accepted, and changed nothing."""
+        return ()
+
     def files(self) -> tuple[Path, ...]:
         """Return the files of the user's that have decided on its answers so far."""
         return ()
@@ -243,6 +247,10 @@ class DriverWrapper(Driver):
     def signals(self) -> Mapping[int, Left]:
         """Return the signals of the driver."""
         return self._driver.signals()
+
+    def in_vain(self, corridor: int) -> Collection[str]:
+        """Return what the driver commanded in vain."""
+        return self._driver.in_vain(corridor)
 
     def files(self) -> tuple[Path, ...]:
         """Return the files that the driver has loaded so far."""

@@ -396,14 +396,10 @@ class _Rollout:
         motion[-1, :, 2] = 0.0
         # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
-        clipped = int(self.clipped[corridor])
+        left = series(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
         if episode.merge_row is None or (error is not None and self.merging is not None):
-            signals = series(episode.left, len(motion))
-            alone = Trajectory(episode.case, motion, end, error, clipped, signals=signals)
-            return episode.index, alone
-        signals = series(episode.left, len(motion))
-        before, after = cut_at(motion, episode.merge_row - episode.first_row)
-        merged = Trajectory(
-            episode.case, before, self.ends_as, error, episode.clipped, after, signals
-        )
-        return episode.index, merged
+            after, clipped = None, int(self.clipped[corridor])
+        else:
+            motion, after = cut_at(motion, episode.merge_row - episode.first_row)
+            end, clipped = self.ends_as, episode.clipped
+        return episode.index, Trajectory(episode.case, motion, end, error, clipped, after, *left)

@@ -64,7 +64,8 @@ class Trajectory:
     the simulation did wrong, in a case that MERGED behind M. `clipped_steps` counts the answers of
     the VUT that were outside the limits of acceleration and were clipped. `after` is the motion
     behind M where the scenario has it followed up, its first row that of the merge. `signals` are
-    what the VUT left for each row of both, where it left any.
+    what the VUT left for each row of both, where it left any. `in_vain` names the commands of the
+    VUT that were accepted, and changed nothing.
     """
 
     case: Case
@@ -74,6 +75,7 @@ class Trajectory:
     clipped_steps: int = 0
     after: FloatArray | None = None
     signals: Signals | None = None
+    in_vain: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Return its end in a line: the motion is an array of hundreds of numbers."""

@@ -53,9 +53,8 @@ def write_scenario(asked: verbs.NewScenario) -> Shown:
         road = road_of(net, *edges, lane_m=suggested_lane_m(road))
     scenario, found = suggested(road, file.stem), [*about(road), *kind_of_merge(road)]
     relative = os.path.relpath(net.resolve(), file.parent.resolve())
-    content = to_toml(replace(scenario, net=relative), found).encode()
     write_new(picture, road_svg(road, scenario), "FILE")
-    write_new(file, content, "FILE")
+    write_new(file, to_toml(replace(scenario, net=relative), found).encode(), "FILE")
     lines = [*found, f"written: {file}, and its picture {picture}"]
     return Shown({"about": found, "written": [str(file), str(picture)]}, lines)
 

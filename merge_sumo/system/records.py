@@ -197,10 +197,7 @@ def _too_large(size: int) -> str:
 
 
 def toml_value(value: object) -> str:
-    """Return plain values as TOML has them, in a line, numbers in full.
-
-    Raises `UserError` for a text that is not UTF-8, as the name of a file may be.
-    """
+    """Return plain values as TOML has them, in a line, numbers in full."""
     if isinstance(value, dict):
         named = []
         for name, of in value.items():
@@ -209,10 +206,7 @@ def toml_value(value: object) -> str:
         return f"{{{', '.join(named)}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
-    text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if any("\ud800" <= letter <= "\udfff" for letter in text):
-        raise UserError(f"{value!r} is not UTF-8, and a TOML file cannot name it: rename the file")
-    return text
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def to_plain(value: object) -> Any:

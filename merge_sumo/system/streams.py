@@ -20,7 +20,6 @@ from merge_sumo.system.interrupt import Stopped
 if TYPE_CHECKING:
     from typing_extensions import Buffer
 
-UTF8_MODE: Final = "PYTHONUTF8"
 STDIN: Final = 0
 STDOUT: Final = 1
 STDERR: Final = 2
@@ -51,17 +50,6 @@ class _Output(FileIO):
                         f"cannot write the result to standard output: {error.strerror}"
                     ) from error
         return memoryview(content).nbytes
-
-
-def use_utf8() -> None:
-    """Run the program again in UTF-8 mode where this interpreter has another encoding.
-
-    There names of files, and what is written of them, are other texts than elsewhere, or none. With
-    it the processes that are started have the mode, too.
-    """
-    if sys.getfilesystemencoding() != "utf-8" and os.environ.get(UTF8_MODE) != "1":
-        environment = {**os.environ, UTF8_MODE: "1"}
-        os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)  # noqa: S606
 
 
 def prepare_streams() -> None:

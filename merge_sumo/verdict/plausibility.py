@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.system.printable import counted
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.verdict.campaign_verdict import message_of
 from merge_sumo.verdict.criteria import CRITERIA
 from merge_sumo.verdict.criterion import Criterion, condition_of, values_of
@@ -38,6 +38,12 @@ def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
     if wrong:
         first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"
         yield f"in {counted(len(wrong), 'case')} an error ends the follow-up, {first}"
+
+
+def in_vain(cases: Mapping[str, int]) -> list[str]:
+    """Return a sentence on commands that changed nothing, by the cases in which they were given."""
+    listed = ", ".join(f"{printable(name)} in {counted(n, 'case')}" for name, n in cases.items())
+    return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
 
 
 def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:

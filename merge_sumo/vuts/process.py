@@ -11,14 +11,14 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.trajectory import as_reason
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import counted, printable
 
 LOG: Final = "controller.log"
 """In the folder of a campaign."""
@@ -35,12 +35,45 @@ _CAREFUL: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 """Whatever stands in the place of a log is neither followed nor waited for."""
 
 
+class Echo:
+    """What the starts of a program print, on standard error: once what they print alike."""
+
+    def __init__(self) -> None:
+        self._last, self._again = b"", 0
+
+    def close(self) -> None:
+        """Say how often the last was printed again."""
+        if self._again:
+            sys.stderr.write(f"(printed {counted(self._again, 'more time')})\n")
+        self._again = 0
+
+    def show(self, parts: Iterable[bytes]) -> None:
+        """Show what one start prints as it comes, from where it differs from the start before."""
+        text = held = b""
+        for part in parts:
+            text, held = (text + part)[:PENDING_BYTES], held + part
+            if len(text) == PENDING_BYTES or not self._last.startswith(text):
+                held = self._write(held)
+        if held and held == self._last:
+            self._again += 1
+            return
+        self._write(held)
+        self._last = text or self._last
+
+    def _write(self, text: bytes) -> bytes:
+        """Show a text; return what is left of it."""
+        if text:
+            self.close()
+            sys.stderr.write(text.decode("utf-8", errors="replace"))
+        return b""
+
+
 class Output:
     """Reads what a program prints until it ends, so that a full pipe never holds it up."""
 
-    def __init__(self, pipe: IO[bytes], log: Path | None) -> None:
-        """Read a pipe; add what comes to the file `log`, or show it on standard error."""
-        self._pipe, self._log = pipe, log
+    def __init__(self, pipe: IO[bytes], log: Path | None, echo: Echo) -> None:
+        """Read a pipe; add what comes to the file `log`, or show it where that is None."""
+        self._pipe, self._log, self._echo = pipe, log, echo
         self._tail = self._pending = b""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -57,17 +90,21 @@ class Output:
 
     def _read(self) -> None:
         with self._pipe as pipe:
-            while part := os.read(pipe.fileno(), 1 << 16):
-                self._tail = (self._tail + part)[-TAIL_BYTES:]
-                if self._log is None:
-                    sys.stderr.write(part.decode("utf-8", errors="replace"))
-                else:
-                    self._pending = (self._pending + part)[-PENDING_BYTES:]
-                    if self._log.parent.is_dir():
-                        # A full disk costs what was printed, not the campaign.
-                        with suppress(OSError):
-                            append(self._log, self._pending)
-                        self._pending = b""
+            if self._log is None:
+                self._echo.show(self._parts(pipe))
+                return
+            for part in self._parts(pipe):
+                self._pending = (self._pending + part)[-PENDING_BYTES:]
+                if self._log.parent.is_dir():
+                    # A full disk costs what was printed, not the campaign.
+                    with suppress(OSError):
+                        append(self._log, self._pending)
+                    self._pending = b""
+
+    def _parts(self, pipe: IO[bytes]) -> Iterator[bytes]:
+        while part := os.read(pipe.fileno(), 1 << 16):
+            self._tail = (self._tail + part)[-TAIL_BYTES:]
+            yield part
 
 
 LINES: Final = 40
@@ -149,8 +186,11 @@ def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
 class Program:
     """A running program in a process group of its own; what it prints goes to a log."""
 
-    def __init__(self, arguments: list[str], port: int, log: Path | None = None) -> None:
-        """Start it, told the port as `{port}` in its arguments and by the environment."""
+    def __init__(self, arguments: list[str], port: int, log: Path | None, echo: Echo) -> None:
+        """Start it, told the port as `{port}` in its arguments and by the environment.
+
+        What it prints goes to `log`, or to `echo` where that is None.
+        """
         try:
             self._process = subprocess.Popen(
                 [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
@@ -165,7 +205,7 @@ class Program:
                 f"the command {arguments[0]!r} cannot be started: {error.strerror}"
             ) from error
         assert self._process.stdout is not None, "piped"  # noqa: S101
-        self._output = Output(self._process.stdout, log)
+        self._output = Output(self._process.stdout, log, echo)
         self.process = self._process.pid
         """Id of its process, which is that of its session."""
 

@@ -21,8 +21,6 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
-from merge_sumo.road.merge import default_net_path
-from merge_sumo.road.scenario_file import read_scenario
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.system.printable import printable, quoted
 
@@ -45,72 +43,6 @@ def on_ascii(*arguments: object) -> tuple[int, str, str]:
         env={**os.environ, **ASCII},
     )
     return done.returncode, done.stdout.decode("latin-1"), done.stderr.decode("latin-1")
-
-
-NOT_UTF8_PYTHON = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-"""Names of files are ASCII there."""
-
-
-class TestAnInterpreterThatIsNotUtf8:
-    @staticmethod
-    def python(folder: Path, *arguments: str) -> tuple[int, str, str]:
-        done = subprocess.run(
-            [sys.executable, *arguments],
-            capture_output=True,
-            check=False,
-            cwd=folder,
-            env={**os.environ, **NOT_UTF8_PYTHON},
-        )
-        return done.returncode, done.stdout.decode(), done.stderr.decode()
-
-    def run(self, folder: Path, *arguments: str) -> str:
-        code, out, err = self.python(folder, "-m", "merge_sumo.cli", *arguments)
-        assert code == 0, err
-        return out
-
-    def new(self, folder: Path) -> None:
-        shutil.copy(default_net_path(), folder / "nétz.net.xml")
-        edges = ("--mainline", "main_in main_out", "--ramp", "ramp main_out")
-        self.run(folder, "scenario", "new", "szenär.toml", "--net", "nétz.net.xml", *edges)
-
-    def test_writes_what_others_read(self, tmp_path):
-        self.new(tmp_path)
-        assert read_scenario(tmp_path / "szenär.toml").net == str(tmp_path / "nétz.net.xml")
-
-    @pytest.mark.slow
-    def test_tests_and_exports_by_names_of_any_letters(self, tmp_path):
-        self.new(tmp_path)
-        (tmp_path / "vüt.py").write_text(VUT)
-        what = ("--scenario", "szenär.toml", "--vut", "vüt.py:drive")
-        cases = ("--level", "0", "--cases", "2", "--workers", "2", "-q")
-        self.run(tmp_path, "campaign", *what, *cases, "--out", "läuf")
-        assert Run(tmp_path / "läuf").settings.vut == "vüt.py:drive"
-        for name in ("sumo", "openscenario", "csv", "cases"):
-            assert "läuf" in self.run(tmp_path, "export", "läuf", "0", "--format", name)
-        assert "identical" in self.run(tmp_path, "replay", "läuf/scenarios/case-00000")
-        self.run(tmp_path, "report", "läuf")
-        self.run(tmp_path, "run", *what, "--x", "-300", "--v", "30", "--out", "eins")
-
-    def test_is_told_to_callers_of_the_package(self, tmp_path):
-        self.new(tmp_path)
-        (tmp_path / "szenär.toml").rename(tmp_path / "a.toml")
-        code, _, err = self.python(
-            tmp_path, "-c", "import merge_sumo; merge_sumo.check_scenario('a.toml')"
-        )
-        assert code == 1
-        assert "names of files in ascii, where" in err
-        assert err.splitlines()[-1].endswith("is none: start it with PYTHONUTF8=1")
-
-
-class TestANet:
-    def test_whose_name_is_no_text_is_refused_before_anything_is_written(self, call, tmp_path):
-        net = Path(shutil.copy(default_net_path(), tmp_path / f"{NOT_UTF8}.net.xml"))
-        edges = ("--mainline", "main_in main_out", "--ramp", "ramp main_out")
-        assert_refused(
-            call("scenario", "new", "a.toml", "--net", net.name, *edges),
-            "is not UTF-8, and a TOML file cannot name it: rename the file",
-        )
-        assert [*tmp_path.iterdir()] == [net]
 
 
 class TestAVutFile:

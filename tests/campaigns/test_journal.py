@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.campaigns.journal import Journal, to_line
-from merge_sumo.campaigns.run import OUTCOMES, Run, read_outcomes, read_settings
+from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
@@ -205,6 +205,17 @@ class TestAJournal:
             to.append([replace(episode(1, 1), pov_files={"c": "4"})])
         noted = {"vut_files": {"a": "1", "b": "3"}, "pov_files": {"c": "4"}, "ran_again": 1}
         assert read_settings(tmp_path / "run") == noted
+
+    def test_notes_in_how_many_cases_a_command_was_in_vain(self, tmp_path):
+        with Journal.create(tmp_path / "run", dict.fromkeys(FILES)) as to:
+            for number, commands in enumerate([("a", "b"), (), ("a",)]):
+                one = episode(number, number)
+                trajectory = replace(one.trajectory, in_vain=commands)
+                to.append([replace(one, trajectory=trajectory)])
+        assert read_settings(tmp_path / "run") == {
+            **dict.fromkeys(FILES),
+            "in_vain": {"a": 2, "b": 1},
+        }
 
     def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):
         journal = Journal.create(tmp_path / "run", {})

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import FOREIGN, LANES, edge, lane_corridor_of, plain
+from foreign_nets import FOREIGN, LANES, lane_corridor_of
 from handmade import write_run
 from lxml import etree
 
@@ -161,28 +161,6 @@ class TestAnExport:
                 assert off_m < (LANE_WIDTH_M if beside else 0.03), x_m
                 compared += not beside
         assert compared > 150
-
-    def test_to_opendrive_has_no_line_that_is_a_point(self, tmp_path):
-        net = plain(
-            tmp_path,
-            '<node id="a" x="0" y="10000"/><node id="j" x="300" y="10040" radius="0"/>'
-            '<node id="m" x="900" y="10100"/><node id="e" x="1500" y="10150"/>'
-            '<node id="b" x="100" y="9900"/>',
-            edge("in", "a", "j", 1, 30, priority=5) + edge("in2", "j", "m", 1, 30, priority=5)
-            + edge("ramp", "b", "m", 1, 20) + edge("out", "m", "e", 1, 30, priority=5),
-        )  # fmt: skip
-        # As in imported nets: a lane inside of a junction that is drawn as a point.
-        text = re.sub(r'(id=":j_0_0" .*shape="(\S+) )\S+"', r'\1\2"', net.read_text())
-        # And one with a point that is nearly the one before.
-        near = r'(id=":m_0_0" .*shape="\S+ )((\S+),(\S+)) '
-        text, found = re.subn(near, r"\1\2 \g<3>0002,\4 ", text)
-        assert found == 1
-        net.write_text(text)
-        road = road_of(net, ["in", "in2", "out"], ["ramp", "out"])
-        for element in etree.fromstring(opendrive(road)).iterfind("road"):
-            lengths_m = [float(line.get("length")) for line in element.iter("geometry")]
-            assert min(lengths_m) >= 1e-3
-            assert sum(lengths_m) == pytest.approx(float(element.get("length")), abs=1e-6)
 
     @pytest.mark.parametrize("name", LANES)
     def test_to_opendrive_has_both_lanes_of_a_merge(self, tmp_path, name):

@@ -26,7 +26,7 @@ from merge_sumo.vuts.base import VutOptions
 from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.hosted import HostedVut
-from merge_sumo.vuts.process import append
+from merge_sumo.vuts.process import Echo, append
 from merge_sumo.vuts.spec import parse
 
 OPTIONS = VutOptions(deadline_s=0.3)
@@ -105,6 +105,15 @@ def Vut(seen):
             assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
     finally:
         vut.close()
+
+
+def test_what_starts_print_is_shown_from_where_it_differs(capsys):
+    echo = Echo()
+    for parts in ([b"a", b"b"], [b"ab"], [b"a", b"b"], [b""], [b"a", b"c"], [b"a"], [b"a"]):
+        echo.show(parts)
+    echo.close()
+    told = "ab(printed 2 more times)\naca(printed 1 more time)\n"
+    assert capsys.readouterr().err == told
 
 
 def test_what_it_reads_may_be_its_to_write_and_its_code_is_not(spec, tmp_path):

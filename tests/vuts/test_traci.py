@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import traci
-from controllers import assert_drives_as_level0, free_port, program, raw_client
+from controllers import STOCK_CLIENT, assert_drives_as_level0, free_port, program, raw_client
 from raw_traci import Client, GoneError
 from vut_contract import cases_of, factory, run_cases
 
@@ -279,6 +279,38 @@ def test_only_code_must_stay_as_it_is_while_it_runs(command, code, tmp_path, mon
         Path(code).write_text("print(2)\n", encoding="utf-8")
         with pytest.raises(UserError, match=f"{code}, code of the VUT .* is not as it was"):
             vut(1)
+
+
+IN_VAIN = """
+while True:
+    traci.simulationStep()
+    if "vut" in traci.vehicle.getIDList():
+        traci.vehicle.changeSublane("vut", 0.5)
+"""
+
+
+def test_what_it_commands_in_vain_is_told_in_the_end(tmp_path, command_line):
+    vut = "traci:" + program(tmp_path, STOCK_CLIENT + IN_VAIN)
+    campaign = ("--cases", 3, "--sampler", "uniform", "--level", 0, "--out", tmp_path / "run")
+    start = ("--level", 0, "--x", -250, "--v", 30)
+    told = "note: commanded in vain, because it changes nothing here: vehicle.changeSublane in {}"
+    for command, cases in (
+        (("campaign", "--vut", vut, *campaign, "-q"), "3 cases"),
+        (("campaign", "--resume", tmp_path / "run", "--vut", vut, "--cases", 4, "-q"), "4 cases"),
+        (("run", "--vut", vut, *start), "1 case"),
+        (("check-vut", vut), "16 cases"),
+    ):
+        _, out, _ = command_line(*command)
+        assert told.format(cases) in out.splitlines()
+
+
+def test_what_every_start_of_a_program_prints_is_shown_once(tmp_path, command_line, capfd):
+    crash = "traci.simulationStep()\ntraci.simulationStep()\nraise ValueError('my bug')\n"
+    code, _, err = command_line("check-vut", "traci:" + program(tmp_path, STOCK_CLIENT + crash))
+    said = err + capfd.readouterr().err
+    assert code == 1
+    assert said.count("ValueError: my bug") == 1
+    assert re.search(r"^\(printed 1[5-9] more times\)$", said, re.MULTILINE)
 
 
 def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):

@@ -35,7 +35,7 @@ from merge_sumo.vuts.base import Deadline, Vut, VutOptions, VutSpec
 from merge_sumo.vuts.blame_cell import BlameCell
 from merge_sumo.vuts.host import wire
 from merge_sumo.vuts.host.wire import About, Facts, Frame, Lost, Opening, Said, WireError
-from merge_sumo.vuts.process import Output
+from merge_sumo.vuts.process import Echo, Output
 
 T = TypeVar("T")
 
@@ -64,7 +64,7 @@ def hosted_vut(spec: VutSpec, options: VutOptions, alike: VutSpec) -> Vut:
     """
     key = alike, str(Path.cwd()), options.memory_gib
     if key not in _known or changed(_known[key][1]):
-        host = _first(lambda: Host(spec, options))
+        host = _first(lambda: Host(spec, options, Echo()))
         host.kill()
         _known[key] = host.facts, hashed(map(Path, host.facts.files))
     facts = _known[key][0]
@@ -114,9 +114,9 @@ class Host:
         facts: what the VUT said of itself.
     """
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+    def __init__(self, spec: VutSpec, options: VutOptions, echo: Echo) -> None:
         """Start the process and open the VUT; `UserError` or `HostDiedError` when that fails."""
-        self._spec, self._options = spec, options
+        self._spec, self._options, self._echo = spec, options, echo
         self._number = 0
         self.alive = True
         self._buffer = bytearray()
@@ -207,7 +207,7 @@ class Host:
         # A question fits into the pipe, unless the process has stopped to listen.
         os.set_blocking(self._to, False)
         assert self._process.stderr is not None, "piped"  # noqa: S101
-        self._output = Output(self._process.stderr, self._options.log)
+        self._output = Output(self._process.stderr, self._options.log, self._echo)
         self._poll = select.poll()
         self._poll.register(self._from, select.POLLIN)
 
@@ -287,7 +287,7 @@ class HostedVut(Driver):
     def __init__(self, corridors: int, spec: VutSpec, options: VutOptions) -> None:
         """Start the process and make the VUT's driver there; `UserError` when that cannot be."""
         super().__init__(corridors)
-        self._spec, self._options = spec, options
+        self._spec, self._options, self._echo = spec, options, Echo()
         self._begun: list[tuple[int, Case]] = []
         self._said = wire.NOTHING
         self._files: set[Path] = set()
@@ -359,9 +359,10 @@ class HostedVut(Driver):
     def close(self) -> None:
         """Let the VUT close and end its process."""
         self._host.close()
+        self._echo.close()
 
     def _started(self) -> Host:
-        host = Host(self._spec, self._options)
+        host = Host(self._spec, self._options, self._echo)
         self._files |= set(map(Path, host.facts.files))
         self._parameters = host.make(self.corridors)
         return host

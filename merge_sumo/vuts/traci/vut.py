@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import ExitStack, suppress
 from time import monotonic
 from typing import Any, Final
@@ -33,7 +33,7 @@ from merge_sumo.sumo.shadow_sumo import write_files
 from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
-from merge_sumo.vuts.process import GRACE_S, Program, append, code_of, split_command
+from merge_sumo.vuts.process import GRACE_S, Echo, Program, append, code_of, split_command
 from merge_sumo.vuts.traci import server
 from merge_sumo.vuts.traci.door import HOST, Door
 from merge_sumo.vuts.traci.server import FaultError
@@ -109,7 +109,9 @@ class TraciVut(Driver):
         self._program: Program | None = None
         self._client: socket.socket | None = None
         self._reason: str | None = None
+        self._echo = Echo()
         self._noted: set[str] = set()
+        self._in_vain: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
         self._starting, self._seed = True, 0
@@ -128,6 +130,7 @@ class TraciVut(Driver):
         self._reason = None
         self._starting, self._seed = True, case.told_seed
         self._before_mps.clear()
+        self._in_vain.clear()
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration that follows from what the client commanded, or NaN."""
@@ -143,6 +146,10 @@ class TraciVut(Driver):
         """Return what the client did wrong."""
         return self._reason
 
+    def in_vain(self, corridor: int) -> Collection[str]:
+        """Return what the client commanded in vain."""
+        return self._in_vain
+
     def close(self) -> None:
         """Let the client see the last arrival and end; then end it."""
         ends = True
@@ -151,6 +158,7 @@ class TraciVut(Driver):
                 ends = "closed" in self._ask({"do": "farewell"})
         self._disconnect(grace=ends)
         self._shadow.close()
+        self._echo.close()
 
     def _acceleration_mps2(self, scene: Scene) -> float:
         """Show the vehicles, and return what the client commands for the coming step."""
@@ -223,6 +231,7 @@ class TraciVut(Driver):
             ) from error
         for note in answer.get("notes", ()):
             self._note(note)
+        self._in_vain.update(answer.get("in_vain", ()))
         if "fault" not in answer:
             return answer
         text = str(answer["fault"])
@@ -249,7 +258,7 @@ class TraciVut(Driver):
         if connection is None:
             port = self._door.port
             if self._command is not None:
-                self._program = Program(self._command, port, self._options.log)
+                self._program = Program(self._command, port, self._options.log, self._echo)
             else:
                 sys.stderr.write(
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
