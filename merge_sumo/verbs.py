@@ -329,6 +329,9 @@ class Rerun(Recorded):
     stand in the place of the campaign. Then what changed in the file is shown, `out` is the file as
     it is now, and the exit code is 1 also for a new error or contact, or too little margin.
 
+    With a controller that others wrote, a case that changed runs a second time. Where that does not
+    confirm the change, the case is "not repeatable", and is not counted.
+
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 
     Example:  merge-sumo rerun cases.toml --vut design2 --junit changes.xml

@@ -185,7 +185,7 @@ def rerun(asked: verbs.Rerun) -> Comparison:
     with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
     if isinstance(before, CasesFile):
-        compared = before.judged(compared, out or before.folder)
+        compared = before.compared(compared, out or before.folder)
     return _written(compared, out, junit)
 
 

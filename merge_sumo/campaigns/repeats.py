@@ -84,7 +84,7 @@ def repeat(
     cases, found = [outcome.case for outcome in again], []
     for place, ran in evaluate(plan, cases, workers):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(_compared(again[place], recorded[again[place].index], ran))
+            found.append(repeat_of(again[place], recorded[again[place].index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
         first, second = (dict(evaluate_anew(plan, cases)) for _ in range(2))
         drawn = {
@@ -101,19 +101,12 @@ def repeat(
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
-    None where the package brings all that drives, nor of a TraCI client that nobody starts: it may
-    have gone. Half are the first cases, which a new controller ran; the others are spread over the
-    campaign, and run before those. Errors may be a slow machine's doing, and are left out.
+    Only those of `others_drive`. Half are the first cases, which a new controller ran; the others
+    are spread over the campaign, and run before those. Errors may be a slow machine's doing, and
+    are left out.
     """
-    if waits_for_client(settings.vut):
-        return []
-    own_vut = not is_built_in(settings.vut)
-    own_pov = settings.pov is not None and not is_built_in(settings.pov)
     tested = [
-        outcome
-        for outcome in outcomes
-        if not outcome.measures.end.is_error
-        and (own_vut or (own_pov and outcome.case.level == OWN))
+        outcome for outcome in others_drive(outcomes, settings) if not outcome.measures.end.is_error
     ]
     count = min(MOST, -(-len(tested) // ONE_IN))
     first = (count + 1) // 2
@@ -121,8 +114,20 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
     return [tested[place] for place in (*others, *reversed(range(first)))]
 
 
-def _compared(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
-    """Return how the second run of a case compares with the recorded one."""
+def others_drive(outcomes: Iterable[Outcome], settings: CampaignSettings) -> list[Outcome]:
+    """Return the outcomes of the cases in which something drives that may not repeat itself.
+
+    None of a TraCI client that nobody starts: it may have gone.
+    """
+    if waits_for_client(settings.vut):
+        return []
+    own_vut = not is_built_in(settings.vut)
+    own_pov = settings.pov is not None and not is_built_in(settings.pov)
+    return [one for one in outcomes if own_vut or (own_pov and one.case.level == OWN)]
+
+
+def repeat_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
+    """Return how the second run of a case compares with the first one."""
     differs_from_s, first = _difference(recorded, ran.trajectory)
     now = ran.outcome
     end = now.measures.end

@@ -23,7 +23,8 @@ SHOWN: Final = 200
 MOST_REGIONS: Final = 20
 """Regions of a level that are listed."""
 DRAWN: Final = (
-    *(Change.BROKE, Change.WITHIN_CHANCE, Change.NEITHER, Change.STILL_CONTACT, Change.FIXED),
+    *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
+    *(Change.STILL_CONTACT, Change.FIXED),
 )
 """Changes of which a section has both motions of each case; the template says what they mean."""
 SEEN: Final = 0.005

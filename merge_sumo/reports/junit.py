@@ -125,8 +125,8 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
             if one.change in GOT_WORSE:
                 _wrong(test, "failure", REGRESSION, one.became)
-            if one.change is Change.ACCEPTED:
-                etree.SubElement(test, "skipped", message=f"accepted: {one.became}")
+            if one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
+                etree.SubElement(test, "skipped", message=f"{one.change}: {one.became}")
 
 
 def _case(

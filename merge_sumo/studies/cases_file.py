@@ -121,17 +121,16 @@ class CasesFile(Run):
             raise UserError(f"{self.folder} has no case {index}")
         return self._by_index[index]
 
-    def judged(self, compared: Comparison, path: Path) -> Comparison:
-        """Return a comparison of cases by what the file allows; its text is that for a path."""
+    def compared(self, compared: Comparison, path: Path) -> Comparison:
+        """Return a comparison of its cases with its text, which is that for a path, and notes."""
         (step,), (_, now) = compared.steps, compared.versions
-        cases = [replace(one, judged=self._change(one)) for one in step.cases]
         outcomes = {one.index: one for one in (*self.outcomes, *now.outcomes)}
         before = cases_toml(self, self.outcomes, path, self.settings.vut)
         text = cases_toml(self, outcomes.values(), path, now.vut)
         notes = list[str]()
         for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
             notes += [] if old == new else [f"- {old.strip()}", f"+ {new.strip()}"]
-        for index, one in ((one.b.index, one) for one in cases):
+        for index, one in ((one.b.index, one) for one in step.cases):
             if one.change in GOT_WORSE:
                 why = cause(one.b, now.motions([index]).get(index))
                 notes.append(f"case {index}, {one.change}: {why}")
@@ -140,10 +139,10 @@ class CasesFile(Run):
                 notes.append(f"case {index} is accepted ({reason}) and {so}")
         if not any(one.is_tested for one in now.outcomes):
             notes.append(judge(now.outcomes).nothing_tested)
-        step = replace(step, cases=cases)
-        return replace(compared, steps=(step,), text=text, notes=tuple(map(printable, notes)))
+        notes += compared.notes
+        return replace(compared, text=text, notes=tuple(map(printable, notes)))
 
-    def _change(self, one: ComparedCase) -> Change:
+    def change_of(self, one: ComparedCase) -> Change:
         """Return what the file calls a change; it excuses neither a new error nor a new contact."""
         a, b = one.a.measures, one.b.measures
         if b.error is not None and a.error is None:

@@ -15,7 +15,7 @@ again with a changed VUT. All return a `Comparison`.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Final
@@ -55,7 +55,8 @@ class Change(StrEnum):
     A case passes where the VUT arrives and the criterion is met. One whose runs are not alike may
     pass with one version alone by chance: it is `WITHIN_CHANCE` where Fisher's exact test does not
     tell the shares of failing runs apart. `LATER_ALONE`, `EARLIER_ALONE` and `NOT_SEEN` are only of
-    regions, `WORSE` and `ACCEPTED` only of a cases file.
+    regions, `WORSE` and `ACCEPTED` only of a cases file, `NOT_REPEATABLE` only of cases that ran
+    again: it is a change that the same case does not show, or not alike, when it runs once more.
     """
 
     BROKE = "broke"
@@ -63,6 +64,7 @@ class Change(StrEnum):
     ACCEPTED = "accepted"
     LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
+    NOT_REPEATABLE = "not repeatable"
     NEITHER = "pass with neither"
     STILL_CONTACT = "contact without failure"
     FIXED = "fixed"
@@ -88,7 +90,7 @@ class ComparedCase:
         b: its outcome with the later one.
         runs_a: its runs with the earlier one, of which `a` decides; None for a single one.
         runs_b: its runs with the later one.
-        judged: what a cases file calls its change; None where none says.
+        judged: what a cases file, or a second run, calls its change; None where none says.
     """
 
     a: Outcome
@@ -133,7 +135,7 @@ class ComparedCase:
         before, after = _word(self.a), _word(self.b)
         if before == after and self.change is not Change.BOTH:
             verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
-            if self.change is Change.WORSE:
+            if self.change in (Change.WORSE, Change.NOT_REPEATABLE):
                 verdicts = (f"margin {short(o.margin)}" for o in (self.a, self.b))
             before, after = (f"{before}, {verdict}" for verdict in verdicts)
         return f"{before} -> {after}"
@@ -179,6 +181,11 @@ def paired(
         ComparedCase(first[key][0], second[key][0], first[key][1], second[key][1])
         for key in first.keys() & second.keys()
     ]
+    return in_order(cases)
+
+
+def in_order(cases: Iterable[ComparedCase]) -> list[ComparedCase]:
+    """Return cases in the order of tables, of a change the worst first."""
     order = list(Change)
     return sorted(cases, key=lambda c: (order.index(c.change), c.b.margin or 0.0, c.b.index))
 
@@ -377,7 +384,9 @@ class Comparison(Result):
         named = f"from {step.before} to {step.after}: {counted(len(step.cases), 'case')} with both"
         text = [named] if step.cases else []
         text += step.table_lines()
-        for change in (Change.BROKE, Change.WITHIN_CHANCE, Change.STILL_CONTACT):
+        for change in (
+            *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.STILL_CONTACT),
+        ):
             cases = [case for case in step.cases if case.change is change]
             if cases:
                 text.append(f"{change}{cut(len(cases), LISTED)}:")

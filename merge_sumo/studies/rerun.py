@@ -2,19 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Final
 
+from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
-from merge_sumo.studies.comparison import LISTED, OUT, Change, Comparison, of_two
+from merge_sumo.studies.cases_file import CasesFile
+from merge_sumo.studies.comparison import (
+    LISTED,
+    OUT,
+    Change,
+    ComparedCase,
+    Comparison,
+    Step,
+    in_order,
+    of_two,
+    passes,
+)
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.version import Version
-from merge_sumo.system.printable import quoted
+from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
+
+AGAIN: Final = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
+"""Changes whose cases run a second time, where a controller drives that may not repeat itself."""
 
 
 def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[Outcome]:
@@ -44,28 +62,80 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     run, settings = study.run, study.settings
     levels = sorted({outcome.case.level for outcome in before})
     study.check_same_system(levels, may_change=True)
-    # In another order than the campaign's, which a VUT that remembers would repeat.
-    order, by_index = before[::-1], dict[int, Episode]()
     plan = study.plan.for_cases(len(before))
     with workers_or_here(study.workers) as processes:
         open_simulators(plan, processes)
-        for place, now in evaluate(plan, [outcome.case for outcome in order], processes):
-            old = order[place]
-            by_index[old.index] = now.at(old.index, old.batch)
-            study.on_cases(1)
-    after = [by_index[outcome.index] for outcome in before]
-    search = f"merge-sumo campaign --vut {quoted(settings.vut)}"
-    if settings.vut != run.vut:
-        search += f" --against {quoted(run.vut)}"
-    source = (
-        f"the cases come from the search of {run.vut} as it was recorded, so what the version of "
+        # In another order than the campaign's, which a VUT that remembers would repeat.
+        ran = _ran(plan, before[::-1], processes, study.on_cases)
+        after = [ran[outcome.index] for outcome in before]
+        earlier = replace(Version.of(run), outcomes=before, levels=levels)
+        compared = of_two(earlier, earlier.with_vut(settings.vut, after), _source(study))
+        (step,) = compared.steps
+        if isinstance(run, CasesFile):
+            judged = [replace(one, judged=run.change_of(one)) for one in step.cases]
+            step = replace(step, cases=judged)
+        changed = [one.b for one in step.cases if one.change in AGAIN and one.runs_b is None]
+        again = _ran(plan, others_drive(changed, settings)[::-1], processes)
+    step, notes = _repeated(step, ran, again)
+    differing = [one for one in step.cases if one.change is not Change.BOTH]
+    indices = " ".join(str(one.b.index) for one in differing[:LISTED])
+    page = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
+    if settings.pov is not None:
+        page += f" --pov {quoted(settings.pov)}"
+    return replace(compared, steps=(step,), notes=notes, page_command=page + OUT)
+
+
+def _source(study: RunStudy) -> str:
+    """Return in a sentence where the cases come from."""
+    vut, before = study.settings.vut, study.run.vut
+    search = f"merge-sumo campaign --vut {quoted(vut)}"
+    if vut != before:
+        search += f" --against {quoted(before)}"
+    return (
+        f"the cases come from the search of {before} as it was recorded, so what the version of "
         f"now alone fails may lie elsewhere: `{search}` searches there"
     )
-    earlier = replace(Version.of(run), outcomes=before, levels=levels)
-    compared = of_two(earlier, earlier.with_vut(settings.vut, after), source)
-    differing = [one for one in compared.steps[0].cases if one.change is not Change.BOTH]
-    indices = " ".join(str(one.b.index) for one in differing[:LISTED])
-    again = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
-    if settings.pov is not None:
-        again += f" --pov {quoted(settings.pov)}"
-    return replace(compared, page_command=again + OUT)
+
+
+def _ran(
+    plan: SimulationPlan,
+    outcomes: Sequence[Outcome],
+    workers: Workers,
+    on_cases: Callable[[int], None] = lambda _: None,
+) -> dict[int, Episode]:
+    """Run the cases of outcomes, in their order; return what became of them by index."""
+    by_index = dict[int, Episode]()
+    for place, now in evaluate(plan, [outcome.case for outcome in outcomes], workers):
+        old = outcomes[place]
+        by_index[old.index] = now.at(old.index, old.batch)
+        on_cases(1)
+    return by_index
+
+
+def _repeated(
+    step: Step, ran: Mapping[int, Episode], again: Mapping[int, Episode]
+) -> tuple[Step, tuple[str, ...]]:
+    """Return what changed by two runs of each case that did, and sentences on what differs.
+
+    A change of the verdict is one where neither run has the old verdict, a loss of margin where
+    both runs are the same: chance moves a margin in each run.
+    """
+    found, cases = list[Repeat](), list[ComparedCase]()
+    for one in step.cases:
+        index = one.b.index
+        if index in again:
+            found.append(repeat_of(ran[index].outcome, ran[index].trajectory, again[index]))
+            is_verdict = one.change is not Change.WORSE
+            stands = is_verdict and passes(one.b) == passes(again[index].outcome)
+            if not (stands or found[-1].same):
+                one = replace(one, judged=Change.NOT_REPEATABLE)  # noqa: PLW2901
+        cases.append(one)
+    step = replace(step, cases=in_order(cases))
+    notes = list(filter(None, [unrepeatable(found)]))
+    if number := step.count(Change.NOT_REPEATABLE):
+        notes.append(
+            f"Not counted, as it may be chance: {counted(number, 'change')}. Draw random numbers "
+            "from the seed of the case, as `reset(seen, seed)` tells it in Python, or compare "
+            "campaigns of both versions with `repeat`"
+        )
+    return step, tuple(notes)

@@ -140,7 +140,7 @@ def test_a_new_error_or_contact_is_worse(file):
     fails = next(o for o in record.outcomes if not passes(o))
 
     def change(before, **measured):
-        return record._change(
+        return record.change_of(
             ComparedCase(before, replace(before, measures=replace(before.measures, **measured)))
         )
 
@@ -150,7 +150,89 @@ def test_a_new_error_or_contact_is_worse(file):
     record.accepted = {fails.index: "known", safe.index: "known"}
     assert change(fails) == "accepted"
     assert change(fails, end=End.VUT_ERROR, error="answered nan") == "broke"
-    assert record._change(ComparedCase(safe, replace(safe, margin=-0.1))) == "accepted"
+    assert record.change_of(ComparedCase(safe, replace(safe, margin=-0.1))) == "accepted"
+
+
+NOISY = (
+    CONTROLLER
+    + """
+from collections import Counter
+TIMES = Counter()
+
+class Drawing(Own):
+    def reset(self, seen):
+        self.far = seen.x_pov_m < -300.0
+        TIMES[seen.x_pov_m] += 1
+        self.times = TIMES[seen.x_pov_m]
+
+    def act(self, seen):
+        return 1.0 if seen.x_vut_m > -100.0 - self.times else -1.0
+
+class Failing(Drawing):
+    def act(self, seen):
+        if self.far and seen.x_vut_m > -20.0 * self.times:
+            raise ValueError(self.times)
+        return Own.act(self, seen)
+
+class Stopping(Drawing):
+    def act(self, seen):
+        return -4.0 + 0.1 * self.times if self.far else Own.act(self, seen)
+
+class Once(Drawing):
+    def act(self, seen):
+        return -4.0 if self.far and self.times == 1 else Own.act(self, seen)
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return a campaign of a controller that repeats, and its cases as a file."""
+    folder = tmp_path_factory.mktemp("noisy")
+    (folder / "own.py").write_text(NOISY)
+    searched = {"cases": 16, "levels": (0,), "seed": 1, "sampler": "uniform"}
+    run_campaign(campaign_settings(vut=f"{folder}/own.py:Own", **searched), folder / "run")
+    (file,) = ms.export(folder / "run", file_format="cases", out=folder / "own.toml")
+    return folder / "run", file
+
+
+class TestAControllerThatDoesNotRepeat:
+    @pytest.fixture
+    def rerun(self, command_line, recorded):
+        """Return what runs the campaign or the file again, 0 or 1, with a controller."""
+
+        def run(of, name, *more):
+            vut = f"{recorded[of].with_name('own.py')}:{name}"
+            # One process counts the times.
+            return command_line("rerun", recorded[of], "--vut", vut, "--workers", 1, *more)
+
+        return run
+
+    def test_is_said_and_its_margins_count_as_nothing(self, rerun, tmp_path):
+        code, out, _ = rerun(1, "Drawing", "--junit", tmp_path / "j.xml")
+        assert code == 0
+        number = int(re.search(r"(\d+) not repeatable", out)[1])
+        assert number > 0
+        assert f"Not repeatable: {number} of {number} case" in out
+        assert f"Not counted, as it may be chance: {number} change" in out
+        junit = etree.parse(tmp_path / "j.xml").getroot()
+        assert len(junit.findall(".//skipped")) == number
+        assert not junit.findall(".//failure")
+
+    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
+    def test_breaks_nothing_where_a_verdict_is_another_one_once(self, rerun, of):
+        code, out, _ = rerun(of, "Once")
+        assert code == 0
+        assert re.search(r" 0 broke, [1-9]\d* not repeatable", out)
+        assert re.search(r"\d+ of \d+ cases that ran twice .* of them with another verdict", out)
+
+    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
+    @pytest.mark.parametrize("name", ["Stopping", "Failing"])
+    def test_is_worse_where_it_passes_neither_time(self, rerun, of, name):
+        code, out, _ = rerun(of, name)
+        assert code == 1
+        assert re.search(r" [1-9]\d* broke", out)
+        assert "Not repeatable: " in out
 
 
 @on_us23
