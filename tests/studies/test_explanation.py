@@ -167,24 +167,20 @@ class TestParameters:
         mine = tmp_path / "mine.py"
         mine.write_text(
             "class Brakes:\n"
-            "    def __init__(self, brake_mps2=3.0):\n"
-            "        if brake_mps2 == 1.9:\n"
+            "    def __init__(self, brake_mps2=2.05):\n"
+            "        if brake_mps2 < 1.99:\n"
             "            raise ValueError\n"
             "        self.brake_mps2 = brake_mps2\n"
             "    def act(self, seen):\n"
             "        return -self.brake_mps2 if seen.t_s < 0.05 else 1.0\n"
         )
-        keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.0015"}
+        keywords: dict[str, Any] = {"level": 0, "fail_when": "vut_max_brake_mps2 > 2.00125"}
         run = uniform(f"{mine}:Brakes", tmp_path / "run", 2, **keywords)
         (of_brake,) = ms.explain(
-            run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=0..4"]
+            run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=1.9..2.06"]
         ).found.parameters
-        # It fails above 2.0015, and thousandths of the range's digits are tried.
-        assert of_brake == Axis("brake_mps2", 3.0, 0.0, 4.0, 0.1, 3, below=2.001)
-        (refused,) = ms.explain(
-            run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=1.9..4"]
-        ).found.parameters
-        assert refused.below == 2.001
+        # It fails above 2.00125; the end of the range and some that run beside are refused.
+        assert of_brake == Axis("brake_mps2", 2.05, 1.9, 2.06, 0.004, 4, below=2.0012)
 
 
 @pytest.mark.parametrize(

@@ -301,9 +301,9 @@ class TestHelix:
             train_library(tmp_path / "new", scenario=US23, a_min_mps2=a_min_mps2)
         assert not (tmp_path / "new").exists()
 
-    def test_level_2_needs_level_1_first(self, library):
+    def test_level_2_needs_level_1_first(self, tmp_path):
         with pytest.raises(UserError, match="pov2 is trained against vut1: train that one first"):
-            train_library(library, ("pov2",), settings=SMALL, scenario=US23)
+            train_library(tmp_path, ("pov2",), settings=SMALL, scenario=US23)
 
 
 class TestTrainingForAnotherScenario:
