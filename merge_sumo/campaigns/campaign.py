@@ -213,9 +213,10 @@ def _compared(version: _Version, before: Run) -> dict[str, Any] | None:
         )
     if changes:
         name, (was, now) = next(iter(changes.items()))
+        same = f"give {was} or more" if name == "cases" else "make it the same"
         raise UserError(
-            f"{name} differs: {before.folder} was run with {was}, now it is {now}; make it the "
-            "same, or begin a new campaign"
+            f"{name} differs: {before.folder} was run with {was}, now it is {now}; {same}, or "
+            "begin a new campaign"
         )
     record |= {k: before.record[k] for k in TALLIES if k in before.record}
     return record if moved or grown else None

@@ -28,7 +28,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import Record, read_indexed, replaced, to_json
+from merge_sumo.system.records import Record, replaced, to_json
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
@@ -155,7 +155,7 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 def read_repeats(run: Run) -> list[Repeat]:
     """Return what a folder says of cases that ran twice; `UserError` for a wrong line."""
-    known = read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
+    known = run.read_lines(REPEATS, Repeat, range(len(run.outcomes)))
     return list(known.values())
 
 

@@ -16,13 +16,13 @@ import hashlib
 import io
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from msgspec import Meta
@@ -38,12 +38,14 @@ from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.printable import counted, printable
-from merge_sumo.system.records import convert, decode
+from merge_sumo.system.printable import counted, printable, quoted
+from merge_sumo.system.records import Record, convert, decode, read_indexed
 from merge_sumo.verdict.chance import one_per_case
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
+
+T = TypeVar("T", bound=Record)
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
@@ -262,6 +264,22 @@ class Run:
         none = np.empty((0, self.scenario.vehicles, 3))
         return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
 
+    def read_lines(self, name: str, kind: type[T], indices: Container[int]) -> dict[int, T]:
+        """Return the lines of a file of the folder by their index, which is one of `indices`.
+
+        Raises `UserError` for another line: of a case that was to run, it is not the line that is
+        wrong, but outcomes that are gone.
+        """
+        lost = range(len(self.outcomes), self.settings.cases)
+        known = read_indexed(self.folder / name, kind, indices, lost)
+        for index in (index for index in known if index in lost):
+            raise UserError(
+                f"{self.folder / OUTCOMES} has {counted(len(self.outcomes), 'case')}, and {name} "
+                f"knows of case {index}: lines of {OUTCOMES} are lost; take it from a copy, or run "
+                f"their cases again with `merge-sumo campaign --resume {quoted(self.folder)}`"
+            )
+        return known
+
     def earlier(self) -> Run | None:
         """Return the run of the version that this campaign is against; None where there is none.
 
@@ -272,6 +290,12 @@ class Run:
             return None
         earlier = Run(self.folder / AGAINST)
         count = len(self.outcomes)
+        if len(earlier.outcomes) < count:
+            raise UserError(
+                f"{earlier.folder / OUTCOMES} has {counted(len(earlier.outcomes), 'case')}, and "
+                f"{self.folder} {count}: lines of the first are lost; take it from a copy, or run "
+                "the campaign again"
+            )
         if [o.case for o in earlier.outcomes[:count]] != [o.case for o in self.outcomes]:
             raise UserError(
                 f"{earlier.folder} has other cases than {self.folder}: take both from a copy, or "

@@ -12,7 +12,7 @@ from typing import Generic, TypeVar
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.system.folders import check_ours, replace_own
-from merge_sumo.system.records import Record, read_indexed, read_record, to_json
+from merge_sumo.system.records import Record, read_record, to_json
 
 R = TypeVar("R", bound=Record)
 
@@ -44,7 +44,7 @@ class StudyFile(Generic[R]):
     def read_lines(self, run: Run) -> dict[int, R]:
         """Read the lines by index; `UserError` for one that is not of a failure of the campaign."""
         failing = {outcome.index for outcome in run.outcomes if outcome.failed}
-        return read_indexed(run.folder / self.name, self.kind, failing)
+        return run.read_lines(self.name, self.kind, failing)
 
     def write_lines(self, folder: Path, lines: Iterable[R]) -> None:
         """Write lines, in the place of older ones."""

@@ -141,11 +141,13 @@ def check_fields(value: Any) -> None:
             raise RecordError(_not_a_value(name, known, hint, str(error))) from error
 
 
-def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
+def read_indexed(
+    path: Path, kind: type[T], indices: Container[int], lost: range = range(0)
+) -> dict[int, T]:
     """Return the lines of a JSON-lines file by their `index`; nothing without the file.
 
-    Raises `RecordError` for a line that is no dataclass `kind` with one of the `indices`, or whose
-    index an earlier line has.
+    Raises `RecordError` for a line that is no dataclass `kind` with one of the `indices`, or of
+    what is `lost`, or whose index an earlier line has.
     """
     try:
         lines = regular(path).read_bytes().splitlines()
@@ -157,10 +159,12 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int
     for number, line in enumerate(lines, start=1):
         try:
             value: Any = convert(decode(line, dict[str, Any]), kind)
-            if value.index not in indices or value.index in values:
-                raise RecordError(f"index is {value.index}")
+            is_known = value.index in indices or value.index in lost
+            if not is_known or value.index in values:
+                raise RecordError(f"it is of case {value.index}, of which no such line can be")
         except UserError as error:
-            raise RecordError(f"line {number} of {path} is of no such case: {error}") from error
+            line_of = f"line {number} of {path}"
+            raise RecordError(f"{line_of} is not as it was written: {error}") from error
         values[value.index] = value
     return values
 

@@ -34,8 +34,6 @@ MOST_WRITTEN: Final = 20 * MOST_CHARACTERS
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
-ALIKE_MEASURES: Final = 0.5
-"""Ratio of matching characters from which on a measure may have been meant."""
 OTHER_SIGNS: Final = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
 """Signs of other languages."""
 
@@ -163,7 +161,7 @@ class _Parser:
         return float(number)
 
     def _unknown(self, name: str) -> UserError:
-        hint = meant(name, (*self._vocabulary, *self._named), ALIKE_MEASURES)
+        hint = meant(name, (*self._vocabulary, *self._named))
         hint = hint or f"choose {', '.join(self._vocabulary)}"
         return self._error(f"there is no measure {printable(name)!r}: {hint.strip()}")
 

@@ -22,7 +22,7 @@ from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.system.printable import printable
 from merge_sumo.system.suggestions import meant
-from merge_sumo.verdict.expression import ALIKE_MEASURES, LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
+from merge_sumo.verdict.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
 
 SIGNALS: Final = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
@@ -62,7 +62,7 @@ def check_formula(text: str) -> str:
             )
         word = token[0]
         if (word[0].isalpha() or word[0] == "_") and word not in (*SIGNALS, *WORDS):
-            hint = meant(word, (*SIGNALS, *WORDS), ALIKE_MEASURES)
+            hint = meant(word, (*SIGNALS, *WORDS))
             hint = hint or f"choose {', '.join(SIGNALS)}"
             raise UserError(
                 f"{what}: at character {place + 1}: there is no signal {word!r}: {hint.strip()}"

@@ -83,6 +83,10 @@ class TestFinds:
         assert earlier.settings.vut == "old.py:f"
         assert [o.case for o in earlier.outcomes] == [o.case for o in run.outcomes]
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
+        path = Path("run") / AGAINST / OUTCOMES
+        path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
+        with pytest.raises(UserError, match=r"against/outcomes.jsonl has 5 cases, and run 10: "):
+            run.earlier()
 
 
 class TestBytes:

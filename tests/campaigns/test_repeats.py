@@ -125,5 +125,5 @@ def test_a_file_that_somebody_changed_is_refused_by_its_line(run, tmp_path, chan
     (folder / REPEATS).write_text(json.dumps(HONEST) + "\n")
     assert read_repeats(opened) == [Repeat(3, 1.5, "vut", End.MERGED, False, True)]
     (folder / REPEATS).write_text(json.dumps(HONEST) + "\n" + json.dumps({**HONEST, **change}))
-    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is of no such case"):
+    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is not as it was written"):
         read_repeats(opened)

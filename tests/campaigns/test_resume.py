@@ -115,11 +115,11 @@ class TestWhatDiffers:
     @pytest.mark.parametrize(
         ("given", "name"),
         [
-            ({"seed": 3}, "seed differs: .* run with 2, now it is 3"),
+            ({"seed": 3}, "seed differs: .* run with 2, now it is 3; make it the same, or begin"),
             ({"vut": "design2"}, "vut differs"),
             ({"levels": (1,)}, "levels differs"),
             ({"sampler": "gpr"}, "sampler differs"),
-            ({"cases": 24}, "cases differs"),
+            ({"cases": 24}, "cases differs: .* with 28, now it is 24; give 28 or more, or begin"),
             ({"batch": 4}, "batch differs"),
         ],
     )

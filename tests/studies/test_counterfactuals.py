@@ -160,6 +160,15 @@ class TestTheFile:
         assert list(AVOIDANCE.read_lines(Run(folder)).values()) == found
         assert (folder / "outcomes.jsonl").read_bytes() == before
 
+    def test_knows_when_outcomes_are_lost_and_does_not_take_the_blame(self, folder, found):
+        AVOIDANCE.write_lines(folder, found)
+        outcomes = folder / "outcomes.jsonl"
+        lines = outcomes.read_bytes().splitlines(keepends=True)
+        outcomes.write_bytes(b"".join(lines[: found[-1].index]))
+        words = rf"outcomes.jsonl has {found[-1].index} cases, and avoidance.jsonl knows of case .*"
+        with pytest.raises(UserError, match=rf"{words}: lines of outcomes.jsonl are lost"):
+            AVOIDANCE.read_lines(Run(folder))
+
     @pytest.mark.parametrize(
         "change",
         [
@@ -181,5 +190,5 @@ class TestTheFile:
         lines = path.read_text().splitlines()
         lines[0] = json.dumps(json.loads(lines[0]) | change)
         path.write_text("\n".join(lines) + "\n")
-        with pytest.raises(UserError, match=r"line 1 of .* is of no such case"):
+        with pytest.raises(UserError, match=r"line 1 of .* is not as it was written"):
             AVOIDANCE.read_lines(Run(folder))

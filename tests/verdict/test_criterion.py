@@ -100,6 +100,7 @@ class TestRefused:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
+            ("speed > 3", "no measure 'speed': choose score, dx_m, "),
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
             ("zzzzzzzz < 1.5", "choose score, dx_m"),
             ("papr", "did you mean paper?"),
