@@ -262,8 +262,8 @@ class TruthKey:
 def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
     """Return what a file of the cache holds, which only its user can write.
 
-    None where there is none, or it is torn or another truth under this name, others can write the
-    cache, or a file that the VUT loaded is not what it was.
+    None where there is none, or it is torn, of other shapes or types, or another truth under this
+    name, others can write the cache, or a file that the VUT loaded is not what it was.
     """
     dims = len(scenario.dimensions(level))
     try:
@@ -278,7 +278,11 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
             return None
     except (*UNREADABLE_NPZ, UserError):
         return None
-    if points.shape != (cases, dims) or len(margin) != cases:
+    shapes = points.shape, margin.shape, in_sumo.shape
+    types = points.dtype.kind, margin.dtype.kind, in_sumo.dtype.kind
+    if shapes != ((cases, dims), (cases,), ()) or types != ("f", "f", "i"):
+        return None
+    if not ((points >= 0.0) & (points <= 1.0)).all() or not 0 <= in_sumo <= cases:
         return None
     return Truth(points, margin, int(in_sumo))
 

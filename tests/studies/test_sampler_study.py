@@ -24,7 +24,7 @@ from merge_sumo.studies.sampler_study import (
     Spread,
     Study,
 )
-from merge_sumo.studies.truth import Truth, ground_truth
+from merge_sumo.studies.truth import Truth, ground_truth, read_truth
 from merge_sumo.verdict.score import Measures, Outcome
 
 
@@ -48,6 +48,30 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     remade = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
     assert np.array_equal(remade.margin, truth.margin)
     assert sum(counted) == 300
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"in_sumo": np.array([300, 300])},
+        {"in_sumo": np.array(301)},
+        {"in_sumo": np.array(np.nan)},
+        {"margin": np.array(0.5)},
+        {"margin": np.zeros((300, 2))},
+        {"margin": np.array(["x"] * 300)},
+        {"points": np.full((300, 2), np.nan)},
+        {"points": np.full((300, 2), 2.0)},
+        {"points": np.zeros((300, 2), dtype=np.complex128)},
+    ],
+)
+def test_a_file_of_the_cache_with_other_arrays_is_none(truth, cache, tmp_path, spoilt):
+    (path,) = cache.glob("truth-*.npz")
+    (kept := tmp_path / path.name).write_bytes(path.read_bytes())
+    tmp_path.chmod(0o700)
+    assert np.array_equal(read_truth(kept, 0, 300, US23).margin, truth.margin)
+    with np.load(path) as data:
+        np.savez(kept, **{**data, **spoilt})
+    assert read_truth(kept, 0, 300, US23) is None
 
 
 @pytest.mark.parametrize(
