@@ -462,7 +462,9 @@ class NewScenario(Asked):
 
     file: AnyPath = field(metadata={"help": "New TOML file to write."})
     _: KW_ONLY
-    net: AnyPath = field(metadata=required_option(Path, "SUMO net, as NAME.net.xml or NAME.net.xml.gz.", TESTED))
+    net: AnyPath = field(
+        metadata=required_option(Path, "SUMO net, as NAME.net.xml or NAME.net.xml.gz.", TESTED)
+    )
     mainline: str = field(
         metadata=required_option(str, 'Edges of the mainline, past M: "e1 e2".', TESTED)
     )

@@ -273,8 +273,9 @@ def test_what_is_named_to_follow_on_both_leads_to_a_merge(tmp_path, mainline, ra
     with pytest.raises(UserError, match=re.escape(said)):
         find_corridor(net, mainline.split(), ramp.split())
     road = find_corridor(net, ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
-    assert road.acceleration_lane.lanes == ("acc_0", "mid_0")
-    assert road.acceleration_lane.exits == ()
+    found = road.acceleration_lane
+    assert found is not None
+    assert (found.lanes, found.exits) == (("acc_0", "mid_0"), ())
 
 
 def edited(old: str, new: str):
