@@ -182,9 +182,13 @@ class CampaignRun(Result):
 
         return write_report(self._run)
 
+    @property
+    def _doubts(self) -> list[str]:
+        return doubts(self._run.cases, self._run.criterion, self._run.settings.in_vain)
+
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo campaign --json` prints."""
-        outcomes, criterion = self._run.cases, self._run.criterion
+        criterion, at_limits = self._run.criterion, mostly_clipped(self._run.cases)
         return {
             **to_plain(self.summary),
             **self.verdict.to_record(),
@@ -192,7 +196,7 @@ class CampaignRun(Result):
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
             "fail_when": criterion.text,
-            "notes": [*filter(None, [mostly_clipped(outcomes)]), *doubts(outcomes, criterion)],
+            "notes": [*filter(None, [at_limits]), *self._doubts],
             **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
             "repeats": to_plain(self.repeats),
             "run": str(self.folder),
@@ -212,8 +216,7 @@ class CampaignRun(Result):
             *found,
             *(f"{fact.name}: {fact.shown}" for fact in told),
             run.ran_again_in_words if run.settings.ran_again else None,
-            *(f"note: {note}" for note in doubts(run.cases, run.criterion)),
-            *(f"note: {note}" for note in in_vain(run.settings.in_vain)),
+            *(f"note: {note}" for note in self._doubts),
             *self._against_lines(),
             f"report: {self.report_file}",
         ]
@@ -274,9 +277,10 @@ class CaseRun(Result):
         return f"<case: {self.cause}>"
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `merge-sumo run --json` prints: outcome, motion and signals of the VUT."""
+        """Return what `merge-sumo run --json` prints: outcome, motion, and what the VUT left."""
         record = {**self.outcome.to_record(), "motion": self.trajectory.whole.tolist()}
-        return record | ({"signals": self.trajectory.signals} if self.trajectory.signals else {})
+        left = {"signals": self.trajectory.signals, "in_vain": self.trajectory.in_vain}
+        return record | {name: value for name, value in left.items() if value}
 
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""

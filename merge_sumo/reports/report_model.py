@@ -146,7 +146,7 @@ class ReportModel:
     @property
     def notes(self) -> list[str]:
         """Doubts about the outcomes, in sentences."""
-        return doubts(self.cases, self.run.criterion)
+        return doubts(self.cases, self.run.criterion, self.run.settings.in_vain)
 
     @property
     def mostly_clipped(self) -> str | None:

@@ -21,7 +21,7 @@ from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.result import Result, Shown
-from merge_sumo.verdict.plausibility import doubts, in_vain, mostly_clipped
+from merge_sumo.verdict.plausibility import doubts, mostly_clipped
 from merge_sumo.vuts.base import HERE
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.python import installed_vuts
@@ -86,8 +86,9 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
                 ground.vut.begin(corridor, from_stand)
             differing += _differences("a reset too many", first, _run(ground, cases))
         outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
-        notes = [*filter(None, [mostly_clipped(outcomes)]), *doubts(outcomes, plan.criterion)]
-        notes += in_vain(Counter(command for one in first for command in one.in_vain))
+        vain = Counter(command for one in first for command in one.in_vain)
+        headline = [*filter(None, [mostly_clipped(outcomes)])]
+        notes = [*headline, *doubts(outcomes, plan.criterion, vain)]
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:

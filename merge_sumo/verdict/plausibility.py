@@ -22,14 +22,15 @@ _THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?
 """A measure, and the number that it is compared with."""
 
 
-def doubts(outcomes: Sequence[Outcome], criterion: Criterion) -> list[str]:
+def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str, int]) -> list[str]:
     """Return sentences on what is odd about the outcomes of a campaign; none for most.
 
-    Of a criterion that says the same of all cases, a neighbour that would not.
+    Of a criterion that says the same of all cases, a neighbour that would not. `vain` are commands
+    that changed nothing: see `in_vain`.
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
-    return [*often, *behind(outcomes), *_one_verdict(outcomes, criterion)]
+    return [*often, *behind(outcomes), *_one_verdict(outcomes, criterion), *in_vain(vain)]
 
 
 def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:

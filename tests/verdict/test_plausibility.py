@@ -39,7 +39,7 @@ class TestAfterTheRun:
             for o, n in zip(run.outcomes, rows, strict=True)
         ]
         clipped = sum(o.measures.clipped_steps for o in at_limit)
-        headline, notes = mostly_clipped(at_limit), doubts(at_limit, Criterion())
+        headline, notes = mostly_clipped(at_limit), doubts(at_limit, Criterion(), {})
         said = f"in {clipped} of {sum(rows)} steps the VUT asks for an acceleration"
         assert (headline is not None) is is_headline
         assert len(notes) == (not is_headline)
@@ -50,7 +50,7 @@ class TestAfterTheRun:
         wrong = [
             replace(o, measures=replace(o.measures, error="answered nan")) for o in (first, second)
         ]
-        assert doubts([*wrong, *others], Criterion()) == [
+        assert doubts([*wrong, *others], Criterion(), {}) == [
             f"in 2 cases an error ends the follow-up, the first in case {first.index}: answered nan"
         ]
 
@@ -80,4 +80,4 @@ def under(run: Run, criterion: Criterion) -> list[str]:
         condition = condition_of(criterion.words)
         margin = None if criterion.is_papers else condition.margin(values_of(outcome.measures))
         judged.append(replace(outcome, margin=margin))
-    return doubts(judged, criterion)
+    return doubts(judged, criterion, {})

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import re
 import socket
 import sys
@@ -302,6 +303,10 @@ def test_what_it_commands_in_vain_is_told_in_the_end(tmp_path, command_line):
     ):
         _, out, _ = command_line(*command)
         assert told.format(cases) in out.splitlines()
+    report = (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    assert told.format("4 cases").removeprefix("note: c") in report
+    _, out, _ = command_line("run", "--vut", vut, *start, "--json")
+    assert json.loads(out)["in_vain"] == ["vehicle.changeSublane"]
 
 
 def test_what_every_start_of_a_program_prints_is_shown_once(tmp_path, command_line, capfd):
