@@ -462,9 +462,7 @@ class NewScenario(Asked):
 
     file: AnyPath = field(metadata={"help": "New TOML file to write."})
     _: KW_ONLY
-    net: AnyPath = field(
-        metadata=required_option(Path, "SUMO net, as NAME.net.xml or NAME.net.xml.gz.", TESTED)
-    )
+    net: AnyPath = field(metadata=required_option(Path, "SUMO net: NAME.net.xml[.gz].", TESTED))
     mainline: str = field(
         metadata=required_option(str, 'Edges of the mainline, past M: "e1 e2".', TESTED)
     )
@@ -579,7 +577,7 @@ class Benchmark(Execution, Test):
     )
     truth_cases: int | None = option(None, int, "Cases of the truth.", CASES, shown=TRUTH_CASES)
     figure: AnyPath | None = option(
-        None, Path, "New file for FMC against cases: .png, .svg or .html.", WHERE, metavar="FILE"
+        None, Path, "New file for FMC against cases: .png or .svg.", WHERE, metavar="FILE"
     )
 
 

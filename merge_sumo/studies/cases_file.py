@@ -24,7 +24,7 @@ from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.comparison import GOT_WORSE, Change, ComparedCase, Comparison, passes, short
-from merge_sumo.system.folders import make_place, write_new
+from merge_sumo.system.folders import check_ending, make_place, write_new
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import (
     Record,
@@ -188,6 +188,8 @@ def watching(run: Run) -> list[Outcome]:
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
     """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
+    if target.suffix and not target.is_dir():
+        check_ending(target, (SUFFIX,))
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
     content = cases_toml(run, outcomes, path, run.settings.vut).encode()
