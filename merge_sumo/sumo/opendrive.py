@@ -46,7 +46,7 @@ def opendrive(road: Corridor) -> bytes:
             *("--opendrive-output.straight-threshold", "180"),
             *("--precision", "6", "--no-warnings", "true", "--xml-validation", "never"),
         ]
-        ended = run_program("netconvert", arguments, stage, CONVERSION_LIMIT_S)
+        ended = run_program("netconvert", arguments, stage, limit_s=CONVERSION_LIMIT_S)
         if ended.code == 0 and (stage / ROAD).is_file():
             return _with_paths((stage / ROAD).read_bytes(), road)
     raise UserError(f"netconvert cannot write {road.path} as OpenDRIVE: {ended.reason}")

@@ -237,7 +237,7 @@ OF_A_KIND: dict[tuple[str, str], dict[str, Edit]] = {
         "a remote port": within("time", "remote-port", "48173"),
         "a script of python": within("time", "python-script", "{SECRET}"),
         "a net elsewhere": instead('"us23.net.xml"', '"{SECRET}"'),
-        "no end": instead('<end value="9.9"/>', '<end value="1e15"/>'),
+        "no end": instead('<end value="12.9"/>', '<end value="1e15"/>'),
         **{f"{name} in the configuration": bomb(text) for name, text in BOMBS.items()},
     },
     (TYPES, IDENTICAL): {
