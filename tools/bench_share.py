@@ -17,7 +17,7 @@ from bench_record import add_record_option, append_record
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.scenario.scenario import LEVELS, US23, level_name
-from merge_sumo.studies.share import CASES, share_at
+from merge_sumo.studies.share import CASES, share_at, stream
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 
 TRUTH_SEED = 20_000
@@ -38,9 +38,10 @@ def main() -> None:
     for vut in asked.vut:
         plan = resolve(CampaignSettings(vut=vut, levels=LEVELS, scenario=US23))
         for level in LEVELS:
-            many = share_at(plan, level, asked.truth_cases, TRUTH_SEED)
+            many = share_at(plan, level, asked.truth_cases, stream(TRUTH_SEED, level))
             truth = many.failures / many.cases
-            intervals = [share_at(plan, level, CASES, seed).interval for seed in seeds]
+            drawn = [share_at(plan, level, CASES, stream(seed, level)) for seed in seeds]
+            intervals = [one.interval for one in drawn]
             held = sum(low <= truth <= high for low, high in intervals)
             print(
                 f"{vut}, level {level_name(level)}: {truth:.5f} fail, {held} of {len(seeds)} hold",

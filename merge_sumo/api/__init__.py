@@ -275,7 +275,7 @@ def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
         return path
     if index is None:
         raise UserError(
-            f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 3`"
+            f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 0`"
         )
     exported = path / SCENARIOS / case_name(index)
     if not (exported / CONFIG).is_file():

@@ -7,13 +7,15 @@ from contextlib import nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from time import perf_counter
 
 from merge_sumo import options, verbs
 from merge_sumo.api.asked import opened
 from merge_sumo.api.results import CampaignRun
+from merge_sumo.campaigns.again import call_again
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
-from merge_sumo.campaigns.settings import CampaignSettings, controllers
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import WorkersLostError, notice
@@ -73,6 +75,7 @@ def concluded(
 
     try:
         with opened(where, plan) if workers is None else nullcontext(workers) as present, bars:
+            begun_s = perf_counter()
             run = run_campaign
             if goes_on:
                 run = partial(resume_campaign, on_before=bars.ran_before, warn=notice)
@@ -83,15 +86,14 @@ def concluded(
                 begin=lambda: bars.begin(title),
             )
             result = CampaignRun(done, asked.gates)
-            _write_findings(result, plan, present, bars, check)
+            took_s = perf_counter() - begun_s
+            _write_findings(result, plan, present, took_s, bars, check)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)
-            again = controllers(asdict(settings))
-            if isinstance(where.workers, str):
-                again["workers"] = where.workers
-            named = "".join(f", {name}={spec!r}" for name, spec in again.items())
-            stop.add_note(f"stopped; go on with ms.resume({str(folder)!r}{named})")
+            address = {"workers": where.workers} if isinstance(where.workers, str) else {}
+            goes_on_by = call_again("resume", folder, asdict(settings), **address)
+            stop.add_note(f"stopped; go on with {goes_on_by}")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
@@ -102,6 +104,7 @@ def _write_findings(
     result: CampaignRun,
     plan: SimulationPlan,
     workers: Workers,
+    took_s: float,
     bars: CampaignBars,
     check: Callable[[], None],
 ) -> None:
@@ -116,8 +119,9 @@ def _write_findings(
         known := avoidance(done, plan, workers=workers, check=check, on_part=careful)
     ):
         AVOIDANCE.write_lines(done.folder, known)
+    uniform = counted("uniform starts", "cases")
+    note_shares(done, plan, workers, took_s, check, uniform)
     with workers_or_here(None) as here:  # worker processes take longer to start than these cases
-        note_shares(done, plan, here, check)
         note_explanation(done, plan, here, check)
     link_latest(done.folder)
     write_report(done, result.summary, counted("surrogates of the report", "levels"))

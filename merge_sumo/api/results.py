@@ -8,9 +8,9 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.options import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, headline
@@ -233,9 +233,9 @@ class CampaignRun(Result):
         ]
 
     @property
-    def named_again(self) -> str:
-        """Options that name again, to go on, the controllers that are code."""
-        return named_again(self.settings, goes_on=True)
+    def go_on(self) -> str:
+        """The command that goes on with the campaign; a call of Python where an object drives."""
+        return again("resume", self.folder, self.settings)
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""

@@ -18,6 +18,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
+from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.run import (
     CHECKSUM,
     FILES,
@@ -33,7 +34,6 @@ from merge_sumo.campaigns.run import (
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.system.folders import check_own, make_place, replace_own, sync_folder, write_folder
-from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import to_json
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
@@ -126,8 +126,8 @@ class Journal:
                 self._outcomes.truncate(end)
                 raise
         except OSError as error:
-            goes_on = f"`merge-sumo campaign --resume {quoted(self.folder)}`"
-            kept = f"; what ran before is kept: go on with {goes_on}"
+            goes_on = again("resume", self.folder, self.settings)
+            kept = f"; what ran before is kept: go on with `{goes_on}`"
             raise UserError(
                 f"cannot write {self.folder}: {error.strerror}"
                 f"{kept if (self.folder / OUTCOMES).is_file() else ''}"

@@ -21,7 +21,7 @@ from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import OWN, US23, Scenario, level_name
-from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.printable import printable
 from merge_sumo.system.records import RecordError, check_fields, to_plain
 from merge_sumo.verdict.chance import check_tolerated
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
@@ -280,15 +280,6 @@ def controllers(record: Mapping[str, Any]) -> dict[str, str]:
     return {
         name: spec for name, spec in named.items() if isinstance(spec, str) and names_code(spec)
     }
-
-
-def named_again(record: Mapping[str, Any], *, goes_on: bool = False) -> str:
-    """Return the options that name the controllers of a record again, for the end of a command.
-
-    Empty where a run folder names them all. Only a campaign that goes on runs an earlier version.
-    """
-    named = controllers(record if goes_on else {**record, "against": None})
-    return "".join(f" --{name} {quoted(spec)}" for name, spec in named.items())
 
 
 def _check_still_there(folder: Path, policies: str) -> None:

@@ -68,13 +68,13 @@ def _how_to_go_on(
     from merge_sumo import api
 
     # None of these is a setting of the campaign that its folder would bring.
-    words = [f"--resume {quoted(folder)}{api.open_run(folder).named_again}"]
+    words = [api.open_run(folder).go_on]
     words += [f"--gate {quoted(gate)}" for gate in gates]
     if junit is not None:
         words.append(f"--junit {quoted(junit)}")
     if isinstance(workers, str):
         words.append(f"--workers {quoted(workers)}")
-    return f"go on with: merge-sumo campaign {' '.join(words)}"
+    return f"go on with: {' '.join(words)}"
 
 
 @app.verb(verbs.RunCase)

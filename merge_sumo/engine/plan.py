@@ -146,6 +146,12 @@ class SimulationPlan:
             return f"the VUT {self.vut.spec} is none of this package"
         return None
 
+    @property
+    def asks_sumo(self) -> bool:
+        """Whether the VUT, or a POV that is none of this package, asks SUMO anything."""
+        own = self.povs.own
+        return self.vut.kind.asks_sumo or (own is not None and own.kind.asks_sumo)
+
     def workers(self, requested: AnyWorkers) -> int | str:
         """Return the number of processes that run cases: as many as VUT and POV can serve.
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Final
 
+from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.scenario.scenario import lane_of, level_name
@@ -21,7 +21,7 @@ from merge_sumo.studies.counterfactuals import AVOIDANCE
 from merge_sumo.studies.probability import PROBABILITY
 from merge_sumo.studies.share import SHARES
 from merge_sumo.studies.stress import STRESS
-from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.printable import printable
 from merge_sumo.verdict.campaign_verdict import Verdict
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.chance import by_case, undecided
@@ -31,6 +31,8 @@ from merge_sumo.verdict.summary import LevelSummary, Summary
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"
 STARTS_THAT_FAIL: Final = "starts that fail"
+UNJUDGED: Final = "uniform starts without a verdict"
+STARTS: Final = "uniform starts of that"
 UNDECIDED: Final = "undecided"
 RULE: Final = "a case fails when"
 AT_MOST: Final = "cases at most; the search converged before"
@@ -38,6 +40,7 @@ TOUCH: Final = "cases with contact that are no failures"
 DRIVEN: Final = "failures that reference drivers drove"
 AVOIDED: Final = "failures that driver {} avoids"
 AVOIDED_BY_POV: Final = "failures that a careful POV avoids"
+PROBABLY: Final = "probability that a case fails"
 WORST: Final = "worst case"
 KIND: Final = "kind of the worst case"
 SCATTERED: Final = "scattered"
@@ -142,7 +145,7 @@ def _level_lines(facts: Iterable[Fact]) -> list[str]:
             found += f", {unsure.shown} undecided"
         cells = [
             f"level {level_name(level)}",
-            "" if share is None else f"{share.shown} of all starts fail",
+            "" if share is None else f"{share.shown} of all starts fail, by {of[STARTS].shown}",
             found,
         ]
         if failures is not None and of["FMC"].value:
@@ -164,8 +167,8 @@ def _not_said(run: Run, of: Mapping[str, Fact], known: set[str]) -> Iterator[str
         more = _counted(of[TOUCH], "more case touches", "more cases touch")
         where = run.scenario.said(" after M") if run.criterion.is_papers else ""
         parts.append(f"{more}{where}, which this rule does not count: `fail_when` unsafe")
-    if STARTS_THAT_FAIL not in known:
-        measure = f"merge-sumo probability {quoted(run.folder)}{named_again(run.record)}"
+    if not known & {STARTS_THAT_FAIL, PROBABLY}:
+        measure = again("probability", run.folder, run.record)
         parts.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if parts:
         yield "; ".join(parts)
@@ -179,7 +182,7 @@ def _how_bad(run: Run, of: Mapping[str, Fact]) -> Iterator[str]:
         failures, pov = _counted(of["failures"], "failure"), of[AVOIDED_BY_POV].shown
         yield f"avoided of {some}{failures}: by driver {by}, by a careful POV {pov}"
     if WORST in of:
-        replay = f"merge-sumo replay {quoted(run.folder)} {of[WORST].value} --gui"
+        replay = command("replay", run.folder, of[WORST].value, gui=True)
         yield f"{WORST} ({of[KIND].shown}): {replay}"
 
 
@@ -202,6 +205,10 @@ def _shares(run: Run) -> Iterator[Fact]:
     for one in () if known is None else known.levels:
         key = "levels: failures of cases"
         yield Fact(STARTS_THAT_FAIL, one.shown, "", SHARES.name, key, one.level)
+        yield Fact(STARTS, one.cases, "", SHARES.name, "levels: cases", one.level)
+        if one.without_verdict:
+            key = "levels: without_verdict"
+            yield Fact(UNJUDGED, one.without_verdict, "", SHARES.name, key, one.level)
 
 
 def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
@@ -339,5 +346,5 @@ def _studies(run: Run) -> Iterator[Fact]:
         for name in ("probability", "low", "high"):
             end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
             value, key = 100.0 * getattr(known.overall, name), f"overall.{name}"
-            yield Fact(f"probability that a case fails{end}", value, PERCENT, PROBABILITY.name, key)
+            yield Fact(f"{PROBABLY}{end}", value, PERCENT, PROBABILITY.name, key)
         yield Fact("fresh cases of that", known.cases, "", PROBABILITY.name, "cases")

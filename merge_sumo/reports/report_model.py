@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+from merge_sumo.campaigns.again import again, call, command
 from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
@@ -164,9 +164,19 @@ class ReportModel:
         return [o.index for o in self.shown if o.index not in self.motion]
 
     @property
-    def named_again(self) -> str:
-        """Options that name controllers of the user's own again, to go on."""
-        return named_again(self.run.record, goes_on=True)
+    def go_on(self) -> str:
+        """The command that goes on with the campaign."""
+        return again("resume", self.run.folder, self.run.record)
+
+    @property
+    def explain(self) -> tuple[str, str]:
+        """The commands that explain a case and write the report, before and after its index."""
+        folder, record = self.run.folder, self.run.record
+        explained = again("explain", folder, record, _Index())
+        first, _, rest = explained.partition(str(_Index()))
+        if explained.startswith("ms."):
+            return first, f"{rest}; {call('report', [folder])}"
+        return first, f"{rest} && {command('report', folder)}"
 
     @property
     def printed(self) -> str:
@@ -182,6 +192,13 @@ class ReportModel:
                 rest[:0] = [(f"{name} {inner}", one) for inner, one in value.items()]
             else:
                 yield name, ", ".join(map(str, value)) if isinstance(value, list) else value
+
+
+class _Index(int):
+    """The index of a case, which the page fills in."""
+
+    def __str__(self) -> str:
+        return "\0"
 
 
 def _road_of(run: Run) -> Corridor:

@@ -49,6 +49,14 @@ def named_scenario(name: str) -> Scenario:
     return read_scenario(Path(name))
 
 
+def spoken_name(scenario: Scenario) -> str | None:
+    """Return what a person names a scenario by here; None where its file is somewhere else."""
+    if scenario.name in shipped_scenarios():
+        return scenario.name
+    file = f"{scenario.name}{SUFFIX}"
+    return file if Path(file).is_file() else None
+
+
 def read_scenario(path: Path) -> Scenario:
     """Return the scenario that a file describes; its net is found beside the file."""
     scenario = _read(path)

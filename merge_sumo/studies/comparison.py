@@ -18,11 +18,13 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from merge_sumo.campaigns.again import command
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.coverage.fmc import fmc, radius_for, regions
@@ -31,7 +33,8 @@ from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.version import Version
-from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.folders import free
+from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record, to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.campaign_verdict import judge
@@ -45,8 +48,8 @@ LISTED: Final = 10
 """Cases of each kind, and regions, that lines name."""
 SIGNIFICANT: Final = 0.05
 """Chance of the runs of a case in equal versions, up to which a change is none of chance."""
-OUT: Final = " --out changes.html"
-"""Ends the commands that write the page with both motions."""
+PAGE: Final = Path("changes.html")
+"""The page with both motions that a command writes."""
 
 
 class Change(StrEnum):
@@ -432,7 +435,6 @@ def compare(runs: Sequence[Run]) -> Comparison:
     found = [Version.of(run) for run in runs]
     if not set.intersection(*(set(version.levels) for version in found[:2])):
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
-    folders = " ".join(quoted(run.folder) for run in runs)
     return Comparison(
         versions=tuple(found),
         steps=tuple(_step(found, number) for number in range(1, len(found))),
@@ -441,7 +443,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
             "hint, and `merge-sumo rerun` pairs the cases of one with another VUT"
         ),
         notes=tuple(_notes(runs)),
-        page_command=f"merge-sumo compare {folders}{OUT}",
+        page_command=command("compare", *(run.folder for run in runs), out=free(PAGE)),
     )
 
 

@@ -21,8 +21,8 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta
 
+from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
@@ -32,7 +32,6 @@ from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
-from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, replaced, to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.system.suggestions import either
@@ -187,17 +186,16 @@ class ExplanationResult(Result):
 
     def lines(self) -> list[str]:
         """Return the failure, its cause, its changes, and a command that runs the smallest."""
-        outcome, folder = self.run.outcome(self.found.index), quoted(self.run.folder)
+        outcome = self.run.outcome(self.found.index)
         words = *causes(self.run, [outcome]).values(), *in_words(self.found, outcome.case)
         lines = [f"case {outcome.index}, POV level {level_name(outcome.case.level)}: "]
         lines[0] += described(outcome.case)
         lines += [f"  {sentence}" for sentence in words]
         if self.found.nearest_start is not None:
             name, value = self.found.nearest_start
-            at = f"--at {name}={value!r}"
-            at += named_again(self.run.record)
-            lines.append(f"look at it: merge-sumo run --case {folder} {outcome.index} {at}")
-        return [*lines, f"in the report: merge-sumo report {folder}"]
+            of_case = (self.run.folder, self.run.record, outcome.index)
+            lines.append(f"look at it: {again('run', *of_case, at={name: value})}")
+        return [*lines, f"in the report: {command('report', self.run.folder)}"]
 
 
 def failure_of(run: Run, index: int | None) -> Outcome:

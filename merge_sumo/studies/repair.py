@@ -36,6 +36,7 @@ import numpy as np
 from msgspec import field
 
 from merge_sumo import verbs
+from merge_sumo.campaigns.again import campaign_in
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import RADIUS
@@ -46,7 +47,7 @@ from merge_sumo.scenario.case import Case, from_unit, to_unit
 from merge_sumo.studies.comparison import Comparison, compare_episodes, cut, passes
 from merge_sumo.studies.run_study import OnPart, RunStudy, check_least
 from merge_sumo.system.folders import add_to, make_folder
-from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record, to_json, to_plain
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.score import Outcome
@@ -217,6 +218,13 @@ class RepairResult(Result):
         return str(parse(self.vut).with_values(self.chosen.values, self.today))
 
     @property
+    def campaign_again(self) -> str:
+        """The command of a campaign of the repaired controller; empty where there is none."""
+        if self.repaired is None or self.best is None:
+            return ""
+        return campaign_in(self.best.campaign.scenario, vut=self.repaired)
+
+    @property
     def stays(self) -> tuple[int, ...]:
         """Indices of the cases of the campaign that still do not pass."""
         if self.chosen is None:
@@ -255,7 +263,7 @@ class RepairResult(Result):
         if self.chosen is None:
             none = f"{self.vut}: {failing} fail, and no values in these ranges let one pass without"
             return [f"{none} others that fail", f"  these stay, {stays}"]
-        passing, spec = len(self.failing) - len(self.stays), quoted(self.repaired or "")
+        passing = len(self.failing) - len(self.stays)
         lines = [
             *([] if self.verified else [self.unverified]),
             f"{self.vut}: {failing} did not pass; with other values {passing} of them pass, and "
@@ -275,7 +283,7 @@ class RepairResult(Result):
                 f"today's values and the new ones {one.compared.headline}"
                 for number, one in enumerate(self.rounds, start=1)
             ),
-            *([f"the repaired controller: merge-sumo campaign --vut {spec}"] if spec else []),
+            *([f"the repaired controller: {self.campaign_again}"] if self.campaign_again else []),
         ]
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
+from merge_sumo.campaigns.again import campaign_in, command
 from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
@@ -15,7 +16,7 @@ from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
 from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import (
     LISTED,
-    OUT,
+    PAGE,
     Change,
     ComparedCase,
     Comparison,
@@ -26,10 +27,12 @@ from merge_sumo.studies.comparison import (
 )
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.version import Version
-from merge_sumo.system.printable import counted, quoted
+from merge_sumo.system.folders import free
+from merge_sumo.system.printable import counted
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
+from merge_sumo.vuts.spec import waits_for_client
 
 AGAIN: Final = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
 """Changes whose cases run a second time, where a controller drives that may not repeat itself."""
@@ -78,22 +81,25 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
         again = _ran(plan, others_drive(changed, settings)[::-1], processes)
     step, notes = _repeated(step, ran, again)
     differing = [one for one in step.cases if one.change is not Change.BOTH]
-    indices = " ".join(str(one.b.index) for one in differing[:LISTED])
-    page = f"merge-sumo rerun {quoted(run.folder)} {indices} --vut {quoted(settings.vut)}"
-    if settings.pov is not None:
-        page += f" --pov {quoted(settings.pov)}"
-    return replace(compared, steps=(step,), notes=notes, page_command=page + OUT)
+    indices = [one.b.index for one in differing[:LISTED]]
+    drivers = {"vut": settings.vut, "pov": settings.pov}
+    page = command("rerun", run.folder, indices, **drivers, out=free(PAGE))
+    return replace(compared, steps=(step,), notes=notes, page_command=page)
 
 
 def _source(study: RunStudy) -> str:
-    """Return in a sentence where the cases come from."""
-    vut, before = study.settings.vut, study.run.vut
-    search = f"merge-sumo campaign --vut {quoted(vut)}"
-    if vut != before:
-        search += f" --against {quoted(before)}"
+    """Return in a sentence where the cases come from, and how to search with the version of now.
+
+    A scenario in a file that is not here has no command.
+    """
+    settings, before = study.settings, study.run.settings.vut
+    earlier = None if before == settings.vut or waits_for_client(before) else before
+    drivers = {"vut": settings.vut, "against": earlier, "pov": settings.pov}
+    search = campaign_in(settings.scenario, **drivers)
     return (
-        f"the cases come from the search of {before} as it was recorded, so what the version of "
-        f"now alone fails may lie elsewhere: `{search}` searches there"
+        f"the cases come from the search of {study.run.vut} as it was recorded, so what the "
+        "version of now alone fails may lie elsewhere"
+        f"{f': `{search}` searches there' if search else ''}"
     )
 
 

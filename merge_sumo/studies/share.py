@@ -2,19 +2,22 @@
 
 A search looks for failures, so the share of its cases that fail says nothing of the pool. By the
 equations of motion thousands of uniform cases take less than a second; a share of them runs in
-SUMO, too (`engine/kinematic_simulator.py`).
+SUMO, too (`engine/kinematic_simulator.py`). A controller of a user's own is asked step by step, and
+takes as long without SUMO as in it: its cases run as those of the campaign do, in rounds, as many
+as fit into a part of the campaign's time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from time import perf_counter
 from typing import Annotated, Final
 
 import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
@@ -22,9 +25,14 @@ from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.chance import clopper_pearson
+from merge_sumo.vuts.process import LOG
 
 CASES: Final = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
+ROUND: Final = 200
+"""Uniform cases of a level that run at a time where they run in SUMO, and the least of them."""
+PART: Final = 0.2
+"""Of the time of a campaign, for further rounds."""
 CONFIDENCE: Final = 0.95
 STREAM: Final = 11
 """Key of the random stream, so that it is none of a sampler's."""
@@ -32,17 +40,33 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class LevelShare(Record, frozen=True):
-    """Uniform cases of a POV level, and how many of them fail."""
+    """Uniform cases of a POV level, how many of them fail, and how many end as an error."""
 
     level: Count
     cases: Count
     failures: Count
+    without_verdict: Count = 0
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The exact interval of the share; of no failure one-sided, from 0."""
-        one_sided = 0.0 if self.failures else 1.0 - CONFIDENCE
-        return clopper_pearson(self.failures, self.cases, CONFIDENCE - one_sided)
+        """The exact interval of the share; of no failure one-sided, from 0.
+
+        Cases without a verdict are safe for its lower end, and failures for the upper.
+        """
+        confidence = CONFIDENCE - (0.0 if self.failures else 1.0 - CONFIDENCE)
+        most = self.failures + self.without_verdict
+        low, _ = clopper_pearson(self.failures, self.cases, confidence)
+        _, high = clopper_pearson(most, self.cases, confidence)
+        return low, high
+
+    def with_more(self, more: LevelShare) -> LevelShare:
+        """Return both together."""
+        return LevelShare(
+            self.level,
+            self.cases + more.cases,
+            self.failures + more.failures,
+            self.without_verdict + more.without_verdict,
+        )
 
     @property
     def shown(self) -> str:
@@ -67,38 +91,83 @@ SHARES: Final = StudyFile("shares.json", Shares)
 
 
 def note_shares(
-    run: Run, plan: SimulationPlan, workers: Workers, check: Callable[[], None] = lambda: None
+    run: Run,
+    plan: SimulationPlan,
+    workers: Workers | None = None,
+    took_s: float = 0.0,
+    check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.
 
-    Nothing is written for drivers that need SUMO, where it takes long (`probability`), where a case
-    ends otherwise in SUMO than by eq. (4), nor where one may fail in some of its runs. `check` is
-    called after each level, and may raise.
+    Nothing is written for drivers that ask SUMO, with which it takes long (`probability`), where a
+    case ends otherwise in SUMO than by eq. (4), where one may fail in some of its runs, nor of a
+    controller whose cases mostly end as errors.
+
+    Args:
+        run: the campaign.
+        plan: how it was run.
+        workers: where its cases ran, and those of a user's controller run here, too.
+        took_s: how long it took; cases in SUMO may take a part of that.
+        check: called after each level, and may raise.
+        on_part: told how many cases are done, and how many there are, from 0 on.
     """
-    if plan.needs_sumo is not None or run.tolerated or run.scenario.sense.is_random:
+    errors = sum(outcome.measures.end.is_error for outcome in run.outcomes)
+    random = run.tolerated or run.scenario.sense.is_random
+    if plan.asks_sumo or random or 2 * errors > len(run.outcomes):
         return
-    levels = []
-    for level in run.levels:
-        try:
-            levels.append(share_at(plan, level, CASES, run.settings.seed, workers))
-        except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
-            return
-        check()
-    SHARES.write(run.folder, Shares(tuple(levels)))
+    by_equations = plan.needs_sumo is None
+    size, budget_s = (CASES, 0.0) if by_equations else (ROUND, PART * took_s)
+    plan = plan.with_log(run.folder.resolve() / LOG)
+    streams = {level: stream(run.settings.seed, level) for level in run.levels}
+    shares = {level: LevelShare(level, 0, 0) for level in run.levels}
+    done, begun_s = 0, perf_counter()
+    # Worker processes would take longer to start than the cases by the equations.
+    with workers_or_here(None if by_equations else workers) as processes:
+        while True:
+            round_s = perf_counter()
+            total = done + size * len(streams)
+            for level, rng in streams.items():
+                on_part(done, total)
+                try:
+                    more = share_at(plan, level, size, rng, processes)
+                except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
+                    return
+                shares[level] = shares[level].with_more(more)
+                done += size
+                on_part(done, total)
+                check()
+            now_s = perf_counter()
+            if now_s - begun_s + (now_s - round_s) > budget_s:
+                break
+    SHARES.write(run.folder, Shares(tuple(shares.values())))
+
+
+def stream(seed: int, level: int) -> np.random.Generator:
+    """Return what draws the uniform cases of a level of a campaign with a seed."""
+    return np.random.default_rng([seed, STREAM, level])
 
 
 def share_at(
-    plan: SimulationPlan, level: int, cases: int, seed: int, workers: Workers | None = None
+    plan: SimulationPlan,
+    level: int,
+    cases: int,
+    rng: np.random.Generator,
+    workers: Workers | None = None,
 ) -> LevelShare:
-    """Return the share of uniform cases of a level that fail, by the equations of motion."""
-    rng = np.random.default_rng([seed, STREAM, level])
+    """Return the share of uniform cases of a level that fail.
+
+    They run by the equations of motion where the drivers allow it, else in SUMO.
+    """
     points = rng.random((cases, len(plan.scenario.dimensions(level))))
     pool = Pool(levels=(level,), scenario=plan.scenario)
-    kinematic = plan.for_verdicts().with_engine(None)
-    ran = evaluate(kinematic, CasesAt(pool, level, points), workers, fails_of)
-    return LevelShare(level, cases, sum(fails for _, fails in ran))
+    chosen = plan.for_verdicts().with_engine(None)
+    ran = [ended for _, ended in evaluate(chosen, CasesAt(pool, level, points), workers, ends_of)]
+    failures, errors = (sum(of) for of in zip(*ran, strict=True))
+    return LevelShare(level, cases, failures, errors)
 
 
-def fails_of(results: Episodes) -> list[bool]:
-    """Return of each result whether the case fails."""
-    return [verdict.failed for verdict in results.verdicts()]
+def ends_of(results: Episodes) -> list[tuple[bool, bool]]:
+    """Return of each result whether the case fails, and whether it ended as an error."""
+    errors = (trajectory.end.is_error for trajectory in results.trajectories)
+    return [(one.failed, error) for one, error in zip(results.verdicts(), errors, strict=True)]

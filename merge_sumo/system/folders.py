@@ -339,6 +339,12 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
+def free(path: Path) -> Path:
+    """Return a path, with a number at the end of its stem where something is there."""
+    paths = (path.with_stem(f"{path.stem}{again}") for again in chain([""], count(-2, -1)))
+    return next(path for path in paths if not os.path.lexists(path))
+
+
 def dated(what: str) -> Path:
     """Return a dated name below `runs/` that is free, of which `what` becomes a part."""
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]

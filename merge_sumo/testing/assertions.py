@@ -5,12 +5,12 @@ from __future__ import annotations
 from merge_sumo import api, verbs
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
+from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import failures
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.printable import printable
 from merge_sumo.verdict.score import Outcome
 
 
@@ -48,7 +48,6 @@ def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
     return [
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
         f"    {causes(run.run, [outcome])[index]}",
-        f"    replay it: merge-sumo replay {quoted(run.folder)} {index} --gui",
-        f"    run it again: merge-sumo run --case {quoted(run.folder)} {index}"
-        f"{named_again(run.settings)}",
+        f"    replay it: {command('replay', run.folder, index, gui=True)}",
+        f"    run it again: {again('run', run.folder, run.settings, index)}",
     ]

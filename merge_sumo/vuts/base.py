@@ -145,6 +145,8 @@ class VutKind:
     own_code: bool = True
     """Whether to test it is to run code that is neither of this package nor of SUMO."""
     files_are_known: bool = True  # whether `Vut.files` are all of which it is made before it drives
+    asks_sumo: bool = True
+    """Whether its drivers ask SUMO, or are SUMO's own; their cases take longer."""
     by_arrays: bool = False
     """Whether its drivers need nothing of SUMO, and take any number of corridors."""
     file_of: Callable[[str], str] = lambda _: ""

@@ -45,4 +45,4 @@ def built_in_vut(spec: VutSpec, options: VutOptions) -> Vut:
     return Vut(make=make, parameters=known | chosen, no_pov=no_pov if built_in.ramp_only else "")
 
 
-KIND: Final = VutKind(prepare=built_in_vut, own_code=False, by_arrays=True)
+KIND: Final = VutKind(prepare=built_in_vut, own_code=False, asks_sumo=False, by_arrays=True)

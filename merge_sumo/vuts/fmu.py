@@ -234,5 +234,6 @@ KIND: Final = VutKind(
     no_parameters="the options of an FMU are the names of its variables",
     prepare=fmu_vut,
     hosted=True,
+    asks_sumo=False,
     file_of=str,
 )

@@ -47,4 +47,4 @@ def vut_of_object(
     return replace(vut, files=(Path(file),) if file and Path(file).is_file() else ())
 
 
-KIND: Final = VutKind(prepare=here_vut, files_are_known=False)
+KIND: Final = VutKind(prepare=here_vut, files_are_known=False, asks_sumo=False)

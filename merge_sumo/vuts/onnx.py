@@ -180,5 +180,6 @@ KIND: Final = VutKind(
     no_parameters="the parameters of a network are its weights",
     prepare=onnx_vut,
     hosted=True,
+    asks_sumo=False,
     file_of=str,
 )

@@ -406,6 +406,7 @@ KIND: Final = VutKind(
     example="--vut my_vut.py:MyVut",
     prepare=python_vut,
     hosted=True,
+    asks_sumo=False,
     file_of=_file_of,
 )
-INSTALLED_KIND: Final = VutKind(prepare=installed_vut, hosted=True)
+INSTALLED_KIND: Final = VutKind(prepare=installed_vut, hosted=True, asks_sumo=False)

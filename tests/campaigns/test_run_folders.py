@@ -15,8 +15,8 @@ from calling import Said, assert_refused
 from campaigning import campaign_settings, run_campaign
 from conftest import require
 
+from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
-from merge_sumo.campaigns.settings import named_again
 from merge_sumo.errors import UserError
 from merge_sumo.system.hashing import files_now
 from merge_sumo.vuts.factory import VutFactory
@@ -123,17 +123,8 @@ class TestARunFolder:
             ran(mine)
             assert_refused(command_line("campaign", "--resume", name, "-q"), f"again with --{name}")
             assert not ran(mine)
-            again = shlex.split(named_again(read_settings(Path(name))))
-            assert command_line("rerun", name, 0, *again, "-q")[0] == 0
-
-    def test_is_gone_on_with_by_what_is_printed(self, mine: Path, command_line: Call) -> None:
-        given = ("--vut", SPEC, "--level", 0, "--cases", 4, "--sampler", "uniform", "-q")
-        code, out, _ = command_line("campaign", *given, "--gate", "errors", "--out", "new")
-        assert code == 0
-        (line,) = [line for line in out.splitlines() if "not measured: " in line]
-        command, *again = shlex.split(line.partition("not measured: merge-sumo ")[2])
-        assert command == "probability"
-        assert command_line("rerun", *again, "-q")[0] == 0
+            words = shlex.split(again("rerun", Path(name), read_settings(Path(name)), 0))
+            assert command_line(*words[1:], "-q")[0] == 0
 
 
 class TestAChangedController:
