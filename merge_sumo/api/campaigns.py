@@ -22,6 +22,7 @@ from merge_sumo.errors import WorkersLostError, notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
 from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import (
     LEVELS,
     OWN,
@@ -137,11 +138,12 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, asked: verbs.C
         )
     if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
         scenario = asked.scenario
-        name = scenario.name if isinstance(scenario, Scenario) else str(scenario)
+        name = spoken_name(scenario) if isinstance(scenario, Scenario) else str(scenario)
         option = "" if asked.policies is None else f" --policies {quoted(asked.policies)}"
+        check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
         notice(
-            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
-            f"`merge-sumo scenario check {quoted(name)}{option}` says in what it differs"
+            f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"
+            f"{f': {check} says in what it differs' if name else ''}"
         )
     own, by_sumo = plan.povs.own, plan.vut.vut.vut_type is not None
     on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,9 @@ import merge_sumo as ms
 from merge_sumo import testing
 from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.again import again, call_again, command
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
+from merge_sumo.road.scenario_file import to_toml
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.system.interrupt import Stopped
 
 Call = Callable[..., Said]
@@ -267,6 +270,18 @@ class TestACommand:
         monkeypatch.setattr(journal, "_write_all", writes)
         found = set(commands_in(str(error.value)))
         assert found == {"merge-sumo campaign --resume run --vut my_vut.py:MyVut"}
+        runs(found)
+
+    @pytest.mark.parametrize("file", ["mine.toml", "elsewhere.toml"])
+    @pytest.mark.usefixtures("place")
+    def test_on_a_scenario_names_its_file_or_is_left_out(self, file, runs):
+        scenario = replace(US23, name="mine", v_pov0_mps=(12.0, 20.0))
+        Path(file).write_text(to_toml(scenario, []))
+        few: dict[str, Any] = {"level": 1, "cases": 4, "seed": 1, "progress": False}
+        with pytest.warns(Notice, match="not trained on mine") as noticed:
+            ms.campaign("design1", scenario=scenario, **few, out="run")
+        found = set(commands_in("\n".join(str(one.message) for one in noticed)))
+        assert found == ({"merge-sumo scenario check mine.toml"} if file == "mine.toml" else set())
         runs(found)
 
     def test_writes_a_page_that_is_not_there_yet(self, place, command_line):
