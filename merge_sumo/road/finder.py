@@ -234,8 +234,8 @@ def _split(
     if 0 in at:
         who = "mainline" if at[0] == 0 else "ramp"
         raise net.broken(
-            f"the {who} begins with edge {common}, which the other path uses too; name an edge "
-            f"before it: {' or '.join(net.edges_into(common)) or 'the net has none'}"
+            f"the {who} begins with edge {common}, which the other path uses too; "
+            f"{_edges_before(net, common, mainline + ramp)}"
         )
     return (mainline[: at[0]], ramp[: at[1]]), max(tails, key=len)
 
@@ -252,15 +252,32 @@ def _how_they_meet(net: NetFile, mainline: _Edges, ramp: _Edges) -> str:
             reached = {edges[-1]: edges for edges in reversed(latest)} | reached
         onward.append(reached)
     mainlines, ramps = onward
-    both = [(mainlines[edge], ramps[edge]) for edge in mainlines if edge in ramps]
-    if not both:
-        return (
-            f", nor do they within {FOLLOWED_EDGES} edges more: name the edge behind the merge "
-            "point as the last one of both"
-        )
-    mainline, ramp = min(both, key=lambda pair: (len(pair[0]) + len(pair[1]), pair))
-    edge = next(edge for edge in ramp if edge in mainline)
-    return f'; both lead to edge {edge}: name "{" ".join(mainline)}" and "{" ".join(ramp)}"'
+    pairs = [(mainlines[edge], ramps[edge]) for edge in mainlines if edge in ramps]
+    # A path that begins with the common edge has no lane before the merge.
+    both = [pair for pair in pairs if not {path[0] for path in pair} & set(pair[0]) & set(pair[1])]
+    if both:
+        mainline, ramp = min(both, key=lambda pair: (len(pair[0]) + len(pair[1]), pair))
+        edge = next(edge for edge in ramp if edge in mainline)
+        return f'; both lead to edge {edge}: name "{" ".join(mainline)}" and "{" ".join(ramp)}"'
+    for who, path, other, reached in (
+        ("mainline", mainline, "ramp", ramps),
+        ("ramp", ramp, "mainline", mainlines),
+    ):
+        if path and path[0] in reached:
+            return (
+                f"; the {other} leads to edge {path[0]}, with which the {who} begins: "
+                f"{_edges_before(net, path[0], reached[path[0]])}"
+            )
+    return (
+        f", nor do they within {FOLLOWED_EDGES} edges more: name the edge behind the merge point "
+        "as the last one of both"
+    )
+
+
+def _edges_before(net: NetFile, edge: str, used: _Edges) -> str:
+    """Return which edges to name before one: those that lead to it and are in no path yet."""
+    free = [name for name in net.edges_into(edge) if name not in used]
+    return f"name an edge before it: {' or '.join(free) or 'the net has no other'}"
 
 
 def _following(net: NetFile, edge: str) -> list[str]:
