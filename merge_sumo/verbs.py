@@ -330,7 +330,7 @@ class Rerun(Recorded):
     it is now, and the exit code is 1 also for a new error or contact, or too little margin.
 
     With a controller that others wrote, a case that changed runs a second time. Where that does not
-    confirm the change, the case is "not repeatable", and is not counted.
+    repeat, the case is "not repeatable", and is not counted by itself.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 

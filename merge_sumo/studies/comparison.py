@@ -247,9 +247,9 @@ class Step:
         after: number of the later one.
         cases: the cases that both ran, in the order of `paired`.
         regions: by level, what became of regions, where each has cases of its own.
-        chance: where there are such levels, and one sampler searched for both, the chance of
-            shares of passing cases there as different as these, or more, in equal versions, by
-            Fisher's exact test; else None.
+        chance: where there are such levels, and one sampler searched for both, or where cases that
+            ran twice do not repeat, the chance of shares of passing cases there as different as
+            these, or more, in equal versions, by Fisher's exact test; else None.
         passes_less: whether the later one passes in a smaller share, by more than chance.
     """
 
@@ -516,10 +516,22 @@ def _step(found: Sequence[Version], after: int) -> Step:
             own[1].extend(sides[1])
     if not regions_at or earlier.sampler != later.sampler:
         return Step(after, after + 1, cases, regions_at)
-    (passed_a, ran_a), (passed_b, ran_b) = shares = [(sum(map(passes, o)), len(o)) for o in own]
-    chance = _fisher(shares)
-    less = chance <= SIGNIFICANT and passed_b * ran_a < passed_a * ran_b
+    chance, less = passes_less(*own)
     return Step(after, after + 1, cases, regions_at, chance, less)
+
+
+def passes_less(earlier: Sequence[Outcome], later: Sequence[Outcome]) -> tuple[float, bool]:
+    """Compare the shares of cases that pass, by Fisher's exact test.
+
+    Returns:
+        The chance of shares as different as these in equal versions, and whether a smaller share
+        passes in `later`, by more than chance.
+    """
+    (passed_a, ran_a), (passed_b, ran_b) = shares = [
+        (sum(map(passes, outcomes)), len(outcomes)) for outcomes in (earlier, later)
+    ]
+    chance = _fisher(shares)
+    return chance, chance <= SIGNIFICANT and passed_b * ran_a < passed_a * ran_b
 
 
 def _regions(number: int, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> list[Region]:

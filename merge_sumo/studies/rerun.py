@@ -23,7 +23,7 @@ from merge_sumo.studies.comparison import (
     Step,
     in_order,
     of_two,
-    passes,
+    passes_less,
 )
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.version import Version
@@ -123,25 +123,28 @@ def _repeated(
 ) -> tuple[Step, tuple[str, ...]]:
     """Return what changed by two runs of each case that did, and sentences on what differs.
 
-    A change of the verdict is one where neither run has the old verdict, a loss of margin where
-    both runs are the same: chance moves a margin in each run.
+    A case whose two runs differ is not repeatable, unless the VUT reaches its goal in neither:
+    chance may be what changed it. Where there are such cases, the shares of cases that pass with
+    each version decide.
     """
     found, cases = list[Repeat](), list[ComparedCase]()
     for one in step.cases:
         index = one.b.index
         if index in again:
             found.append(repeat_of(ran[index].outcome, ran[index].trajectory, again[index]))
-            is_verdict = one.change is not Change.WORSE
-            stands = is_verdict and passes(one.b) == passes(again[index].outcome)
-            if not (stands or found[-1].same):
+            reached = one.b.is_tested or again[index].outcome.is_tested
+            if reached and not found[-1].same:
                 one = replace(one, judged=Change.NOT_REPEATABLE)  # noqa: PLW2901
         cases.append(one)
     step = replace(step, cases=in_order(cases))
     notes = list(filter(None, [unrepeatable(found)]))
     if number := step.count(Change.NOT_REPEATABLE):
+        sides = [one.a for one in cases], [one.b for one in cases]
+        chance, less = passes_less(*sides)
+        step = replace(step, chance=chance, passes_less=less)
         notes.append(
-            f"Not counted, as it may be chance: {counted(number, 'change')}. Draw random numbers "
-            "from the seed of the case, as `reset(seen, seed)` tells it in Python, or compare "
-            "campaigns of both versions with `repeat`"
+            f"Not counted one by one, as it may be chance: {counted(number, 'change')}. Draw "
+            "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "
+            "or compare campaigns of both versions with `repeat`"
         )
     return step, tuple(notes)
