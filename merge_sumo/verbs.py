@@ -172,8 +172,8 @@ class Resume(SearchOfTest):
 class RunCase(Beginning, Test):
     """Run one case and show what happens: verdict, measures, and the motion second by second.
 
-    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use. With --from
-    the controller drives from the start; with --gui, too, it does so twice, first without a window.
+    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use. With --gui
+    its replay opens in sumo-gui when it has ended; --from begins table and window later.
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
@@ -215,7 +215,7 @@ class RunCase(Beginning, Test):
         "--debug",
     )
     gui: bool = option(
-        False, bool, "Show it in sumo-gui while it runs, in real time.", WHERE, "--gui"
+        False, bool, "Show its replay in sumo-gui when it has ended.", WHERE, "--gui"
     )
     out: AnyPath | None = _out("New folder to keep it in, for `replay` and sumo-gui.")
     on_end: Callable[[Any], None] | None = keyword(

@@ -14,6 +14,7 @@ Results print as the command prints them, and `to_record()` is what the command'
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import count
@@ -82,7 +83,8 @@ from merge_sumo.studies.stress import STRESS, StressResult
 from merge_sumo.studies.truth import TruthResult
 from merge_sumo.studies.vut_check import VutCheck
 from merge_sumo.sumo import replay as replayer
-from merge_sumo.sumo.replay import Replay
+from merge_sumo.sumo.binding import scratch_folder
+from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.system.folders import (
     check_new,
@@ -96,7 +98,6 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import check_toml_size, to_plain
 from merge_sumo.system.result import Shown
 from merge_sumo.verdict.conflict import check_from
-from merge_sumo.verdict.episode import Episode
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 from merge_sumo.vuts.parameters import Range
@@ -161,15 +162,21 @@ def run(asked: verbs.RunCase) -> CaseRun:
     plan = resolve(settings, debug=asked.debug)
     if asked.recorded is not None:
         notice_changes(recorded(asked.recorded[0]), plan)
-
-    def ended(episode: Episode) -> None:
-        if asked.out is not None:
-            write_scenario(Path(asked.out), plan.road, episode.outcome, episode.trajectory)
+    if asked.gui:
+        check_display()
+    episode = run_one(plan, case)
+    result = CaseRun(episode, asked.from_s)
+    with ExitStack() as opened:
+        folder = path_of(asked.out)
+        if folder is None and asked.gui:
+            folder = opened.enter_context(scratch_folder()) / "case"
+        if folder is not None:
+            write_scenario(folder, plan.road, episode.outcome, episode.trajectory)
         if asked.on_end is not None:
-            asked.on_end(CaseRun(episode, asked.from_s))
-
-    episode = run_one(plan, case, live=asked.gui, from_s=asked.from_s, on_end=ended)
-    return CaseRun(episode, asked.from_s)
+            asked.on_end(result)
+        if folder is not None and asked.gui:
+            replayer.open_gui(folder, asked.from_s)
+    return result
 
 
 @verb(verbs.Rerun)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Mapping
 from typing import Any, Final
 
 from merge_sumo.engine.plan import SimulationPlan
@@ -12,9 +11,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, level_name
-from merge_sumo.sumo.live import Window
 from merge_sumo.verbs import COORDINATES
-from merge_sumo.verdict.conflict import Conflict
 from merge_sumo.verdict.episode import Episode
 
 ONE: Final[dict[str, Any]] = {
@@ -67,30 +64,9 @@ def _option(name: str) -> str:
     return f"`{name}`" if name in COORDINATES else f"`at` {name}=NUMBER"
 
 
-def run_one(
-    plan: SimulationPlan,
-    case: Case,
-    *,
-    live: bool = False,
-    from_s: float | None = None,
-    on_end: Callable[[Episode], None] = lambda _: None,
-) -> Episode:
-    """Run one case in SUMO; its outcome is that of the same case in a campaign.
-
-    With `live` sumo-gui shows it in real time, from `from_s` before the first conflict on, until a
-    person closes the window; `on_end` is told before that. Raises `UserError` when the window is
-    closed while the case runs.
-    """
-    with ExitStack() as opened:
-        window = opened.enter_context(Window()) if live else None
-        if window is not None and from_s is not None:
-            window.first, _ = Conflict.of(run_one(plan, case).trajectory).begin(from_s)
-        simulator = opened.enter_context(Simulator(plan.for_cases(1), window))
-        running = simulator.run([case])
-        _, trajectory = next(running)
+def run_one(plan: SimulationPlan, case: Case) -> Episode:
+    """Run one case in SUMO; its outcome is that of the same case in a campaign."""
+    with Simulator(plan.for_cases(1)) as simulator:
+        _, trajectory = next(simulator.run([case]))
         outcome = plan.criterion.outcome(0, 0, trajectory, centre_lines(plan.road))
-        episode = Episode(outcome, trajectory)
-        on_end(episode)
-        if window is not None:
-            window.wait()  # before the corridor is made ready for the next case
-    return episode
+        return Episode(outcome, trajectory)

@@ -109,7 +109,7 @@ def run(
         if out is not None:
             show(f"kept: merge-sumo replay {quoted(out)} --gui")
         if gui:
-            say("close the window to go on")
+            say("the replay is open in sumo-gui: close the window to end")
 
     asked = given.keywords if case is None else given.written
     result = api.run(**{**asked, "recorded": case, "at": _coordinates(at or []), "on_end": ended})

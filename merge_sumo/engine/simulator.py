@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
-from typing import Any, Self
+from typing import Self
 
 from merge_sumo.drivers.actuation import ActuatedDriver
 from merge_sumo.drivers.base import Driver
@@ -33,11 +33,8 @@ class Simulator:
     pov: Driver
     in_sumo: Collection[int] = ()
 
-    def __init__(self, plan: SimulationPlan, binding: Any = None) -> None:
-        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many.
-
-        `binding` takes the place of libsumo: see `World`.
-        """
+    def __init__(self, plan: SimulationPlan) -> None:
+        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
         own = plan.povs.own
         car_type = None if own is None else own.vut.vut_type
         with ExitStack() as opened:
@@ -45,7 +42,6 @@ class Simulator:
                 *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut.vut_type),
                 scenario=plan.scenario,
                 car_type=car_type,
-                binding=binding,
             )
             opened.callback(world.close)
             self._open_drivers(plan, world, world, opened)

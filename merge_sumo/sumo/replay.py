@@ -104,7 +104,7 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
     rows = {key: of for key, of in episode.rows.items() if round(key[0] / DT_S) >= first}
     fault = _difference(replace(episode, rows=rows), replayed) or _fault_of_record(episode)
     diverged_at_s, detail = fault or (None, "")
-    return Replay(len(rows), diverged_at_s, detail, (*_words(episode.labels), *begins))
+    return Replay(len(rows), diverged_at_s, detail, (*_words(episode.lines), *begins))
 
 
 def _conflict(episode: _Episode) -> Conflict:
@@ -121,12 +121,10 @@ def _conflict(episode: _Episode) -> Conflict:
     return Conflict.find(np.stack((x_m, v_mps), axis=2), next(merged, None), lengths_m)
 
 
-def _words(labels: etree._Element | None) -> tuple[str, ...]:
-    """Return the case and its cause, as the labels of lines have them, where there are any."""
-    lines = () if labels is None else labels.iterfind("poi[param]")
-    texts = [str(poi[0].get("value")) for poi in lines if poi.get("id", "").startswith("line")]
-    cause = ". ".join(texts[1:]).replace(":. ", ": ")
-    return (texts[0], f"{cause}.") if cause else ()
+def _words(lines: Sequence[str]) -> tuple[str, ...]:
+    """Return the case and its cause as sentences, where there are any."""
+    cause = ". ".join(lines[1:]).replace(":. ", ": ")
+    return (lines[0], f"{cause}.") if cause else ()
 
 
 Rows = dict[tuple[float, str], tuple[float, ...]]
@@ -155,7 +153,8 @@ class _Episode:
     road: Road
     types: etree._Element
     record: etree._Element
-    labels: etree._Element | None
+    lines: Sequence[str]
+    """Texts of the case and its cause."""
     rows: Rows
     places: Places
 
@@ -179,10 +178,12 @@ def _received(folder: Path) -> _Episode:
             "one ahead and one behind"
         )
     root, rows = _checked_record(folder / RECORD, _vehicles(types))
-    labels = None  # in folders of older versions
-    if os.path.lexists(folder / LABELS):
-        labels = _read(folder / LABELS, allowed.LABELS)
-    return _Episode(road, types, root, labels, rows, _places(root, road.corridor))
+    lines = []
+    if os.path.lexists(folder / LABELS):  # not in folders of older versions
+        for poi in _read(folder / LABELS, allowed.LABELS).iterfind("poi[param]"):
+            if poi.get("id", "").startswith("line"):
+                lines.append(str(poi[0].get("value")))
+    return _Episode(road, types, root, lines, rows, _places(root, road.corridor))
 
 
 def _bytes(path: Path) -> bytes:
@@ -225,7 +226,7 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
     outer = [car for step in [*record][: row + 1] for car in step if ":" not in car.get("lane", "")]
     record[row][:] = [*{car.get("id"): car for car in (*record[0], *outer)}.values()]
     with scratch_folder() as stage:
-        files = files_of(episode.road, episode.types, record, episode.labels)
+        files = files_of(episode.road, episode.types, record, episode.lines)
         for name, content in files.items():
             (stage / name).write_bytes(content)
         yield stage, ["-c", CONFIG, "--begin", f"{row * DT_S:.1f}"]

@@ -10,7 +10,6 @@ on each other at M, where a reader looks.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -53,20 +52,12 @@ SPEED_LIMIT_MPS: Final = 200.0
 WINDOW: Final = (1280, 800)
 SHAPE: Final = 614.0 / 1270.0
 """Height of the picture in that window, as a share of its width."""
-WHOLE_WIDTH_M: Final = 683.0
-"""Of the picture of the shipped road."""
-SEEN: Final = 1.6
-"""Width of the picture, as a multiple of where the cars drove."""
+SEEN: Final = 1.3
+"""Width of the picture, as a multiple of where the VUT drove."""
 SMALLEST_M: Final = 100.0
-"""Of such a width."""
-SEEN_BESIDE: Final = 1.15
-"""The same with an acceleration lane, where cars are drawn smaller."""
-EXAGGERATED: Final = 1.0 / 175.0
-"""Enlargement of the cars for a metre of the picture's width."""
-MOST_BESIDE: Final = 1.7
-"""At most, with an acceleration lane: cars side by side do not look as if they touched."""
-MOVING_INK: Final = "0.85,0.30,0.05"
-"""Of labels at cars: it is read on a black road and beside it."""
+"""Of where it drove."""
+BELOW_LABELS: Final = 0.8
+"""Share of the height of the picture in which no label stands."""
 LETTERS: Final = "60"
 """Size of the labels."""
 REAL_TIME_MS: Final = "1000"
@@ -95,9 +86,8 @@ APART: Final = 0.13
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The first picture of sumo-gui: its zoom, its middle, and its size on the road."""
+    """The picture of sumo-gui: its zoom, its middle, and its size on the road."""
 
-    exaggeration: str
     zoom: str
     x_m: float
     y_m: float
@@ -129,10 +119,9 @@ def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: T
     Raises `UserError` when something else is there or it cannot be written (`write_folder`).
     """
     written = _road(road, folder)
-    record = _fcd(written.corridor, trajectory)
-    labels = labels_of(outcome, trajectory, _picture(written, record))
+    record, lines = _fcd(written.corridor, trajectory), lines_of(outcome, trajectory)
     case = to_json(outcome.to_record(), indent=2)
-    write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, labels)})
+    write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, lines)})
     return folder / CONFIG
 
 
@@ -182,12 +171,20 @@ def corridor_of_hosted(content: bytes, path: Path, lane_end_m: float = 0.0) -> C
 
 
 def files_of(
-    road: Road, types: etree._Element, record: etree._Element, labels: etree._Element | None
+    road: Road, types: etree._Element, record: etree._Element, lines: Sequence[str]
 ) -> dict[str, bytes]:
-    """Return all that SUMO reads, the configuration last; without labels where there are none."""
-    given = {TYPES: types} if labels is None else {TYPES: types, LABELS: labels}
-    picture = _picture(road, record)
-    view = view_settings(picture.exaggeration, picture.viewport, borders=picture.borders)
+    """Return all that SUMO reads, the configuration last.
+
+    Args:
+        road: the road that is driven on.
+        types: vehicle types of the cars.
+        record: positions and speeds of the cars.
+        lines: texts above the road, without which there are no labels.
+    """
+    picture, given = _picture(road, record), {TYPES: types}
+    if lines:
+        given[LABELS] = _labels(lines, [str(vtype.get("id")) for vtype in types], picture)
+    view = view_settings(picture.viewport, borders=picture.borders)
     config = _config(road, [*given], len(record))
     roots = {**given, RECORD: record, VIEW: view, CONFIG: config}
     return {road.file: road.net} | {name: received.serialize(r) for name, r in roots.items()}
@@ -242,22 +239,17 @@ def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
 
 
 def view_settings(
-    exaggeration: str,
     viewport: tuple[str, str, str],
-    label: str | None = None,
     *,
     borders: bool = False,
 ) -> etree._Element:
-    """Return the settings of a view with large cars, labelled by one of their parameters.
+    """Return the settings of a view.
 
-    `viewport` is zoom, x and y. Without a `label` cars have none. `borders` draws lines between
-    lanes.
+    `viewport` is zoom, x and y. `borders` draws lines between lanes.
     """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": exaggeration}
-    if label is not None:
-        vehicles |= {"vehicleTextParam": label, **_text("vehicleText", "70", MOVING_INK)}
+    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": "1"}
     if borders:
         etree.SubElement(scheme, "edges", laneShowBorders="1")
     etree.SubElement(scheme, "vehicles", vehicles)
@@ -289,27 +281,30 @@ def _text(of: str, size: str, colour: str) -> dict[str, str]:
 
 
 def _picture(shown: Road, record: etree._Element) -> Picture:
-    """Return a picture of the way of the cars; at a zoom of 100 it has the whole net."""
-    if shown.file == NET:
-        return Picture("4", "440", -110.0, -20.0, WHOLE_WIDTH_M, WHOLE_WIDTH_M * SHAPE)
+    """Return a picture of the way of the VUT; at a zoom of 100 it has the whole net."""
     road = shown.corridor
-    paths = (road.mainline, road.ramp)
-    net = [point[:2] for path in paths for piece in path.pieces for point in piece.shape]
-    cars = [(float(car.get("x", "0")), float(car.get("y", "0"))) for car in record.iter("vehicle")]
+    net: list[tuple[float, ...]] = []
+    for path in (road.mainline, road.ramp):
+        for piece in path.pieces:
+            net += [point[:2] for point in piece.shape]
+    driven = [
+        (float(car.get("x", "0")), float(car.get("y", "0")))
+        for car in record.iter("vehicle")
+        if car.get("id") == VEHICLES[VUT]
+    ]
+    whole_m, _, _ = _box(net)
+    driven_m, x_m, y_m = _box(driven or net)
+    width_m = SEEN * max(driven_m, SMALLEST_M)
+    zoom = f"{100.0 * whole_m / width_m:.0f}"
+    borders = road.lane_m is not None
+    return Picture(zoom, round(x_m), round(y_m), width_m, width_m * SHAPE, borders=borders)
 
-    def box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
-        """Return the width of a picture of points, and its centre."""
-        xs, ys = zip(*points, strict=True)
-        width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) * WINDOW[0] / WINDOW[1])
-        return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
 
-    whole_m, (driven_m, x, y) = box(net)[0], box(cars or net)
-    seen, most = (SEEN, math.inf) if road.lane_m is None else (SEEN_BESIDE, MOST_BESIDE)
-    seen_m = seen * max(driven_m, SMALLEST_M)
-    exaggeration = f"{min(max(EXAGGERATED * seen_m, 1.0), most):.1f}"
-    zoom = f"{100.0 * whole_m / seen_m:.0f}"
-    at = round(x), round(y), seen_m, seen_m * SHAPE
-    return Picture(exaggeration, zoom, *at, borders=road.lane_m is not None)
+def _box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
+    """Return the width of a picture of points, and its centre."""
+    xs, ys = zip(*points, strict=True)
+    width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) / (SHAPE * BELOW_LABELS))
+    return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
 
 
 def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Element:
@@ -342,27 +337,20 @@ def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Ele
     return root
 
 
-def beside(text: str, *, ahead: bool) -> str:
-    """Return the label of a car that moves, pushed ahead of it or behind it by spaces.
-
-    Labels stand over the middle of their cars, and at M these are in one place. A space is half as
-    wide as a letter.
-    """
-    room = " " * (round(2.6 * len(text)) + 8)
-    return room + text if ahead else text + room
-
-
-def labels_of(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree._Element:
-    """Return the labels of an episode as an additional file: the case, its cause, the colours."""
-    root = etree.Element("additional")
+def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
+    """Return what is written above the road: the case and its cause."""
     words = cause(outcome, trajectory).removesuffix(".")
     if outcome.measures.end.is_error:
         words = words.partition(":")[0]  # A message may hold what labels may not.
-    lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
+    return [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
+
+
+def _labels(lines: Sequence[str], cars: Sequence[str], picture: Picture) -> etree._Element:
+    """Return lines, and a legend of the cars, as an additional file."""
+    root = etree.Element("additional")
     for number, (line, height) in enumerate(zip(lines, LINES, strict=False)):
         at = picture.x_m, picture.y_m + height * picture.height_m
         _label(root, f"line{number}", at, line)
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
     dot_m, apart_m = DOT * picture.width_m, APART * picture.width_m
     y = picture.y_m + LEGEND * picture.height_m
     for row, name in enumerate(cars):

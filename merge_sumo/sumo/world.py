@@ -87,7 +87,6 @@ class World:
         *,
         scenario: Scenario,
         car_type: Mapping[str, str] | None = None,
-        binding: Any = None,
     ) -> None:
         """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
 
@@ -97,7 +96,6 @@ class World:
         of the VUTs, and `wanted_v_mps` tells what they want.
         `car_type` are those of cars of the mainline in the episodes in which they are the tester's
         own; without a `maxSpeed` they want the speed with which they start.
-        `binding` is what takes the place of libsumo: a `live.Window`.
         """
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
@@ -106,7 +104,7 @@ class World:
         self.vut_type, self.car_type = vut_type, car_type
         self.scenario = scenario
         self.vehicles = scenario.vehicles
-        self._libsumo = binding or load_libsumo()
+        self._libsumo = load_libsumo()
         self.x_m: FloatArray = np.empty((self.vehicles, corridors))
         self.v_mps: FloatArray = np.empty((self.vehicles, corridors))
         mainline, ramp = hosted_paths(self.road)

@@ -9,17 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from calling import assert_refused
-from plans import plan_for
-from processes import ports_of
-
-from merge_sumo.campaigns.one_case import run_one
-from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase
-from merge_sumo.scenario.scenario import US23
-from merge_sumo.sumo.live import Window
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
-COLLIDES = MergeCase(level=2, x_pov0_m=-294.5, v_pov0_mps=34.125, svo_rad=0.6, scenario=US23)
 SAFE = ("--level", "0", "--x", "-300", "--v", "34")
 
 
@@ -99,54 +90,31 @@ def _rows(folder: Path) -> int:
 
 class TestInSumoGui:
     @pytest.fixture
-    def window(self, display, monkeypatch):
-        """Let windows open on a display of the test, without waiting for anybody."""
-        monkeypatch.setenv("DISPLAY", display)
-        monkeypatch.setattr(Window, "wait", lambda _: None)
-        monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
-        monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
-        return monkeypatch
+    def opened(self, monkeypatch) -> list[dict[str, bytes]]:
+        """Return what sumo-gui is opened on, instead of opening it."""
+        found: list[dict[str, bytes]] = []
 
-    def test_a_case_is_run_live_and_moves_as_without_a_window(self, window):
-        slept: list[float] = []
-        window.setattr("merge_sumo.sumo.live.sleep", slept.append)
-        plan = plan_for("design2", corridors=1)
-        live = run_one(plan, COLLIDES, live=True)
-        without = run_one(plan, COLLIDES)
-        assert (live.trajectory.motion == without.trajectory.motion).all()
-        assert live.outcome == without.outcome
-        assert len(slept) == len(live.trajectory.whole) - 1, "every step waits for its time"
+        def note(folder: Path, from_s: float | None) -> int:
+            found.append({file.name: file.read_bytes() for file in folder.iterdir()})
+            return 0
 
-    def test_passes_the_time_before_without_delay(self, window):
-        slept: list[float] = []
-        window.setattr("merge_sumo.sumo.live.sleep", slept.append)
-        plan = plan_for("design2", corridors=1)
-        live = run_one(plan, COLLIDES, live=True, from_s=-3.0)
-        without = run_one(plan, COLLIDES)
-        assert (live.trajectory.motion == without.trajectory.motion).all()
-        assert live.outcome == without.outcome
-        assert len(slept) == len(live.trajectory.whole) - 1 - 63, "from 6.3 s on"
+        monkeypatch.setenv("DISPLAY", ":99")
+        monkeypatch.setattr("merge_sumo.sumo.replay.open_gui", note)
+        return found
 
-    def test_opens_no_port(self, window):
-        ports: list[list[str]] = []
+    def test_the_replay_opens_when_the_case_has_ended(self, command_line, opened, tmp_path):
+        start = ("run", "--vut", "design2", *STALEMATE, "--gui")
+        code, out, err = command_line(*start)
+        assert code == 1
+        assert "Late brake" in out
+        assert "close the window" in err
+        command_line(*start, "--out", tmp_path / "kept")
+        kept = {file.name: file.read_bytes() for file in (tmp_path / "kept").iterdir()}
+        assert opened == [kept, kept]
+        code, replayed, _ = command_line("replay", tmp_path / "kept")
+        assert (code, "identical" in replayed) == (0, True)
 
-        def look(this: Window) -> None:
-            ports.append(ports_of(this._child.process.pid))
-            step(this)
-
-        step = Window.step
-        window.setattr(Window, "step", look)
-        run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
-        assert len(ports) > 20
-        assert not any(ports)
-
-    def test_a_window_that_is_closed_is_said_in_a_sentence(self, window):
-        def close_window(this: Window) -> None:
-            if this._shown == 20:
-                this._child.process.kill()
-            step(this)
-
-        step = Window.step
-        window.setattr(Window, "step", close_window)
-        with pytest.raises(UserError, match="the window was closed before the case had ended"):
-            run_one(plan_for("design2", corridors=1), COLLIDES, live=True)
+    def test_cars_are_to_scale(self, tmp_path, command_line):
+        command_line("run", "--vut", "design2", *SAFE, "--out", tmp_path / "kept")
+        view = (tmp_path / "kept" / "view.settings.xml").read_text()
+        assert 'vehicle_exaggeration="1"' in view

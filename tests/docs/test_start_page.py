@@ -10,13 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from merge_sumo.sumo.live import Window
-
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```(\w+)\n(.*?)^```$", PAGE, flags=re.DOTALL | re.MULTILINE)
 (SOURCE,) = (block for kind, block in BLOCKS if kind == "python")
-CHECK, CAMPAIGN, RUN, LIVE, RERUN = (
+CHECK, CAMPAIGN, RUN, WINDOW, RERUN = (
     shlex.split(block)[1:] for kind, block in BLOCKS if kind == "bash"
 )
 (PRINTED,) = (block for kind, block in BLOCKS if kind == "text")
@@ -63,14 +61,12 @@ def test_the_steps_lead_to_a_failing_case(campaign, command_line, monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_last_step_shows_it_live(campaign, command_line, display, monkeypatch):
+def test_the_last_step_opens_it_in_sumo_gui(campaign, command_line, monkeypatch):
     folder, worst = campaign
     monkeypatch.chdir(folder)
-    monkeypatch.setenv("DISPLAY", display)
-    monkeypatch.setattr(Window, "wait", lambda _: None)
-    monkeypatch.setattr("merge_sumo.sumo.live.sleep", lambda _: None)
-    monkeypatch.setattr("merge_sumo.sumo.live.BEFORE_S", 0.0)
-    arguments = the_worst(LIVE, worst)
+    monkeypatch.setenv("DISPLAY", ":99")
+    monkeypatch.setattr("merge_sumo.sumo.replay.open_gui", lambda folder, from_s: 0)
+    arguments = the_worst(WINDOW, worst)
     assert arguments == [*the_worst(RUN, worst), "--gui"]
     code, _, err = command_line(*arguments)
     assert code == FAILS, err

@@ -54,18 +54,3 @@ def none_left() -> Iterator[str]:
         patch.setenv("MERGE_SUMO_TEST", mark)
         yield mark
         assert wait_for(lambda: not marked(mark)), marked(mark)
-
-
-def ports_of(process: int) -> list[str]:
-    """Return the addresses at which a process listens or is connected by TCP or UDP."""
-    rows = [
-        line.split()
-        for table in ("tcp", "tcp6", "udp", "udp6")
-        for line in Path("/proc/net", table).read_text().splitlines()[1:]
-    ]
-    address_of = {f"socket:[{row[9]}]": row[1] for row in rows}
-    found = []
-    for descriptor in Path(f"/proc/{process}/fd").iterdir():
-        with suppress(OSError):
-            found.append(str(descriptor.readlink()))
-    return [address_of[name] for name in found if name in address_of]
