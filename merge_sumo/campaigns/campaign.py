@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager, nullcontext, suppress
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -103,7 +103,7 @@ def run_campaign(
     check_new(folder / SCENARIOS / case_name(settings.cases))
     versions = _versions(folder, settings, plan, workers)
     with workers_or_here(workers) as available, ExitStack() as opened:
-        sampler = opened.enter_context(_searching(versions, available))
+        sampler = _new_sampler(versions)
         for one in versions:
             open_simulators(one.plan, available, first=settings.in_flight is not None)
         for one in versions:
@@ -163,7 +163,7 @@ def resume_campaign(
                 one.journal.rewrite_settings(rewritten)
         for outcome in campaign.outcomes:
             on_before(outcome)
-        sampler = opened.enter_context(_searching(versions, available))
+        sampler = _new_sampler(versions)
         return _run(sampler, versions, available, on_case, check, begin)
 
 
@@ -255,19 +255,12 @@ def _run(
     return done
 
 
-@contextmanager
-def _searching(versions: Sequence[_Version], workers: Workers) -> Iterator[Sampler]:
-    """Give the sampler of a campaign, which was told nothing.
-
-    Where there are workers it may search in a second process.
-    """
+def _new_sampler(versions: Sequence[_Version]) -> Sampler:
+    """Return the sampler of a campaign, which was told nothing."""
     settings = versions[0].settings
     twins = [twin_of(settings, one.plan) for one in versions]
     predictor = twins[0] if len(twins) == 1 else TwinPair(*twins)
-    sampler = settings.with_repeats(settings.new_sampler(predictor))
-    two = len(twins) == 1 and workers.count > 1
-    with sampler.two_processes() if two else nullcontext():
-        yield sampler
+    return settings.with_repeats(settings.new_sampler(predictor))
 
 
 def _scheduler(

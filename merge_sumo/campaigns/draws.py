@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from math import ceil, inf, log2
 from typing import Final
@@ -52,10 +51,6 @@ class RepeatingSampler(Sampler):
         """By the place in the last batch, the place among the other sampler's picks."""
         self._drawn: dict[Case, int] = {}
         """Draws proposed of each case by its start, but for those that are pending."""
-
-    def two_processes(self) -> AbstractContextManager[None]:
-        """Have the other sampler search in a second process, too."""
-        return self._sampler.two_processes()
 
     @abstractmethod
     def repeats(self, n: int) -> list[Case]:

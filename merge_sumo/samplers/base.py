@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
@@ -64,10 +63,6 @@ class Sampler(ABC):
         """Whether a case ran with more than one draw."""
         self._proposed: Counter[int] = Counter()
         self._pending: list[Case] = []
-
-    def two_processes(self) -> AbstractContextManager[None]:
-        """Search in a second process, too, where the sampler can; to be told nothing before."""
-        return nullcontext()
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:

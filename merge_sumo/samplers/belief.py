@@ -16,8 +16,8 @@ typical width of what fails. That bisects the curve where the order of merging f
 where it is a jump, and goes on along it where it is a strip of failures. Then a logistic
 regression corrects the odds by the distances to the nearest failure and to that curve.
 
-Where runs of a case differ, P(fail) is that of a run. The processes then have a noise of their own,
-all are judged by k failures of n runs, and `LatentOdds` corrects what they say.
+Where runs of a case differ, P(fail) is that of a run: the processes learn a noise of their own, and
+all are judged by k failures of n runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ from scipy.special import expit, log_expit, logit
 
 from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.verdict.prediction import NO_GAP
@@ -94,28 +93,6 @@ class Belief:
 
     def of(self, cases: FloatArray) -> FloatArray:
         """Return P(fail) of a run of cases, (m, d), as (m,)."""
-        chance = self._believed(cases)
-        if self._latent is None:
-            return chance
-        return mean_chance(*self._latent.at(cases, _log_odds(chance)))
-
-    @property
-    def tolerates(self) -> bool:
-        """Whether a case that fails in a run may pass: chance was seen, and a share tolerated."""
-        return self.history.varies and self.history.tolerated > 0.0
-
-    def above(self, cases: FloatArray) -> FloatArray:
-        """Return the probability that cases, (m, d), fail in more runs than are tolerated, (m,).
-
-        With none tolerated it is P(fail) of a run: a case fails once a run of it does.
-        """
-        if self._latent is None or not self.tolerates:
-            return self.of(cases)
-        odds = self._latent.at(cases, _log_odds(self._believed(cases)))
-        return chance_above(*odds, self.history.tolerated)
-
-    def _believed(self, cases: FloatArray) -> FloatArray:
-        """Return P(fail) of cases, (m, d), by all experts, before the correction for chance."""
         dims = self.history.dims
         distances = [nearest(cases, self.history.points[group]) for group in self.groups]
         chances = [
@@ -135,7 +112,7 @@ class Belief:
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
         log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
         self._fitted: list[tuple[float, FloatArray]] = []
-        best, left_out = [], []
+        best: list[float] = []
         for expert in (self._smooth, self._rough, self._branches):
             if expert is None:
                 continue
@@ -148,12 +125,7 @@ class Belief:
             posterior, width, calibration = posteriors[place], WIDTHS[place], calibrations[place]
             self._fitted.append((float(width), calibration))
             best.append(float(posterior))
-            left_out.append(expit(evidence[place] @ calibration))
         self._weights = np.exp(np.array(best) - max(best))
-        self._latent = None
-        if learned.varies:
-            odds = _log_odds(np.average(left_out, axis=0, weights=self._weights))
-            self._latent = LatentOdds(learned.points, learned.runs, learned.failures, odds)
 
 
 class Calibration:

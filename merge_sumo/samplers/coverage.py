@@ -8,8 +8,6 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Final
 
@@ -20,16 +18,14 @@ from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration, nearness
-from merge_sumo.samplers.beside import CopyBeside
 from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
 from merge_sumo.samplers.gpr import exploiting
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
+from merge_sumo.samplers.prediction_skill import PredictionSkill, Predictor
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Outcome
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -63,37 +59,13 @@ class CoverageSampler(Sampler):
     uses_predictions = True
     overlaps = True
 
-    _beside: CopyBeside | None = None
-
-    @contextmanager
-    def two_processes(self) -> Iterator[None]:
-        """Search some of the levels in a second process, if the system lets one start."""
-        if self.predictor is not None and len(self.pool.levels) > 1:
-            with suppress(OSError, RuntimeError):
-                self._beside = CopyBeside(self)
-        try:
-            yield
-        finally:
-            beside, self._beside = self._beside, None
-            if beside is not None:
-                beside.close()
-
-    def tell(
-        self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
-    ) -> None:
-        """Take outcomes, also for what searches beside."""
-        super().tell(outcomes, motions)
-        if self._beside is not None:
-            self._beside.tell(outcomes, motions)
-
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
-        *others, last = self.pool.levels
-        if self._beside is not None:
-            self._beside.ask(others, n, self._pending)
-        proposals = self.search([last], n)
-        answer = None if self._beside is None else self._beside.answer()
-        proposals |= self.search(others, n) if answer is None else answer
+        from threadpoolctl import threadpool_limits
+
+        # One thread: rounding must not depend on the number of cores.
+        with threadpool_limits(1):
+            proposals = {level: self._propose(level, n) for level in self.pool.levels}
         shares = self._shares(proposals, n)
         self._predictions = [
             prediction
@@ -120,33 +92,7 @@ class CoverageSampler(Sampler):
         most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
         return max(most, a_level * levels)
 
-    def search(self, levels: Sequence[int], n: int) -> dict[int, Proposal]:
-        """Return a batch of each of some levels.
-
-        Their searches go in step, so that the predictor answers all of them at once.
-        """
-        from threadpoolctl import threadpool_limits
-
-        proposals: dict[int, Proposal] = {}
-        searches = {level: self._propose(level, n) for level in levels}
-        # One thread: rounding must not depend on the number of cores.
-        with threadpool_limits(1):
-            answers: dict[int, FloatArray | None] = dict.fromkeys(searches)
-            while answers:
-                queries = {}
-                for level, answer in answers.items():
-                    try:
-                        # A generator is begun by sending None.
-                        queries[level] = searches[level].send(answer)  # type: ignore[arg-type]
-                    except StopIteration as ended:
-                        proposals[level] = ended.value
-                answers = {}
-                if queries and self.predictor is not None:
-                    gaps = self.predictor.predict(list(queries.values()))
-                    answers.update(zip(queries, gaps, strict=True))
-        return proposals
-
-    def _propose(self, level: int, n: int) -> Asking[Proposal]:
+    def _propose(self, level: int, n: int) -> Proposal:
         history, rng, pending = self.history(level), self.rng(level), self.pending(level)
         few = len(history.points) < FEWEST
         if self.predictor is None or not self.predictor.can_predict(level):
@@ -159,15 +105,14 @@ class CoverageSampler(Sampler):
                 spread = spread_out(begun + n, history.dims, rng)[begun:]
                 return Proposal(spread, chance, chance, (None,) * n)
             return _LevelBatch(history, pending, rng, n).batch(n)
-        skill = yield from self._skill(level)
+        skill = self._skill(self.predictor, level)
         base_rate = None
         if skill.breaks_promises and not few:
             base_rate = self._base_rate(level, history, pending, n)
         if skill.is_worthless and not few:
             batch = _LevelBatch(history, pending, rng, n).batch(n, base_rate)
-            gaps = yield Query(level, batch.points)
-            return skill.annotated(batch, gaps)
-        return (yield from twin_guided_batch(history, pending, n, rng, level, skill, base_rate))
+            return skill.annotated(batch, self.predictor.predict(level, batch.points))
+        return twin_guided_batch(self.predictor, history, pending, n, rng, level, skill, base_rate)
 
     def _base_rate(
         self, level: int, history: LevelHistory, pending: FloatArray, n: int
@@ -185,14 +130,14 @@ class CoverageSampler(Sampler):
         by_margin = partial(exploiting, history, pending)
         return BaseRate(history, predictions, unknown, n, self.proposed(level), begins, by_margin)
 
-    def _skill(self, level: int) -> Asking[PredictionSkill]:
+    def _skill(self, predictor: Predictor, level: int) -> PredictionSkill:
         """Return the skill of the predictions so far, of all levels."""
         last = self.observed(level)[-REPLAYED:]
         replayed: dict[int, FloatArray] = {}
         if last:
             indices = [outcome.index for outcome in last]
             points = to_unit((outcome.case for outcome in last), level, self.pool.scenario)
-            gaps = yield Query(level, points, held_out=indices)
+            gaps = predictor.predict(level, points, held_out=indices)
             replayed = dict(zip(indices, gaps.T, strict=True))
         return PredictionSkill(self.observed(), level, self.pool.scenario.dx_crash_m, replayed)
 
@@ -222,14 +167,14 @@ class _LevelBatch:
         belief = Belief(history, limit)
         candidates = of_belief(history, belief, rng, n)
         aim, balls = (
-            calibration.of(belief.above(candidates), candidates),
+            calibration.of(belief.of(candidates), candidates),
             self._grid.balls(candidates),
         )
         worth = aim * self._grid.new(balls)
         best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
         refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
         candidates = np.concatenate([candidates, refined])
-        aim = np.concatenate([aim, calibration.of(belief.above(refined), refined)])
+        aim = np.concatenate([aim, calibration.of(belief.of(refined), refined)])
         balls = np.concatenate([balls, self._grid.balls(refined)])
         worth = aim * (self._grid.new(balls) + EVEN_IF_COVERED)
         kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
@@ -238,14 +183,13 @@ class _LevelBatch:
         self._belief = belief if limit is None else Belief(history)
         self._above = self._aim
         if limit is not None:
-            self._above = calibration.of(self._belief.above(self._candidates), self._candidates)
+            self._above = calibration.of(self._belief.of(self._candidates), self._candidates)
 
     def batch(self, n: int, base_rate: BaseRate | None = None) -> Proposal:
         """Return the greedy batch of `n` cases, with a base rate where its picks promise more."""
         picks, gain = greedy(self._grid, self._candidates, self._aim, self._above, n)
         points, unknown = self._candidates[picks], (None,) * n
-        chance = self._chance(points) if self._belief.tolerates else self._above[picks]
-        batch = Proposal(points, gain, chance, unknown)
+        batch = Proposal(points, gain, self._above[picks], unknown)
         if base_rate is None:
             return batch
         following = base_rate.following

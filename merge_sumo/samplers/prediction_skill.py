@@ -8,9 +8,9 @@ in the record: what they had said of the cases that have run since.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, Protocol, TypeVar
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,29 +57,6 @@ EDGE: Final = float(np.arcsinh(1.0))
 """The limit of a failure on the scale of `compressed`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Query:
-    """Cases of one level whose gaps are to be predicted.
-
-    Attributes:
-        level: that of the POV.
-        points: cases, (n, d), of the unit cube.
-        screening: the one expert of which one member predicts; None for all members of all experts.
-        held_out: indices of the cases where they were told before: each case is predicted by a
-            member of each expert that has not learned from the case.
-    """
-
-    level: int
-    points: FloatArray
-    screening: int | None = None
-    held_out: Sequence[int] = ()
-
-
-R = TypeVar("R")
-Asking = Generator[Query, FloatArray, R]
-"""Yields queries, is sent the gaps of each, and returns a result."""
-
-
 class Predictor(Protocol):
     """Predicts the gaps of cases; a pure function of the outcomes told so far."""
 
@@ -89,10 +66,22 @@ class Predictor(Protocol):
     def can_predict(self, level: int) -> bool:
         """Return whether the outcomes so far suffice to predict cases of a level."""
 
-    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
-        """Return the signed gaps of each query (`Outcome.signed_gap`); NaN where none is reached.
+    def predict(
+        self,
+        level: int,
+        points: FloatArray,
+        *,
+        screening: int | None = None,
+        held_out: Sequence[int] = (),
+    ) -> FloatArray:
+        """Return the signed gaps of cases (`Outcome.signed_gap`), (E, G, n); NaN where none is.
 
-        They are (E, G, n), (1, 1, n) where one member screens, and (E, n) of cases held out.
+        Args:
+            level: that of the POV.
+            points: cases, (n, d), of the unit cube.
+            screening: the one expert of which one member predicts, (1, 1, n).
+            held_out: indices of the cases where they were told before: each is predicted by a
+                member of each expert that has not learned from the case, (E, n).
         """
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -21,7 +20,7 @@ from merge_sumo.samplers.candidates import (
 )
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.prediction_skill import Asking, PredictionSkill, Query
+from merge_sumo.samplers.prediction_skill import PredictionSkill, Predictor
 from merge_sumo.scenario.case import FloatArray
 
 ANYWHERE: Final = 1000
@@ -51,6 +50,7 @@ EXPLORES_FROM: Final = 5
 
 
 def twin_guided_batch(
+    predictor: Predictor,
     history: LevelHistory,
     pending: FloatArray,
     n: int,
@@ -58,7 +58,7 @@ def twin_guided_batch(
     level: int,
     skill: PredictionSkill,
     base_rate: BaseRate | None = None,
-) -> Asking[Proposal]:
+) -> Proposal:
     """Return a batch of `n` cases of a level that the predictor can predict.
 
     `pending` are cases, (m, d), that run and have no outcome yet.
@@ -67,36 +67,36 @@ def twin_guided_batch(
     the predictions so far. Without outcomes at the level there is no surrogate, and half of the
     batch is spread over the cube. With a base rate, picks that promise less than that give way.
     """
-    candidates = _Candidates(history, pending, level, skill)
-    first_points = yield from _first_candidates(candidates, history, n, rng)
-    yield from candidates.add(first_points)
+    candidates = _Candidates(predictor, history, pending, level, skill)
+    first_points = _first_candidates(candidates, history, n, rng)
+    candidates.add(first_points)
     reach = REFINED_REACH * radius_for(history.dims)
     # What does not come true is not refined.
     for _ in range(ROUNDS if base_rate is None else 0):
         batch, _ = greedy(
-            candidates.grid.copy(), candidates.points, candidates.above, candidates.above, n
+            candidates.grid.copy(), candidates.points, candidates.p_fail, candidates.p_fail, n
         )
-        best = candidates.best(candidates.points, candidates.above, n)
+        best = candidates.best(candidates.points, candidates.p_fail, n)
         centres = np.concatenate([best, candidates.points[batch]])
-        yield from candidates.add(around(centres, REFINED, reach, rng))
+        candidates.add(around(centres, REFINED, reach, rng))
     first: list[int] = []
     if candidates.surrogate is None:
         spread = spread_out(n - n // 2, history.dims, rng)
         first = [*range(len(candidates.points), len(candidates.points) + len(spread))]
-        yield from candidates.add(spread)
+        candidates.add(spread)
         candidates.grid.cover(candidates.grid.balls(spread), PICKED)
     explores = n >= EXPLORES_FROM and not skill.is_doubted
     information = skill.disagreement(candidates.gaps) if explores else None
-    above = candidates.above
+    p_fail = candidates.p_fail
     picks, gain = greedy(
-        candidates.grid, candidates.points, above, above, n - len(first), information
+        candidates.grid, candidates.points, p_fail, p_fail, n - len(first), information
     )
     gain = np.concatenate([np.ones(len(first)), gain])
     if base_rate is None:
         return candidates.proposal(first + picks, gain * skill.trust)
     picked = candidates.proposal(first + picks, gain)
     spread_from = len(candidates.points)
-    yield from candidates.add(base_rate.following)
+    candidates.add(base_rate.following)
     following = [*range(spread_from, len(candidates.points))]
     return base_rate.mixed(picked, candidates.proposal(following, gain))
 
@@ -109,13 +109,18 @@ class _Candidates:
         surrogate: None without outcomes at the level.
         points: candidates, (m, d).
         gaps: predicted gaps at M, (E, G, m).
-        above: probability of failing in more runs than are tolerated, (m,).
+        p_fail: P(fail) of each, (m,).
     """
 
     def __init__(
-        self, history: LevelHistory, pending: FloatArray, level: int, skill: PredictionSkill
+        self,
+        predictor: Predictor,
+        history: LevelHistory,
+        pending: FloatArray,
+        level: int,
+        skill: PredictionSkill,
     ) -> None:
-        self.level, self.skill = level, skill
+        self.predictor, self.level, self.skill = predictor, level, skill
         self.grid = covered_grid(history, pending)
         self.surrogate = Belief(history) if len(history.points) >= FEWEST else None
         self._calibration = Calibration(history) if skill.is_doubted else None
@@ -127,21 +132,16 @@ class _Candidates:
         return self._predictions[0]
 
     @property
-    def above(self) -> FloatArray:
+    def p_fail(self) -> FloatArray:
         return self._predictions[-1]
 
-    def add(self, points: FloatArray) -> Asking[None]:
+    def add(self, points: FloatArray) -> None:
         """Add candidates, (k, d), with the predictions of all members."""
-        gaps = yield Query(self.level, points)
+        gaps = self.predictor.predict(self.level, points)
         p_twin = self.skill.chance(gaps)
-        p_surrogate = (
-            p_twin if self.surrogate is None else self.corrected(self.surrogate.of, points)
-        )
+        p_surrogate = p_twin if self.surrogate is None else self.corrected(points)
         p_fail = self.skill.mixed(gaps, p_twin, p_surrogate)
-        above = p_fail
-        if self.surrogate is not None and self.surrogate.tolerates:
-            above = self.skill.mixed(gaps, p_twin, self.corrected(self.surrogate.above, points))
-        fresh = gaps, p_twin, p_surrogate, p_fail, above
+        fresh = gaps, p_twin, p_surrogate, p_fail
         self._predictions = (
             tuple(
                 np.concatenate(pair, axis=-1) for pair in zip(self._predictions, fresh, strict=True)
@@ -151,13 +151,11 @@ class _Candidates:
         )
         self.points = np.concatenate([self.points, points])
 
-    def corrected(
-        self, chance: Callable[[FloatArray], FloatArray], points: FloatArray
-    ) -> FloatArray:
-        """Return a probability of points, (m,), by the surrogate, calibrated where due."""
-        if self._calibration is None:
-            return chance(points)
-        return self._calibration.of(chance(points), points)
+    def corrected(self, points: FloatArray) -> FloatArray:
+        """Return P(fail) of points, (m,), by the surrogate, calibrated where due."""
+        assert self.surrogate is not None, "there are outcomes"  # noqa: S101
+        chance = self.surrogate.of(points)
+        return chance if self._calibration is None else self._calibration.of(chance, points)
 
     def best(self, points: FloatArray, probability: FloatArray, most: int) -> FloatArray:
         """Return the `most` points with the largest expected gain of their own."""
@@ -166,7 +164,7 @@ class _Candidates:
 
     def proposal(self, picks: list[int], gain: FloatArray) -> Proposal:
         """Return the batch of some candidates, by index, with their gains."""
-        gaps, p_twin, p_surrogate, p_fail, _ = self._predictions
+        gaps, p_twin, p_surrogate, p_fail = self._predictions
         predictions = tuple(
             self.skill.prediction(gaps[..., i], p_twin[i], p_surrogate[i], p_fail[i]) for i in picks
         )
@@ -175,7 +173,7 @@ class _Candidates:
 
 def _first_candidates(
     candidates: _Candidates, history: LevelHistory, n: int, rng: np.random.Generator
-) -> Asking[FloatArray]:
+) -> FloatArray:
     """Return the candidates, (m, d), that all members predict first.
 
     One member of one expert screens many; the surrogate chooses among its own.
@@ -188,13 +186,13 @@ def _first_candidates(
     if surrogate is not None:
         screened.append(between(surrogate, BETWEEN, rng))
         own = rng.permutation(of_belief(history, surrogate, rng, n))[:SURROGATE_CANDIDATES]
-        chance = candidates.corrected(surrogate.above, own)
+        chance = candidates.corrected(own)
         chosen.append(candidates.best(own, chance, OF_SURROGATE))
     if len(failing):
         screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))
     points = np.concatenate(screened)
     expert = skill.expert(rng)
-    gaps = yield Query(candidates.level, points, screening=expert)
+    gaps = candidates.predictor.predict(candidates.level, points, screening=expert)
     chance = skill.chance(gaps, expert)
     chosen.append(candidates.best(points, chance, SCREENED))
     return np.concatenate(chosen)

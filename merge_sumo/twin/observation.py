@@ -39,21 +39,14 @@ class Observation:
     with a delay or a memory decides also by what was before.
     """
 
-    def __init__(self, scenario: Scenario, rows: int, labels: Inputs | None = None) -> None:
-        """Begin `rows` episodes of a scenario.
-
-        `labels`, (L, rows), are further inputs, which stay as they are.
-        """
+    def __init__(self, scenario: Scenario, rows: int) -> None:
+        """Begin `rows` episodes of a scenario."""
         self._scenario = scenario
         cars = scenario.vehicles - 1
         self.now = NOW + (1 + OF_EACH_CAR * cars if cars > 1 else 0)
         """How many of the inputs are those of the present."""
         self._step = 0
-        labelled = self.now + HISTORY
-        more = 0 if labels is None else len(labels)
-        self._inputs: Inputs = np.empty((labelled + more, rows), dtype=np.float32)
-        if labels is not None:
-            self._inputs[labelled:] = labels
+        self._inputs: Inputs = np.empty((self.now + HISTORY, rows), dtype=np.float32)
         self._past: Inputs = np.empty((DEPTH, 5, rows), dtype=np.float32)
         self._since_jump = np.zeros(rows)
         self._lowest = np.zeros(rows)
@@ -69,8 +62,8 @@ class Observation:
         """Take the next states, (A, R), and the last accelerations of the VUT, (R,).
 
         Returns:
-            (R, inputs): first those of the present, `now` of them, then those of the past, then
-            the labels. They are good until the next call.
+            (R, inputs): first those of the present, `now` of them, then those of the past. They
+            are good until the next call.
         """
         scenario, inputs, past, t = self._scenario, self._inputs, self._past, self._step
         x_pov, v_pov, x_vut, v_vut = x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.twin.twin import Twin
 from merge_sumo.verdict.regression import regression_gaps
@@ -34,9 +33,17 @@ class TwinPair:
         """Return whether both twins can predict cases of a level."""
         return self._new.can_predict(level) and self._old.can_predict(level)
 
-    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
-        """Return what stands for the gap of a regression in each query; see `Predictor`."""
-        return [
-            regression_gaps(new, old)
-            for new, old in zip(self._new.predict(queries), self._old.predict(queries), strict=True)
-        ]
+    def predict(
+        self,
+        level: int,
+        points: FloatArray,
+        *,
+        screening: int | None = None,
+        held_out: Sequence[int] = (),
+    ) -> FloatArray:
+        """Return what stands for the gap of a regression in each case; see `Predictor`."""
+        new, old = (
+            twin.predict(level, points, screening=screening, held_out=held_out)
+            for twin in (self._new, self._old)
+        )
+        return regression_gaps(new, old)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.following import keep_safe
-from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, feature_columns
+from merge_sumo.drivers.levelk import (
+    DECISION_STEPS,
+    QNetwork,
+    actions_mps2,
+    feature_columns,
+)
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.engine.povs import POLICIES, Povs
 from merge_sumo.scenario.case import FloatArray, Pool
@@ -21,25 +25,10 @@ from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.verdict.merge import REACTION_S
 
-Answer = Callable[[Inputs], FloatArray]
-"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs)."""
+Answer = Callable[[Inputs, NDArray[np.int64]], FloatArray]
+"""Gives accelerations of the VUT, (R,), by inputs, (R, inputs), and the numbers of the cases."""
 STILL: Final = 0.92
 """Share of rows that still move below which the others are dropped."""
-
-
-@dataclass(frozen=True, slots=True)
-class Starts:
-    """Cases of one level to roll out.
-
-    Attributes:
-        level: that of the POV.
-        points: cases, (n, d), of the unit cube.
-        labels: further inputs of the answer, (L, n), the same number for all `Starts` together.
-    """
-
-    level: int
-    points: FloatArray
-    labels: Inputs | None = None
 
 
 class TwinRollout:
@@ -88,25 +77,18 @@ class TwinRollout:
             x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
         return x_m, v_mps, values.get("svo_rad", np.zeros(n))
 
-    def play(self, starts: Sequence[Starts], answer: Answer) -> list[FloatArray]:
-        """Return the signed gaps of the starts, (n,) for each of them: see `Outcome.signed_gap`.
+    def play(self, level: int, points: FloatArray, answer: Answer) -> FloatArray:
+        """Return the signed gaps of cases, (n, d), of a level: see `Outcome.signed_gap`, (n,).
 
         All step together, as arrays. NaN where the VUT never arrives.
         """
         if self._by_gap:
-            gap = self._play(starts, answer) / self._scenario.dx_crash_m
-        else:
-            gap = self._judged(starts, answer)
-        return np.split(gap, np.cumsum([len(some.points) for some in starts])[:-1])
-
-    def _judged(self, starts: Sequence[Starts], answer: Answer) -> FloatArray:
-        """Return what stands for the gaps, (R,)."""
+            return self._play(level, points, answer) / self._scenario.dx_crash_m
         played: list[FloatArray] = []
-        gap_m = self._play(starts, answer, played)
+        gap_m = self._play(level, points, answer, played)
         motion = np.array(played)
         found = np.empty(len(gap_m))
-        cases = [case for some in starts for case in self._pool.cases(some.points, some.level)]
-        for row, case in enumerate(cases):
+        for row, case in enumerate(self._pool.cases(points, level)):
             arrived = motion[:, VUT, 0, row] >= 0.0
             last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
             of_row = motion[: last + 1, :, :, row].copy()
@@ -128,33 +110,29 @@ class TwinRollout:
 
     def _play(
         self,
-        starts: Sequence[Starts],
+        level: int,
+        points: FloatArray,
         answer: Answer,
         played: list[FloatArray] | None = None,
     ) -> FloatArray:
         """Return the gaps at M, (R,); add every step, (A, 3, R), to what is `played`."""
-        scenario = self._scenario
-        begun = [self._starts(some.points, some.level) for some in starts]
-        x_m, v_mps, svo_rad = (np.concatenate(each, axis=-1) for each in zip(*begun, strict=True))
-        levels = np.repeat([some.level for some in starts], [len(some.points) for some in starts])
-        rows = np.arange(len(levels))
+        scenario, network = self._scenario, self._networks.get(level)
+        x_m, v_mps, svo_rad = self._starts(points, level)
+        rows = np.arange(len(points))
         gap_m = np.full(len(rows), np.nan)
         cars = [row for row in range(len(x_m)) if row != VUT]
         a_mps2 = np.zeros_like(x_m)
         held = np.zeros((len(cars), len(rows)))
-        labels = [some.labels for some in starts if some.labels is not None]
-        observation = Observation(
-            scenario, len(rows), np.concatenate(labels, axis=1) if labels else None
-        )
+        observation = Observation(scenario, len(rows))
         taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
         for step in range(scenario.max_steps):
             inputs = observation.see(x_m, v_mps, a_mps2[VUT])
-            if step % DECISION_STEPS == 0:
-                self._decide(held, x_m[cars], v_mps[cars], x_m[VUT], v_mps[VUT], svo_rad, levels)
+            if network is not None and step % DECISION_STEPS == 0:
+                held = self._decisions(network, x_m, v_mps, cars, svo_rad)
             a_mps2[cars] = held
             if len(cars) > 1:
                 keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
-            a_mps2[VUT] = answer(inputs)
+            a_mps2[VUT] = answer(inputs, rows)
             a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
             v_next = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
             x_before_m, x_m = x_m, x_m + v_mps * DT_S
@@ -174,7 +152,7 @@ class TwinRollout:
                 if not going.any():
                     break
                 if played is None and going.mean() < STILL:
-                    rows, levels, svo_rad = rows[going], levels[going], svo_rad[going]
+                    rows, svo_rad = rows[going], svo_rad[going]
                     x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
                     held = held[:, going]
                     observation.keep(going)
@@ -182,30 +160,24 @@ class TwinRollout:
             played.append(np.stack((x_m, v_mps, np.zeros_like(x_m)), axis=1))
         return gap_m
 
-    def _decide(
+    def _decisions(
         self,
-        held_mps2: FloatArray,
+        network: QNetwork,
         x_m: FloatArray,
         v_mps: FloatArray,
-        x_vut_m: FloatArray,
-        v_vut_mps: FloatArray,
+        cars: list[int],
         svo_rad: FloatArray,
-        levels: NDArray[np.int64],
-    ) -> None:
-        """Write what the cars of the mainline choose, (C, R), by the levels of the rows, (R,)."""
-        cars = len(x_m)
-        for level, network in self._networks.items():
-            of = np.flatnonzero(levels == level)
-            if not len(of):
-                continue
-            limited = network.limited(self._scenario)
-            seen = feature_columns(
-                x_m[:, of].ravel(),
-                v_mps[:, of].ravel(),
-                np.tile(x_vut_m[of], cars),
-                np.tile(v_vut_mps[of], cars),
-                np.tile(svo_rad[of], cars) if network.sees_svo else None,
-                scenario=limited,
-            )
-            chosen = network.values_at_once(np.array(seen).T).argmax(axis=1)
-            held_mps2[:, of] = actions_mps2(limited)[chosen].reshape(cars, -1)
+    ) -> FloatArray:
+        """Return what the cars of the mainline choose, (C, R), in states, (A, R)."""
+        limited, count = network.limited(self._scenario), len(cars)
+        features = feature_columns(
+            x_m[cars].ravel(),
+            v_mps[cars].ravel(),
+            np.tile(x_m[VUT], count),
+            np.tile(v_mps[VUT], count),
+            np.tile(svo_rad, count) if network.sees_svo else None,
+            scenario=limited,
+        )
+        chosen = network.values_at_once(np.array(features).T).argmax(axis=1)
+        held_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
+        return held_mps2

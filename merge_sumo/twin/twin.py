@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.engine.povs import Povs
-from merge_sumo.samplers.prediction_skill import Query
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.scenario import VUT
-from merge_sumo.twin.experts import GROUPS, Forest, Steps, learn
-from merge_sumo.twin.observation import HISTORY, Observation
-from merge_sumo.twin.rollout import Starts, TwinRollout
+from merge_sumo.twin.experts import GROUPS, Steps, learn
+from merge_sumo.twin.observation import HISTORY, Inputs, Observation
+from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.verdict.score import Outcome
@@ -62,8 +61,6 @@ class Twin:
         """By group, the cases that its members learn from; empty after each new outcome."""
         self._members: dict[tuple[int, int], tuple[tuple[int, ...], Any]] = {}
         """By expert and group: from which cases it has learned, and what."""
-        self._asks: tuple[list[Any], Forest] | None = None
-        """The trees of all members, and the forest of them."""
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
@@ -77,54 +74,45 @@ class Twin:
         """Return whether it has seen enough, and the POV is no program of a person's own."""
         return len(self._motions) >= FEWEST and self._rollout.can_predict(level)
 
-    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
-        """Return the gaps at M of each query; see `Predictor`.
-
-        All queries together are one rollout: each row is a case and the member that drives in it.
-        """
-        asked = [self._asked(query) for query in queries]
-        starts = []
-        for query, (members, places) in zip(queries, asked, strict=True):
-            labels = np.repeat(members, list(map(len, places)))[None].astype(np.float32)
-            starts.append(Starts(query.level, query.points[np.concatenate(places)], labels))
-        gaps_m = self._rollout.play(starts, self._forest().answer)
-        return [
-            self._answer(query, places, found)
-            for query, (_, places), found in zip(queries, asked, gaps_m, strict=True)
-        ]
-
-    def _asked(self, query: Query) -> tuple[list[int], list[NDArray[np.int64]]]:
-        """Return the numbers of the members that a query asks, and which of the points each."""
-        everywhere = np.arange(len(query.points))
-        if query.screening is not None:
-            member = query.screening * GROUPS + self._last_batch() % GROUPS
-            return [member], [everywhere]
-        members = list(range(EXPERTS * GROUPS))
-        if not query.held_out:
-            return members, [everywhere] * len(members)
-        group = np.array(query.held_out) % GROUPS
-        return members, [np.flatnonzero(group == member % GROUPS) for member in members]
-
-    def _answer(
-        self, query: Query, places: Sequence[NDArray[np.int64]], found_m: FloatArray
+    def predict(
+        self,
+        level: int,
+        points: FloatArray,
+        *,
+        screening: int | None = None,
+        held_out: Sequence[int] = (),
     ) -> FloatArray:
-        """Return the gaps that a query asks for by those of its rows."""
-        if not query.held_out:
-            groups = GROUPS if query.screening is None else 1
-            return found_m.reshape(-1, groups, len(query.points))
-        gaps_m = np.empty((EXPERTS, len(query.points)))
-        expert = np.repeat(np.arange(len(places)) // GROUPS, list(map(len, places)))
-        gaps_m[expert, np.concatenate(places)] = found_m
-        return gaps_m
+        """Return the gaps at M of cases; see `Predictor`.
 
-    def _forest(self) -> Forest:
-        """Return the trees of all members, those of an expert together."""
-        trees = [self._member(e, g) for e in range(EXPERTS) for g in range(GROUPS)]
-        if self._asks is None or any(
-            one is not other for one, other in zip(self._asks[0], trees, strict=True)
-        ):
-            self._asks = trees, Forest(trees, max(self._looked_at))
-        return self._asks[1]
+        All members together are one rollout: each row is a case and the member that drives in it.
+        """
+        n, numbers = len(points), list(range(EXPERTS * GROUPS))
+        if screening is not None:
+            numbers = [screening * GROUPS + self._last_batch() % GROUPS]
+        if held_out:
+            group = np.array(held_out) % GROUPS
+            cases = [np.flatnonzero(group == number % GROUPS) for number in numbers]
+        else:
+            cases = [np.arange(n)] * len(numbers)
+        trees = [self._member(*divmod(number, GROUPS)) for number in numbers]
+        rows_until = np.cumsum(list(map(len, cases)))
+
+        def drive(inputs: Inputs, rows: NDArray[np.int64]) -> FloatArray:
+            answers = np.empty(len(rows))
+            first = 0
+            for tree, until in zip(trees, np.searchsorted(rows, rows_until).tolist(), strict=True):
+                if until > first:
+                    answers[first:until] = tree.predict(inputs[first:until])[:, 0]
+                first = until
+            return answers
+
+        gaps = self._rollout.play(level, points[np.concatenate(cases)], drive)
+        if not held_out:
+            return gaps.reshape(-1, GROUPS if screening is None else 1, n)
+        by_expert = np.empty((EXPERTS, n))
+        expert = np.repeat(np.arange(len(cases)) // GROUPS, list(map(len, cases)))
+        by_expert[expert, np.concatenate(cases)] = gaps
+        return by_expert
 
     def _last_batch(self) -> int:
         return max(self._batch.values(), default=0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.samplers import coverage
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
+from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -41,15 +41,12 @@ class Confident:
         """Return that it can."""
         return True
 
-    def predict(self, queries: Sequence[Query]) -> list[FloatArray]:
-        """Return the gaps of each query."""
-        return [self._answer(query) for query in queries]
-
-    def _answer(self, query: Query) -> FloatArray:
-        gap = band_m(query.points) / US23.dx_crash_m
-        if query.held_out:
+    def predict(self, level, points, *, screening=None, held_out=()) -> FloatArray:
+        """Return the gaps of cases."""
+        gap = band_m(points) / US23.dx_crash_m
+        if held_out:
             return np.tile(gap, (EXPERTS, 1))
-        if query.screening is not None:
+        if screening is not None:
             return gap[None, None]
         off = np.linspace(-0.02, 0.02, EXPERTS * GROUPS).reshape(EXPERTS, GROUPS, 1)
         return gap + off

@@ -13,7 +13,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.history import bounded
-from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
+from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.twin.pair import TwinPair
@@ -70,7 +70,7 @@ def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when
     pair.tell_old(old[:80], old_motions)
     regressions = [regression(*versions) for versions in zip(outcomes, old, strict=True)]
     for predictor, ran in ((twin, outcomes), (pair, regressions)):
-        (gaps,) = predictor.predict([Query(0, points[80:])])
+        gaps = predictor.predict(0, points[80:])
         said = np.abs(np.median(gaps, axis=(0, 1))) < 1.0
         failed = np.array([outcome.failed for outcome in ran[80:]])
         assert failed.any()

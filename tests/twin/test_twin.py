@@ -18,14 +18,13 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.prediction_skill import PredictionSkill, Query
+from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.scenario.case import MergeCase, Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.records import decode, to_plain
-from merge_sumo.twin.experts import Forest, learn
 from merge_sumo.twin.observation import NOW, Observation
-from merge_sumo.twin.rollout import Starts, TwinRollout
+from merge_sumo.twin.rollout import TwinRollout
 from merge_sumo.twin.twin import Twin
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.prediction import Prediction
@@ -77,10 +76,10 @@ class TestGames:
         outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario, povs)
         games = TwinRollout(Pool(levels=(level,), scenario=scenario), povs)
 
-        def slows(inputs):
+        def slows(inputs, _rows):
             return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
 
-        found = games.play([Starts(level, points)], slows)[0]
+        found = games.play(level, points, slows)
         assert np.isfinite(found).any()
         # The POV decides in float32 here: one that has no preference may choose otherwise.
         off = np.abs(found - gaps_of(outcomes)) > 1e-6
@@ -89,8 +88,8 @@ class TestGames:
     def test_go_on_until_the_timeout_for_a_vut_that_stops(self):
         pool = Pool(levels=(0,), scenario=US23)
         found = TwinRollout(pool, POVS).play(
-            [Starts(0, np.full((3, 2), 0.5))], lambda inputs: np.full(len(inputs), -4.0)
-        )[0]
+            0, np.full((3, 2), 0.5), lambda inputs, _: np.full(len(inputs), -4.0)
+        )
         assert np.isnan(found).all()
 
     @pytest.mark.parametrize(
@@ -105,8 +104,8 @@ class TestGames:
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
         found = TwinRollout(pool, POVS, criterion, lines).play(
-            [Starts(0, points)], lambda inputs: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
-        )[0]
+            0, points, lambda inputs, _: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+        )
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
         assert (np.abs(found) < 1.0).any()
 
@@ -130,31 +129,16 @@ class TestWatching:
         assert seen[NOW + 8 : NOW + 10].tolist() == [-101.0, 10.0]
 
 
-class TestForest:
-    @pytest.mark.parametrize("count", [1, 2, 5, 8])
-    def test_answers_as_each_of_its_trees(self, count):
-        rng = np.random.default_rng(count)
-        cases = [(rng.random((30, 6)).astype(np.float32), rng.random(30)) for _ in range(2)]
-        trees = [learn(cases, 4 + 2 * (k % 2), seed=k) for k in range(count)]
-        forest = Forest(trees, 6)
-        inputs = rng.random((50, 7)).astype(np.float32)
-        for number, tree in enumerate(trees):
-            inputs[:, 6] = number
-            alone = tree.predict(inputs[:, : 4 + 2 * (number % 2)])[:, 0]
-            assert forest.answer(inputs).tolist() == alone.tolist()
-
-
 class TestTwin:
     def test_says_the_same_however_it_was_told(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
-        query = Query(0, points)
         at_once, in_parts = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
         at_once.tell(outcomes, motions)
         in_parts.tell(outcomes[30:], motions)
-        in_parts.predict([query])
+        in_parts.predict(0, points)
         in_parts.tell(outcomes[:40], motions)
-        assert (at_once.predict([query])[0] == in_parts.predict([query])[0]).all()
+        assert (at_once.predict(0, points) == in_parts.predict(0, points)).all()
 
     def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
         outcomes, motions = seen
@@ -164,7 +148,7 @@ class TestTwin:
         plain, taught = (Twin(Pool(levels=(0,), scenario=US23), POVS, 0) for _ in range(2))
         plain.tell(outcomes[:40], motions)
         taught.tell(outcomes[:40], odd)
-        same = [twin.predict([Query(0, points[8:9], held_out=[8])])[0] for twin in (plain, taught)]
+        same = [twin.predict(0, points[8:9], held_out=[8]) for twin in (plain, taught)]
         assert same[0].tolist() == same[1].tolist()
 
 

@@ -8,11 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.special import expit, logit
 
 from merge_sumo.samplers.belief import Belief
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.latent_odds import LatentOdds, chance_above, mean_chance
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import MergeCase, Pool
 from merge_sumo.scenario.scenario import US23
@@ -66,37 +64,6 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert history.variance[0] == pytest.approx(np.var([0.96, -0.4, 0.95, -0.2], ddof=1))
     assert np.isnan(history.variance[1])
     assert history.varies
-
-
-class TestTheLogOdds:
-    POINTS = np.array([[0.2, 0.2], [0.8, 0.8]])
-
-    def at(self, runs: int, failures: int, mean: float = -2.0) -> tuple[float, float]:
-        """Return mean and variance at a case with so many runs, far from one that never fails."""
-        latent = LatentOdds(
-            self.POINTS, np.array([runs, 1]), np.array([failures, 0]), np.full(2, mean)
-        )
-        odds, variance = latent.at(self.POINTS[:1], np.array([mean]))
-        return float(odds[0]), float(variance[0])
-
-    def test_follow_the_share_of_many_runs(self):
-        odds, variance = self.at(1000, 300)
-        assert expit(odds) == pytest.approx(0.3, abs=0.005)
-        # The curvature of a binomial of 1,000 runs at .3, and hardly any prior.
-        assert variance == pytest.approx(1.0 / 210.0, rel=0.05)
-
-    def test_of_one_failure_in_one_run_stay_in_doubt(self):
-        one, ten = self.at(1, 1), self.at(10, 10)
-        assert logit(0.12) < one[0] < logit(0.8) < logit(0.9) < ten[0]
-        assert 1.0 < one[1] < 8.0
-
-
-def test_the_mean_chance_is_that_of_normal_log_odds():
-    rng = np.random.default_rng(0)
-    drawn = expit(-1.0 + 1.5 * rng.standard_normal(200_000)).mean()
-    assert mean_chance(np.array([-1.0]), np.array([2.25]))[0] == pytest.approx(drawn, abs=0.005)
-    above = chance_above(np.array([logit(0.3)] * 2), np.array([1.0, 4.0]), 0.3)
-    assert above.tolist() == [0.5, 0.5]
 
 
 class TestTheBelief:
