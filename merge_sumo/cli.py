@@ -1,42 +1,437 @@
-"""The command line: the commands, and what becomes of a `UserError`."""
+"""The command line: each command parses a config, calls the verb of the API, and prints."""
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import traceback
+from collections.abc import Callable, Mapping, Sequence
+from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
-import typer
+from cyclopts import App, CycloptsError, Group, Parameter, Token
 
-from merge_sumo.commands import campaigns, inputs, studies
-from merge_sumo.commands.application import app
-from merge_sumo.commands.printing import say
+from merge_sumo import config as c
+from merge_sumo.console import (
+    flag_of,
+    notices_printed,
+    print_json,
+    print_result,
+    say,
+    show,
+    stoppable,
+)
 from merge_sumo.errors import UserError
+from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.limits import check_limits, exhausted
-from merge_sumo.system.printable import printable
+from merge_sumo.system.printable import quoted
 from merge_sumo.system.streams import prepare_streams
 
-__all__ = ["app", "campaigns", "inputs", "main", "studies"]
+if TYPE_CHECKING:
+    from cyclopts import ArgumentCollection
 
+    from merge_sumo.api import CaseRun
+
+T = TypeVar("T")
+
+OPTIONS: Final = Group.create_ordered("Options")
+TESTED: Final = Group.create_ordered("What is tested")
+FAILURE: Final = Group.create_ordered("What counts as a failure")
+CASES: Final = Group.create_ordered("Which cases run")
+PLACE: Final = Group.create_ordered("Where it runs")
+DRIVERS: Final = Group.create_ordered("Drivers and limits")
+GROUPS: Final[Mapping[type[Any], Group]] = {
+    c.Test: TESTED,
+    c.ScenarioChanges: TESTED,
+    c.Levels: TESTED,
+    c.Recorded: TESTED,
+    c.FailureRule: FAILURE,
+    c.Search: CASES,
+    c.Execution: PLACE,
+    c.Drivers: DRIVERS,
+    c.Limits: DRIVERS,
+    c.Policies: DRIVERS,
+}
+"""Groups of options in help, by the class that declares the field."""
+FIELDS: Final[Mapping[str, Parameter]] = {
+    "progress": Parameter(negative=("--quiet", "-q")),
+    "workers": Parameter(show_default=False),
+}
+"""What else an option is, by the name of its field."""
+SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
+    Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
+)
+GONE: Final[Mapping[str, str]] = {
+    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
+    "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
+    "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
+    "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
+    "stress": "`merge-sumo rerun RUN --stress` does it",
+    "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
+    "bounds how much of the pool can fail",
+}
+"""What replaces a command of an earlier version, by its name."""
 FAULT: Final = 70
 """Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
 
-
-@app.callback(invoke_without_command=True)
-def _version(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
-) -> None:
-    if version:
-        from importlib.metadata import version as version_of
-
-        typer.echo(f"merge-sumo {version_of('merge-sumo')}")
-        raise typer.Exit
+Options = Annotated[T, Parameter(name="*")]
+Json = Annotated[
+    bool, Parameter(group=PLACE, help="Print the result as one JSON object on standard output.")
+]
 
 
-def _check_here() -> None:
+class Commands(App):
+    """An application whose commands take the fields of a dataclass as arguments and options."""
+
+    def assemble_argument_collection(self, **how: Any) -> ArgumentCollection:
+        """Return the arguments of a command, in groups."""
+        arguments = super().assemble_argument_collection(**how)
+        index = 0
+        for argument in arguments:
+            name = argument.field_info.name
+            # A dataclass lists inherited keywords before its own arguments, which hides these.
+            if argument.keys and argument.field_info.is_positional:
+                argument.index = index
+                index += 1
+                continue
+            default = argument.field_info.default
+            shown = type(default) in (int, float) or (isinstance(default, str) and default != "")
+            more = Parameter.combine(Parameter(show_default=shown), FIELDS.get(name))
+            for kind, group in GROUPS.items():
+                if argument.keys and name in kind.__annotations__:
+                    more = Parameter.combine(more, Parameter(group=group))
+            argument.parameter = Parameter.combine(argument.parameter, more)
+        return arguments
+
+
+def use_all_cores(_app: App, _commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
+    """Let a command have a worker a core; in Python a script without a guard would start again."""
+    for argument in arguments:
+        if argument.field_info.name == "workers" and not argument.has_tokens:
+            argument.append(Token(keyword="--workers", value="auto"))
+
+
+app = Commands(
+    name="merge-sumo",
+    help="""Find where a merging controller fails against drivers who react to it.
+
+    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
+    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; a case fails
+    where both reach the merge point within 6 m, or by a rule of your own, and failure mode
+    coverage (FMC) says how much of the failing region was found.
+
+    Start with:  merge-sumo campaign --vut design2
+    """,
+    version=lambda: f"merge-sumo {version('merge-sumo')}",
+    version_flags="--version",
+    group_parameters=OPTIONS,
+    default_parameter=Parameter(
+        negative=(),
+        name_transform=lambda name: flag_of(name).removeprefix("--"),
+    ),
+    config=use_all_cores,
+    result_action="return_value",
+    exit_on_error=False,
+    print_error=False,
+    suppress_keyboard_interrupt=False,
+)
+scenario = Commands(name="scenario", help="The road and the numbers of a merge.", group=OWN)
+app.command(scenario)
+app.register_install_completion_command()
+
+
+def command(
+    kind: type[Any], group: Group | None = None, name: str | None = None, of: App = app
+) -> Callable[[Callable[..., int]], Callable[..., int]]:
+    """Return a decorator that registers a command, whose help is the docstring of its config.
+
+    Args:
+        kind: the config of the command.
+        group: where the list of commands shows it.
+        name: its name, by default that of the function.
+        of: the application that has it.
+    """
+
+    def register(function: Callable[..., int]) -> Callable[..., int]:
+        return of.command(function, name, group=group, help=inspect.cleandoc(kind.__doc__ or ""))
+
+    return register
+
+
+@command(c.CampaignOptions, SEARCH)
+def campaign(
+    vut: Annotated[
+        str,
+        Parameter(
+            group=TESTED,
+            help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
+            "`merge-sumo vuts` lists the kinds.",
+        ),
+    ] = "",
+    config: Options[c.CampaignOptions] = c.CampaignOptions(),
+    *,
+    resume: Annotated[
+        Path | None,
+        Parameter(help="Go on with the campaign in this folder; --cases may be more."),
+    ] = None,
+    out: Annotated[
+        Path | None, Parameter(help="New folder to write; runs/VUT-DATE by default.")
+    ] = None,
+    json: Json = False,
+) -> int:
+    from merge_sumo import api
+
+    if resume is not None and out is not None:
+        raise UserError("--resume names the folder: leave --out away")
+    folder = resume or out or dated(vut)
+
+    def how_to_go_on() -> str | None:
+        return _how_to_go_on(folder, config) if folder.exists() else None
+
+    with stoppable(how_to_go_on) as check:
+        if resume is None:
+            run = api.campaign(vut, **vars(config), out=folder, check=check)
+        else:
+            run = api.resume(folder, **vars(config), vut=vut or None, check=check)
+    print_result(run, json)
+    for remark in run.remarks():
+        say(remark)
+    return 0 if run.passed else 1
+
+
+def _how_to_go_on(folder: Path, config: c.CampaignOptions) -> str:
+    """Return the command that goes on, with the options that are no setting of the campaign."""
+    from merge_sumo import api
+
+    words = [api.open_run(folder).go_on]
+    words += [f"--gate {quoted(gate)}" for gate in config.gates]
+    if config.junit is not None:
+        words.append(f"--junit {quoted(config.junit)}")
+    if isinstance(config.workers, str):
+        words.append(f"--workers {quoted(config.workers)}")
+    return f"go on with: {' '.join(words)}"
+
+
+@command(c.CaseOptions, SEARCH)
+def run(
+    vut: Annotated[
+        str | None, Parameter(group=TESTED, help="Vehicle under test, as of a campaign.")
+    ] = None,
+    config: Options[c.CaseOptions] = c.CaseOptions(),
+    *,
+    at: Annotated[
+        list[str] | None,
+        Parameter(help="Any coordinate of the case, by its name in outcomes.jsonl: NAME=NUMBER."),
+    ] = None,
+    json: Json = False,
+) -> int:
+    from merge_sumo import api
+
+    def ended(result: CaseRun) -> None:
+        print_result(result, json, **({"out": config.out} if json else {}))
+        if config.out is not None and not json:
+            show(f"kept: merge-sumo replay {quoted(config.out)} --gui")
+        if config.gui and not json:
+            say("the replay is open in sumo-gui: close the window to end")
+
+    result = api.run(vut, **vars(config), at=_coordinates(at or []), on_end=ended)
+    return 0 if result.passed else 1
+
+
+def _coordinates(words: Sequence[str]) -> dict[str, float]:
+    """Return coordinates that are written NAME=NUMBER."""
+    values: dict[str, float] = {}
+    for text in words:
+        name, _, number = text.partition("=")
+        try:
+            values[name.strip()] = float(number)
+        except ValueError:
+            raise UserError(f"--at {text}: give NAME=NUMBER, as x_pov0_m=-250") from None
+    return values
+
+
+@command(c.Probability, SEARCH)
+def probability(config: Options[c.Probability], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    file = config.out or Path(str(config.run)) / "probability.json"
+    print_result(api.probability(**vars(config)), json, file=file)
+    return 0
+
+
+@command(c.Report, LOOK)
+def report(config: Options[c.Report], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    run = api.open_run(str(config.run))
+    print_result(api.report(run), json)
+    if sentence := run.run.interruption:
+        say(sentence)
+    return 0
+
+
+@command(c.Explain, LOOK)
+def explain(config: Options[c.Explain], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.explain(**vars(config)), json)
+    return 0
+
+
+@command(c.ReplayCase, LOOK)
+def replay(
+    config: Options[c.ReplayCase],
+    *,
+    gui: Annotated[bool, Parameter(help="Open it in sumo-gui.")] = False,
+    json: Json = False,
+) -> int:
+    from merge_sumo import api
+
+    if gui:
+        return api.open_in_gui(**vars(config))
+    result = api.replay(**vars(config))
+    print_result(result, json)
+    return 0 if result.identical else 1
+
+
+@command(c.Export, LOOK)
+def export(config: Options[c.Export], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    paths = api.export(**vars(config))
+    if json:
+        print_json({"written": list(map(str, paths))})
+        return 0
+    for path in paths:
+        show(path)
+    return 0
+
+
+@command(c.Rerun, CHANGE)
+def rerun(
+    config: Options[c.Rerun],
+    *,
+    stress: Annotated[
+        bool,
+        Parameter(
+            group=CASES,
+            help="Change the simulation and not the VUT: a shorter step, an actuator that lags, "
+            "limited power, a start that is off by the error of a sensor, longer cars. Failures "
+            "that fail every time are robust.",
+        ),
+    ] = False,
+    json: Json = False,
+) -> int:
+    from merge_sumo import api
+
+    if not stress:
+        result = api.rerun(**vars(config))
+        page = {"page" if result.text is None else "cases": config.out}
+        print_result(result, json, **page)
+        return 1 if result.worse else 0
+    options = c.values_of(config, c.Recorded)
+    if c.changed(config, c.Rerun).keys() - options.keys() - {"run"}:
+        raise UserError("--stress runs all cases: leave indices, --level, --out and --junit away")
+    print_result(api.stress(config.run, **options), json)
+    return 0
+
+
+@command(c.Compare, CHANGE)
+def compare(config: Options[c.Compare], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    result = api.compare(**vars(config))
+    print_result(result, json, page=config.out)
+    return 1 if result.worse else 0
+
+
+@command(c.Repair, CHANGE)
+def repair(config: Options[c.Repair], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    result = api.repair(**vars(config))
+    print_result(result, json, page=result.folder / "repair.html")
+    return 0 if result.verified else 1
+
+
+@command(c.Vuts, OWN)
+def vuts(config: Options[c.Vuts] = c.Vuts(), *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.vuts(**vars(config)), json)
+    return 0
+
+
+@command(c.CheckVut, OWN, "check-vut")
+def check_vut(config: Options[c.CheckVut], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    result = api.check_vut(**vars(config))
+    print_result(result, json)
+    return 0 if result.ok else 1
+
+
+@command(c.Scenarios, name="list", of=scenario)
+def list_scenarios(*, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.scenarios(), json)
+    return 0
+
+
+@command(c.NewScenario, name="new", of=scenario)
+def new_scenario(config: Options[c.NewScenario], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.new_scenario(**vars(config)), json)
+    return 0
+
+
+@command(c.CheckScenario, name="check", of=scenario)
+def check_scenario(config: Options[c.CheckScenario], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.check_scenario(**vars(config)), json)
+    return 0
+
+
+@command(c.Train, OWN)
+def train(config: Options[c.Train] = c.Train(), *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.train(**vars(config)), json)
+    return 0
+
+
+@command(c.GroundTruth, RESEARCH)
+def truth(config: Options[c.GroundTruth], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.truth(**vars(config)), json)
+    return 0
+
+
+@command(c.Benchmark, RESEARCH)
+def benchmark(config: Options[c.Benchmark], *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.benchmark(**vars(config)), json)
+    return 0
+
+
+@command(c.Reproduce, RESEARCH)
+def reproduce(config: Options[c.Reproduce] = c.Reproduce(), *, json: Json = False) -> int:
+    from merge_sumo import api
+
+    print_result(api.reproduce(**vars(config)), json)
+    return 0
+
+
+def _check_working_folder() -> None:
     """Raise `UserError` where the working folder is gone: relative paths mean nothing then."""
     try:
         Path.cwd()
@@ -44,6 +439,21 @@ def _check_here() -> None:
         raise UserError(
             f"the working folder cannot be read ({error.strerror}): change to another one"
         ) from error
+
+
+def execute(words: Sequence[str]) -> int:
+    """Run a command and return its exit code.
+
+    Raises:
+        UserError: for bad use.
+    """
+    if words and words[0] in GONE:
+        raise UserError(f"the command {words[0]} is gone: {GONE[words[0]]}")
+    try:
+        with notices_printed():
+            return app(words) or 0
+    except CycloptsError as error:
+        raise UserError(str(error)) from error
 
 
 def main() -> None:
@@ -59,20 +469,23 @@ def main() -> None:
     try:
         # From here on, so that no signal finds a temporary folder that nobody removes.
         with stopping_in_order():
-            _check_here()
+            _check_working_folder()
             check_limits()
-            app()
+            sys.exit(execute(sys.argv[1:]))
     except UserError as error:
         say(f"merge-sumo: {error}")
         sys.exit(2)
     except Stopped as stopped:
         sys.exit(stopped.exit_code)
+    except KeyboardInterrupt:
+        say("stopped")
+        sys.exit(130)
     except Exception as error:
         if (sentence := exhausted(error)) is not None:
             say(f"merge-sumo: {sentence}")
             sys.exit(2)
         for line in traceback.format_exc().splitlines():
-            typer.echo(printable(line), err=True)
+            say(line)
         say("merge-sumo: this is a fault of merge-sumo and no result: report it with these lines")
         sys.exit(FAULT)
 

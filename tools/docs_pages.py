@@ -25,31 +25,10 @@ SHOWN = (
 PICTURES = "scenarios/**/*.png"
 
 
-def cli_page() -> str:
-    """Return the help of all commands."""
-    import typer
-    from typer.cli import get_docs_for_click
+EXIT_CODES: Final = """# Commands
 
-    from merge_sumo import cli
+This is `merge-sumo COMMAND --help` of all commands.
 
-    command = typer.main.get_command(cli.app)
-    _keep_summaries_whole(command)
-    text = get_docs_for_click(obj=command, ctx=typer.Context(command), name="merge-sumo")
-    # An example is on a line of its own in --help, and is a block here.
-    text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
-    head = "# Commands\n\nThis is `merge-sumo COMMAND --help` of all commands.\n"
-    head += EXIT_CODES + _options_table(command)
-    return text.replace("# `merge-sumo`\n", head, 1)
-
-
-def _keep_summaries_whole(command: Any) -> None:
-    """Set the summaries of commands in a list of them, which click would cut at 45 characters."""
-    for below in getattr(command, "commands", {}).values():
-        below.short_help = below.help.partition("\n\n")[0]
-        _keep_summaries_whole(below)
-
-
-EXIT_CODES = """
 | exit code | meaning |
 |---|---|
 | 0 | finished |
@@ -57,37 +36,21 @@ EXIT_CODES = """
 | 2 | wrong usage, or a limit of the system (disk, memory, processes), with one sentence |
 | 70 | a fault of merge-sumo itself, with a traceback: no result |
 | 130, 141, 143 | stopped by Ctrl-C, by a closed pipe, by SIGTERM |
-"""
-
-
-SHARED = (
-    *("level", "scenario", "policies", "pov", "fail_when", "deadline", "workers"),
-    *("out", "json", "quiet"),
-)
-"""Options that several commands have, as columns of a table."""
-
-
-def _options_table(application: Any) -> str:
-    """Return which command has which of the options that several have."""
-    rows, waiting = [], [("", application)]
-    while waiting:
-        name, command = waiting.pop(0)
-        below = getattr(command, "commands", {})
-        waiting += [(f"{name} {part}".strip(), one) for part, one in below.items()]
-        if not below:
-            has = {option.lstrip("-") for p in command.params for option in p.opts}
-            marks = ["x" if name.replace("_", "-") in has else "" for name in SHARED]
-            rows.append(f"| `{name}` | {' | '.join(marks)} |")
-    titles = " | ".join(f"`--{name.replace('_', '-')}`" for name in SHARED)
-    rule = "|---" * (len(SHARED) + 1) + "|"
-    about = "\nOptions that several commands have; defaults may differ between commands:\n\n"
-    return f"{about}| command | {titles} |\n{rule}\n" + "\n".join(rows) + COMPLETION
-
-
-COMPLETION = """
 
 `merge-sumo --install-completion` teaches your shell to complete commands and options.
 """
+
+
+def cli_page() -> str:
+    """Return the help of all commands."""
+    from merge_sumo import cli
+
+    text = cli.app.generate_docs().replace("# merge-sumo\n", EXIT_CODES, 1)
+    text = re.sub(r"## Table of Contents\n.*?\n(?=\*\*)", "", text, flags=re.DOTALL)
+    # An example is on a line of its own in --help, and is a block here.
+    text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
+    text = re.sub(r"(, --no-[\w-]+)+", "", text)  # it shows opposites that there are not
+    return re.sub(r"\n {8,}", " ", text)
 
 
 def measures_page() -> str:

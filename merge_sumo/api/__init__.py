@@ -21,20 +21,21 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from merge_sumo import options, verbs
-from merge_sumo.api.asked import (
+from merge_sumo import config as c
+from merge_sumo.api.campaigns import notice_povs, run_and_report
+from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
+from merge_sumo.api.settings import (
+    case_in,
+    current,
     opened,
     opened_study,
     opened_truths,
+    overrides,
     path_of,
+    recorded_case,
     scenario_of,
     settings_for,
-    stated_again,
-    today,
 )
-from merge_sumo.api.campaigns import concluded, notice_povs
-from merge_sumo.api.cases import given_case, recorded_case
-from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import run_one
@@ -46,7 +47,6 @@ from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError, notice
-from merge_sumo.options import AnyPath, AnyRun
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.export_format import EXPORTS
@@ -106,7 +106,7 @@ from merge_sumo.vuts.python import SeenBatch
 if TYPE_CHECKING:
     from merge_sumo.training.library import PolicyChecks
 
-__all__ = ["AnyRun", "AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch"]
+__all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch"]
 __all__ += ["benchmark", "campaign", "check_scenario", "check_vut", "compare", "dated", "explain"]
 __all__ += ["export", "new_scenario", "open_in_gui", "open_run", "probability", "repair", "replay"]
 __all__ += ["report", "reproduce", "rerun", "resume", "run", "scenarios", "stress", "train"]
@@ -115,34 +115,32 @@ __all__ += ["truth", "vuts"]
 # Campaigns
 
 
-@verb(verbs.Campaign)
-def campaign(asked: verbs.Campaign) -> CampaignRun:
+@verb(c.Campaign)
+def campaign(config: c.Campaign) -> CampaignRun:
     """Test a VUT and return the campaign, also one without failures."""
-    settings, where = settings_for(asked)
-    folder = dated(settings.vut) if asked.out is None else Path(asked.out)
+    settings, where = settings_for(config)
+    folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = resolve(settings)
-    notice_povs(settings, plan, asked)
-    return concluded(settings, plan, folder, where, asked)
+    notice_povs(settings, plan, config)
+    return run_and_report(settings, plan, folder, where, config)
 
 
-@verb(verbs.Resume)
-def resume(asked: verbs.Resume) -> CampaignRun:
+@verb(c.Resume)
+def resume(config: c.Resume) -> CampaignRun:
     """Go on with a campaign that was stopped."""
-    folder = folder_of(asked.run)
+    folder = folder_of(config.run)
     recorded = read_settings(folder)
-    fields, where = stated_again(
-        asked, asked.vut, {name: recorded.get(name) for name in ("vut", "pov")}
-    )
-    settings = settings_of(folder, recorded, fields, goes_on=True)
-    if "level" in asked.given:
+    new = overrides(config, vut=recorded.get("vut") or "", pov=recorded.get("pov"))
+    settings = settings_of(folder, recorded, new.fields, goes_on=True)
+    if config.level != "all":
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
-        levels = parse_levels(asked.level, policies, settings.scenario.levels, own=own)
+        levels = parse_levels(config.level, policies, settings.scenario.levels, own=own)
         settings = replace(settings, levels=levels)
-    return concluded(settings, resolve(settings), folder, where, asked, goes_on=True)
+    return run_and_report(settings, resolve(settings), folder, new.where, config, goes_on=True)
 
 
-def open_run(folder: AnyPath) -> CampaignRun:
+def open_run(folder: c.AnyPath) -> CampaignRun:
     """Open the folder of a campaign; `UserError` when it is none."""
     return CampaignRun(folder)
 
@@ -150,60 +148,58 @@ def open_run(folder: AnyPath) -> CampaignRun:
 # Cases
 
 
-@verb(verbs.RunCase)
-def run(asked: verbs.RunCase) -> CaseRun:
+@verb(c.RunCase)
+def run(config: c.RunCase) -> CaseRun:
     """Run one case and return it."""
-    check_from(asked.from_s)
-    settings, case = given_case(asked) if asked.recorded is None else recorded_case(asked)
-    if asked.out is not None:
-        check_new(Path(asked.out))
+    check_from(config.from_s)
+    settings, case = case_in(config) if config.recorded is None else recorded_case(config)
+    if config.out is not None:
+        check_new(Path(config.out))
     for sentence in outside_of_the_pool(case):
         notice(sentence)
-    plan = resolve(settings, debug=asked.debug)
-    if asked.recorded is not None:
-        notice_changes(recorded(asked.recorded[0]), plan)
-    if asked.gui:
+    plan = resolve(settings, debug=config.debug)
+    if config.recorded is not None:
+        notice_changes(recorded(config.recorded[0]), plan)
+    if config.gui:
         check_display()
     episode = run_one(plan, case)
-    result = CaseRun(episode, asked.from_s)
+    result = CaseRun(episode, config.from_s)
     with ExitStack() as opened:
-        folder = path_of(asked.out)
-        if folder is None and asked.gui:
+        folder = path_of(config.out)
+        if folder is None and config.gui:
             folder = opened.enter_context(scratch_folder()) / "case"
         if folder is not None:
             write_scenario(folder, plan.road, episode.outcome, episode.trajectory)
-        if asked.on_end is not None:
-            asked.on_end(result)
-        if folder is not None and asked.gui:
-            replayer.open_gui(folder, asked.from_s)
+        if config.on_end is not None:
+            config.on_end(result)
+        if folder is not None and config.gui:
+            replayer.open_gui(folder, config.from_s)
     return result
 
 
-@verb(verbs.Rerun)
-def rerun(asked: verbs.Rerun) -> Comparison:
+@verb(c.Rerun)
+def rerun(config: c.Rerun) -> Comparison:
     """Run recorded cases again with a changed VUT."""
-    before = recorded(asked.run)
-    indices = (asked.indices,) if isinstance(asked.indices, int) else tuple(asked.indices)
-    chosen = rerunning.chosen(before, indices, asked.level)
-    out, junit = _new_files(asked, SUFFIX if isinstance(before, CasesFile) else PAGE)
+    before = recorded(config.run)
+    indices = (config.indices,) if isinstance(config.indices, int) else tuple(config.indices)
+    chosen = rerunning.chosen(before, indices, config.level)
+    out, junit = _new_files(config, SUFFIX if isinstance(before, CasesFile) else PAGE)
     some = len(chosen) < len(before.outcomes)
     if isinstance(before, CasesFile) and out is not None and some:
         raise UserError("`out` of a cases file has all cases: name none of them, and no level")
-    with opened_study(before, asked, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
+    with opened_study(before, config, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
     if isinstance(before, CasesFile):
         compared = before.compared(compared, out or before.folder)
     return _written(compared, out, junit)
 
 
-def _new_files(
-    asked: verbs.Rerun | verbs.Compare, ending: str = PAGE
-) -> tuple[Path | None, Path | None]:
+def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | None, Path | None]:
     """Return the new files of a comparison, whose `out` has an ending.
 
     Raises `UserError` where one cannot be.
     """
-    out, junit = path_of(asked.out), path_of(asked.junit)
+    out, junit = path_of(config.out), path_of(config.junit)
     if out is not None:
         check_new_file(out, endings=(ending,))
     if junit is not None:
@@ -212,7 +208,7 @@ def _new_files(
 
 
 def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
-    """Write the page, or the cases file of now, and JUnit, where they are asked for."""
+    """Write the page, or the cases file of now, and JUnit, where they are config for."""
     text = compared.text
     if out is not None and text is not None:
         check_toml_size(text.encode(errors="backslashreplace"), out)
@@ -225,32 +221,32 @@ def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comp
     return replace(compared, page_command="")
 
 
-@verb(verbs.Export)
-def export(asked: verbs.Export) -> list[Path]:
+@verb(c.Export)
+def export(config: c.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
-    loaded, export_format = campaign_of(asked.run).run, FORMATS[asked.file_format]
-    given = asked.indices
-    wanted = [given] if isinstance(given, int) else list(given or ())
-    if asked.out is None:
+    loaded, export_format = campaign_of(config.run).run, FORMATS[config.file_format]
+    indices = config.indices
+    wanted = [indices] if isinstance(indices, int) else list(indices or ())
+    if config.out is None:
         below = dict.fromkeys((SCENARIOS, EXPORTS, export_format.below))
         check_own(*(loaded.folder / name for name in below))
-    target = loaded.folder / export_format.below if asked.out is None else Path(asked.out)
+    target = loaded.folder / export_format.below if config.out is None else Path(config.out)
     if export_format.write_table is not None:
         return [export_format.write_table(loaded, wanted, target)]
     if not wanted or export_format.write_case is None:
-        raise UserError(f"`file_format` {asked.file_format} needs the indices of cases")
+        raise UserError(f"`file_format` {config.file_format} needs the indices of cases")
     road = road_for(loaded.scenario)
     return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
 
 
-def report(run: AnyRun) -> Shown:
+def report(run: c.AnyRun) -> Shown:
     """Write the report of a campaign again, and return its facts; as `merge-sumo report`."""
     opened_run = campaign_of(run)
     path = str(opened_run.report())
     return Shown({"report": path, "facts": to_plain(opened_run.facts)}, [path])
 
 
-def replay(folder: AnyRun, index: int | None = None, *, from_s: float | None = None) -> Replay:
+def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> Replay:
     """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
 
     Args:
@@ -264,7 +260,7 @@ def replay(folder: AnyRun, index: int | None = None, *, from_s: float | None = N
     return replayer.replay(_scenario_folder(folder, index), from_s)
 
 
-def open_in_gui(folder: AnyRun, index: int | None = None, *, from_s: float | None = None) -> int:
+def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> int:
     """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
 
     The arguments are those of `replay`. Raises `UserError` without a display.
@@ -273,7 +269,7 @@ def open_in_gui(folder: AnyRun, index: int | None = None, *, from_s: float | Non
     return replayer.open_gui(_scenario_folder(folder, index), from_s)
 
 
-def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
+def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
     """Return the replay folder of a case, written where it does not exist yet."""
     path = folder_of(folder)
     if not (path / SETTINGS).is_file():
@@ -293,77 +289,77 @@ def _scenario_folder(folder: AnyRun, index: int | None) -> Path:
 # Studies
 
 
-@verb(verbs.Compare)
-def compare(asked: verbs.Compare) -> Comparison:
+@verb(c.Compare)
+def compare(config: c.Compare) -> Comparison:
     """Compare recorded campaigns: what broke, and what was fixed."""
-    if isinstance(asked.runs, str | Path | CampaignRun):
+    if isinstance(config.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
-    out, junit = _new_files(asked)
-    versions = [campaign_of(run).run for run in asked.runs]
+    out, junit = _new_files(config)
+    versions = [campaign_of(run).run for run in config.runs]
     return _written(comparison.compare(versions), out, junit)
 
 
-@verb(verbs.GroundTruth)
-def truth(asked: verbs.GroundTruth) -> TruthResult:
+@verb(c.GroundTruth)
+def truth(config: c.GroundTruth) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases."""
-    settings, where = settings_for(asked)
-    with opened_truths(settings, where, asked.engine) as study:
-        return study.truths(settings, asked)
+    settings, where = settings_for(config)
+    with opened_truths(settings, where, config.engine) as study:
+        return study.truths(settings, config)
 
 
-@verb(verbs.Benchmark)
-def benchmark(asked: verbs.Benchmark) -> SamplerStudy:
+@verb(c.Benchmark)
+def benchmark(config: c.Benchmark) -> SamplerStudy:
     """Compare samplers with each other and with the ground truth."""
-    picture = path_of(asked.figure)
+    picture = path_of(config.figure)
     if picture is not None:
         figures.check_figure(picture)
-    names = sampler_study.names_of(asked)
-    settings, where = settings_for(asked, sampler=names[0], cases=asked.cases, batch=asked.batch)
+    names = sampler_study.names_of(config)
+    settings, where = settings_for(config, sampler=names[0], cases=config.cases, batch=config.batch)
     for name in names[1:]:
         replace(settings, sampler=name)
     with opened_truths(settings, where) as study:
-        result = study.compare(settings.levels, names, asked)
+        result = study.compare(settings.levels, names, config)
     if picture is None:
         return result
-    title = f"{sampler_study.title(settings.vut, settings.levels)}, {asked.seeds} seeds"
+    title = f"{sampler_study.title(settings.vut, settings.levels)}, {config.seeds} seeds"
     figures.save(figures.coverage_curves(title, result), picture)
     return replace(result, figure=picture)
 
 
-@verb(verbs.Probability)
-def probability(asked: verbs.Probability) -> ProbabilityResult:
+@verb(c.Probability)
+def probability(config: c.Probability) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail."""
-    before = campaign_of(asked.run).run
-    target = path_of(asked.out) or before.folder / PROBABILITY.name
-    total = estimates.DEFAULT_CASES if asked.cases is None else asked.cases
-    with opened_study(before, asked, "fresh cases", total, engine=asked.engine) as study:
-        return estimates.failure_probability(study, asked, target)
+    before = campaign_of(config.run).run
+    target = path_of(config.out) or before.folder / PROBABILITY.name
+    total = estimates.DEFAULT_CASES if config.cases is None else config.cases
+    with opened_study(before, config, "fresh cases", total, engine=config.engine) as study:
+        return estimates.failure_probability(study, config, target)
 
 
-@verb(verbs.Stress)
-def stress(asked: verbs.Stress) -> StressResult:
+@verb(c.Stress)
+def stress(config: c.Stress) -> StressResult:
     """Run the cases of a campaign again, each time a little otherwise."""
-    before = campaign_of(asked.run).run
+    before = campaign_of(config.run).run
     STRESS.check(before.folder)
     cases = ladder.RUNS * sum(outcome.is_tested for outcome in before.outcomes)
-    with opened_study(before, asked, "cases again", cases) as study:
+    with opened_study(before, config, "cases again", cases) as study:
         return ladder.stress(study)
 
 
-@verb(verbs.Repair)
-def repair(asked: verbs.Repair) -> RepairResult:
+@verb(c.Repair)
+def repair(config: c.Repair) -> RepairResult:
     """Search for values of a controller's parameters that repair it."""
-    mending.ranges_of(asked)
-    before = campaign_of(asked.run).run
-    folder = path_of(asked.out) or dated(f"repair-{before.folder.name}")
+    mending.ranges_of(config)
+    before = campaign_of(config.run).run
+    folder = path_of(config.out) or dated(f"repair-{before.folder.name}")
     check_new(folder)
-    settings, plan, where = today(before, asked)
+    settings, plan, where = current(before, config)
     study = RunStudy(before, settings, plan.with_engine(None))
     study.check_same_system()
     with opened(where, plan) as workers, Bars(shown=where.progress) as bars:
 
         def fresh(spec: str, number: int) -> Run:
-            of_round = mending.fresh_settings(settings, before, asked, spec, number)
+            of_round = mending.fresh_settings(settings, before, config, spec, number)
             to, total, number_of = (
                 folder / mending.CAMPAIGN.format(number),
                 of_round.cases,
@@ -373,35 +369,35 @@ def repair(asked: verbs.Repair) -> RepairResult:
             def on_case(_: object) -> None:
                 bars.counted(f"fresh campaign {number}", next(number_of), total, "cases")
 
-            of_plan, listening = resolve(of_round), verbs.SearchOfTest(on_case=on_case)
+            of_plan, listening = resolve(of_round), c.CampaignCalls(on_case=on_case)
             quietly = replace(where, progress=False)
-            return concluded(of_round, of_plan, to, quietly, listening, workers=workers).run
+            return run_and_report(of_round, of_plan, to, quietly, listening, workers=workers).run
 
         study = replace(study, workers=workers)
-        found = mending.repair(study, asked, folder, fresh, bars.counted)
+        found = mending.repair(study, config, folder, fresh, bars.counted)
     write_repair(found, before)
     return found
 
 
-@verb(verbs.Explain)
-def explain(asked: verbs.Explain) -> ExplanationResult:
+@verb(c.Explain)
+def explain(config: c.Explain) -> ExplanationResult:
     """Find the smallest changes with which a failure passes."""
-    before = campaign_of(asked.run).run
+    before = campaign_of(config.run).run
     EXPLANATIONS.check(before.folder)
-    explanation.failure_of(before, asked.case)
-    ranges = tuple(map(Range.parsed, asked.params))
-    with opened_study(before, asked, "explained", 1, "failures") as study:
-        return explanation.explain(study, asked.case, ranges)
+    explanation.failure_of(before, config.case)
+    ranges = tuple(map(Range.parsed, config.params))
+    with opened_study(before, config, "explained", 1, "failures") as study:
+        return explanation.explain(study, config.case, ranges)
 
 
-@verb(verbs.Reproduce)
-def reproduce(asked: verbs.Reproduce) -> Reproduction:
+@verb(c.Reproduce)
+def reproduce(config: c.Reproduce) -> Reproduction:
     """Reproduce Table II and the figures of the paper."""
-    scale = reproduction.scale_of(asked)
-    policies, folder = policies_folder(asked.policies, US23), path_of(asked.out)
+    scale = reproduction.scale_of(config)
+    policies, folder = policies_folder(config.policies, US23), path_of(config.out)
     figures.require_matplotlib()
     folder = folder or dated("reproduce")
-    with evaluation_workers(asked.workers) as workers, Bars(shown=asked.progress) as bars:
+    with evaluation_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
         make_folder(folder)
         result = reproduction.reproduce(
             scale, policies=policies, workers=workers, on_part=bars.counted
@@ -412,20 +408,19 @@ def reproduce(asked: verbs.Reproduce) -> Reproduction:
 # What a person brings: VUTs, scenarios, learned drivers
 
 
-@verb(verbs.Vuts)
-def vuts(asked: verbs.Vuts) -> Shown:
+@verb(c.Vuts)
+def vuts(config: c.Vuts) -> Shown:
     """Return the VUTs that can be tested, and the kinds that a person can bring."""
-    return vut_check.known_vuts(asked.policies)
+    return vut_check.known_vuts(config.policies)
 
 
-@verb(verbs.CheckVut)
-def check_vut(asked: verbs.CheckVut) -> VutCheck:
+@verb(c.CheckVut)
+def check_vut(config: c.CheckVut) -> VutCheck:
     """Let a VUT drive a few cases and say what is wrong with it."""
-    spec, _, _ = drivers_of(asked.vut, None, 1)
-    scenario = US23 if asked.scenario is None else scenario_of(asked.scenario)
-    policies = None if asked.policies is None else str(asked.policies)
-    fields = {"vut": spec, "levels": (0,), "policies": policies, **asked.values(options.Limits)}
-    plan = resolve(CampaignSettings(scenario=scenario, **fields))
+    spec, _, _ = drivers_of(config.vut, None, 1)
+    policies = None if config.policies is None else str(config.policies)
+    fields = {"vut": spec, "levels": (0,), "policies": policies, **c.changed(config, c.Limits)}
+    plan = resolve(CampaignSettings(scenario=scenario_of(config.scenario), **fields))
     with Bars() as bars:
         bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
         return vut_check.check_vut(plan)
@@ -436,23 +431,23 @@ def scenarios() -> Shown:
     return own_scenario.shipped()
 
 
-@verb(verbs.NewScenario)
-def new_scenario(asked: verbs.NewScenario) -> Shown:
+@verb(c.NewScenario)
+def new_scenario(config: c.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road."""
-    return own_scenario.write_scenario(asked)
+    return own_scenario.write_scenario(config)
 
 
-@verb(verbs.CheckScenario)
-def check_scenario(asked: verbs.CheckScenario) -> Shown:
+@verb(c.CheckScenario)
+def check_scenario(config: c.CheckScenario) -> Shown:
     """Say whether a scenario can be hosted, and whether the learned drivers were trained on it."""
-    folder = None if asked.policies is None else policies_in(asked.policies)
-    scenario = scenario_of(asked.scenario)
-    name = scenario.name if isinstance(asked.scenario, Scenario) else str(asked.scenario)
+    folder = None if config.policies is None else policies_in(config.policies)
+    scenario = scenario_of(config.scenario)
+    name = scenario.name if isinstance(config.scenario, Scenario) else str(config.scenario)
     return own_scenario.check_scenario(scenario, name, folder)
 
 
-@verb(verbs.Train)
-def train(asked: verbs.Train) -> PolicyChecks:
+@verb(c.Train)
+def train(config: c.Train) -> PolicyChecks:
     """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
     for package in ("torch", "gymnasium"):
         if find_spec(package) is None:
@@ -462,6 +457,6 @@ def train(asked: verbs.Train) -> PolicyChecks:
             )
     from merge_sumo.training.library import checks_of
 
-    scenario = None if asked.scenario is None else scenario_of(asked.scenario)
-    with Bars(shown=asked.progress) as bars:
-        return checks_of(asked, scenario, bars.counted, bars.say)
+    scenario = None if config.scenario is None else scenario_of(config.scenario)
+    with Bars(shown=config.progress) as bars:
+        return checks_of(config, scenario, bars.counted, bars.say)

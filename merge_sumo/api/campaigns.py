@@ -9,9 +9,9 @@ from functools import partial
 from pathlib import Path
 from time import perf_counter
 
-from merge_sumo import options, verbs
-from merge_sumo.api.asked import opened
+from merge_sumo import config as c
 from merge_sumo.api.results import CampaignRun
+from merge_sumo.api.settings import opened
 from merge_sumo.campaigns.again import call_again
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
@@ -26,6 +26,7 @@ from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import (
     LEVELS,
     OWN,
+    US23,
     MergeScenario,
     Scenario,
     lane_of,
@@ -42,12 +43,12 @@ from merge_sumo.verdict.campaign_verdict import parse_gates
 from merge_sumo.verdict.score import Outcome
 
 
-def concluded(
+def run_and_report(
     settings: CampaignSettings,
     plan: SimulationPlan,
     folder: Path,
-    where: options.Execution,
-    asked: verbs.SearchOfTest,
+    where: c.Execution,
+    config: c.CampaignCalls,
     *,
     goes_on: bool = False,
     workers: Workers | None = None,
@@ -57,22 +58,22 @@ def concluded(
     It begins in a new folder, or goes on in one, with its own workers or those of a caller. An
     interruption has a note on how to go on.
     """
-    junit = None if asked.junit is None else Path(asked.junit)
-    parse_gates(asked.gates, against=settings.against is not None)
+    junit = None if config.junit is None else Path(config.junit)
+    parse_gates(config.gates, against=settings.against is not None)
     if junit is not None:
         check_junit(junit, folder)
     if goes_on:
         check_report(folder)
     else:
         check_new(folder)
-    check = asked.check or (lambda: None)
+    check = config.check or (lambda: None)
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
     def case_ended(outcome: Outcome) -> None:
         bars.case_ended(outcome)
-        if asked.on_case is not None:
-            asked.on_case(outcome)
+        if config.on_case is not None:
+            config.on_case(outcome)
 
     try:
         with opened(where, plan) if workers is None else nullcontext(workers) as present, bars:
@@ -86,7 +87,7 @@ def concluded(
                 check=check,
                 begin=lambda: bars.begin(title),
             )
-            result = CampaignRun(done, asked.gates)
+            result = CampaignRun(done, config.gates)
             took_s = perf_counter() - begun_s
             _write_findings(result, plan, present, took_s, bars, check)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
@@ -128,18 +129,18 @@ def _write_findings(
     write_report(done, result.summary, counted("surrogates of the report", "levels"))
 
 
-def notice_povs(settings: CampaignSettings, plan: SimulationPlan, asked: verbs.Campaign) -> None:
+def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
     """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT."""
     levels = set(LEVELS) & set(settings.scenario.levels)
-    if asked.level == "all" and not levels <= set(settings.levels):
+    if config.level == "all" and not levels <= set(settings.levels):
         present = ", ".join(map(level_name, settings.levels))
         notice(
             f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
         )
     if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
-        scenario = asked.scenario
+        scenario = config.scenario or US23
         name = spoken_name(scenario) if isinstance(scenario, Scenario) else str(scenario)
-        option = "" if asked.policies is None else f" --policies {quoted(asked.policies)}"
+        option = "" if config.policies is None else f" --policies {quoted(config.policies)}"
         check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
         notice(
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"

@@ -11,7 +11,7 @@ from typing import Any, Final
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
-from merge_sumo.options import AnyRun
+from merge_sumo.config import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.motion import lines_of

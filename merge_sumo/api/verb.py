@@ -1,66 +1,63 @@
-"""Verbs: functions whose keywords are the fields of a record."""
+"""Verbs: functions whose keywords are the fields of a config."""
 
 from __future__ import annotations
 
+import ast
 import inspect
 from collections.abc import Callable
 from dataclasses import fields
-from typing import ParamSpec, TypeVar
+from functools import cache, update_wrapper
+from itertools import pairwise
+from typing import Any, ParamSpec, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.help_texts import with_names
-from merge_sumo.options import Asked
-from merge_sumo.system.suggestions import nearest
+from merge_sumo import config as configs
 
 P = ParamSpec("P")
-A = TypeVar("A", bound=Asked)
+C = TypeVar("C")
 R = TypeVar("R")
 
 
-def verb(record: Callable[P, A]) -> Callable[[Callable[[A], R]], Callable[P, R]]:
-    """Return a decorator of a function of a record, which is then called with the keywords of that.
+def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
+    """Return a decorator of a function of a config, which then takes the fields of that."""
 
-    A type checker takes the signature from the record, and so does `help`. An unknown keyword is a
-    `TypeError`, as in Python.
-    """
-
-    def made(do: Callable[[A], R]) -> Callable[P, R]:
-        names = {one.name for one in fields(record)}  # type: ignore[arg-type]
-
-        def call(*args: P.args, **given: P.kwargs) -> R:
-            for name in given.keys() - names:
-                close = nearest(name, names)
-                hint = f": did you mean {close[0]!r}?" if close else ""
-                raise TypeError(
-                    f"{do.__name__}() got an unexpected keyword argument {name!r}{hint}"
-                )
-            asked = record(*args, **given)
-            object.__setattr__(asked, "given", frozenset(given))
+    def decorated(work: Callable[[C], R]) -> Callable[P, R]:
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
             # One thread: products are small, and the cores are for workers.
             with threadpool_limits(1):
-                return do(asked)
+                return work(config(*args, **kwargs))
 
-        call.__name__, call.__qualname__, call.__module__ = (
-            do.__name__,
-            do.__qualname__,
-            do.__module__,
+        update_wrapper(call, work)
+        # What `help` shows.
+        signature = inspect.signature(config).replace(
+            return_annotation=work.__annotations__["return"]
         )
-        call.__doc__ = _documented(record)
-        returned = inspect.signature(do).return_annotation
-        call.__signature__ = inspect.signature(record).replace(  # type: ignore[attr-defined]
-            return_annotation=returned
-        )
+        vars(call)["__signature__"] = signature
+        call.__doc__ = f"{inspect.getdoc(config)}\n\nArgs:\n{_arguments(config)}"
         return call
 
-    return made
+    return decorated
 
 
-def _documented(record: Callable[..., Asked]) -> str:
-    """Return the docstring of a verb: that of its record, and its keywords."""
-    about = [
-        f"    {one.name}: {with_names(one.metadata['help'])}"
-        for one in fields(record)  # type: ignore[arg-type]
-        if "help" in one.metadata
-    ]
-    return "\n".join([inspect.cleandoc(record.__doc__ or ""), "", "Args:", *about])
+def _arguments(config: Any) -> str:
+    """Return the fields of a config with the docstrings under them."""
+    lines = []
+    for field in fields(config):
+        owner = next(kind for kind in config.__mro__ if field.name in kind.__annotations__)
+        lines.append(f"    {field.name}: {_docstrings()[owner.__name__, field.name]}")
+    return "\n".join(lines)
+
+
+@cache
+def _docstrings() -> dict[tuple[str, str], str]:
+    """Return the docstrings under the fields, by the name of the class and that of the field."""
+    found = {}
+    for kind in ast.parse(inspect.getsource(configs)).body:
+        if not isinstance(kind, ast.ClassDef):
+            continue
+        for field, text in pairwise(kind.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                name = ast.unparse(field.target)
+                found[kind.name, name] = " ".join(ast.literal_eval(text.value).split())
+    return found

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+from merge_sumo.config import COORDINATES
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, level_name
-from merge_sumo.verbs import COORDINATES
 from merge_sumo.verdict.episode import Episode
 
 ONE: Final[dict[str, Any]] = {

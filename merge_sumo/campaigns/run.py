@@ -29,9 +29,9 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from merge_sumo.campaigns.stopping import has_converged
+from merge_sumo.config import Search
 from merge_sumo.coverage.fmc import regions
 from merge_sumo.errors import UserError
-from merge_sumo.options import Search
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario

@@ -11,16 +11,23 @@ from typing import Any, Final
 from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
+from merge_sumo.config import Search
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
-from merge_sumo.options import DEFAULT_CASES, Limits, Search
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
-from merge_sumo.scenario.scenario import OWN, US23, Scenario, level_name
+from merge_sumo.scenario.scenario import (
+    DEADLINE_S,
+    MEMORY_GIB,
+    OWN,
+    US23,
+    Scenario,
+    level_name,
+)
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import RecordError, check_fields, to_plain
 from merge_sumo.verdict.chance import check_tolerated
@@ -31,12 +38,14 @@ from merge_sumo.vuts.spec import is_built_in, names_code, waits_for_client
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignSettings(Search, Limits):
+class CampaignSettings(Search):
     """Everything that decides what a campaign does; `UserError` for values that make none."""
 
     vut: str
     levels: tuple[int, ...]
-    cases: int = DEFAULT_CASES
+    cases: int = 800
+    deadline_s: float = DEADLINE_S
+    vut_memory_gib: float = MEMORY_GIB
     policies: str | None = None
     pov: str | None = None
     against: str | None = None

@@ -6,7 +6,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
     kind_of_merge,
@@ -37,7 +37,7 @@ def shipped() -> Shown:
     return Shown({name: scenario.to_record() for name, scenario in known.items()}, lines)
 
 
-def write_scenario(asked: verbs.NewScenario) -> Shown:
+def write_scenario(asked: config.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road.
 
     Raises `UserError` for a net without such a merge, and where something is there.

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
@@ -227,7 +227,7 @@ class Counted(NamedTuple):
     without_verdict: int
 
 
-def failure_probability(study: RunStudy, asked: verbs.Probability, out: Path) -> ProbabilityResult:
+def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases; write it to a file.
 
     Raises `UserError` for a distribution, a traffic or numbers that make no sense, for a campaign

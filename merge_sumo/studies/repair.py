@@ -35,7 +35,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from msgspec import field
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.campaigns.again import campaign_in
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -287,7 +287,7 @@ class RepairResult(Result):
         ]
 
 
-def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
+def ranges_of(asked: config.Repair) -> tuple[Range, ...]:
     """Return the parameters that may change, with their ranges.
 
     Raises `UserError` for values that make no search, and where optuna is not installed.
@@ -305,7 +305,7 @@ def ranges_of(asked: verbs.Repair) -> tuple[Range, ...]:
 
 
 def fresh_settings(
-    today: CampaignSettings, before: Run, asked: verbs.Repair, spec: str, number: int
+    today: CampaignSettings, before: Run, asked: config.Repair, spec: str, number: int
 ) -> CampaignSettings:
     """Return the settings of the fresh campaign of a round: another seed, and no earlier lesson.
 
@@ -324,7 +324,7 @@ def fresh_settings(
 
 def repair(
     study: RunStudy,
-    asked: verbs.Repair,
+    asked: config.Repair,
     folder: Path,
     fresh: Callable[[str, int], Run],
     on_part: OnPart = lambda *_: None,
@@ -373,7 +373,9 @@ def repair(
 class _Repair:
     """The search for values, with its cases and its trials."""
 
-    def __init__(self, study: RunStudy, asked: verbs.Repair, folder: Path, on_part: OnPart) -> None:
+    def __init__(
+        self, study: RunStudy, asked: config.Repair, folder: Path, on_part: OnPart
+    ) -> None:
         self._plan, self._workers, self._folder = study.plan, study.workers, folder
         self._asked, self._on_part, self.ranges = asked, on_part, ranges_of(asked)
         self.today = study.plan.vut.values_of(self.ranges)

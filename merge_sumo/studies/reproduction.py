@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import fmc
@@ -94,7 +94,7 @@ def quick(seeds: int) -> Scale:
     return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
 
 
-def scale_of(asked: verbs.Reproduce) -> Scale:
+def scale_of(asked: config.Reproduce) -> Scale:
     """Return the scale that a person asks for; `UserError` for numbers that make none."""
     check_least(asked, seeds=1)
     if asked.quick:
@@ -282,7 +282,7 @@ def reproduce(
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.
-        asked = verbs.Benchmark(
+        asked = config.Benchmark(
             column.vut,
             seeds=scale.seeds,
             cases=scale.batches * scale.batch,

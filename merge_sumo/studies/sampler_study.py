@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import covered, fmc
@@ -115,10 +115,11 @@ def _lost_search(task: Task) -> SamplerRun:
     )
 
 
-def names_of(asked: verbs.Benchmark) -> list[str]:
+def names_of(asked: config.Benchmark) -> list[str]:
     """Return the names of the samplers that are compared; `UserError` for none, or no seeds."""
     known = SAMPLERS if asked.samplers is None else asked.samplers
-    names = list(dict.fromkeys(map(str.strip, known)))
+    listed = known.split(",") if isinstance(known, str) else known
+    names = list(dict.fromkeys(map(str.strip, listed)))
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
     check_least(asked, seeds=1)
@@ -162,7 +163,7 @@ class Study:
         where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
         return ground_truth(plan, level, total, seed, **where)
 
-    def truths(self, settings: CampaignSettings, asked: verbs.GroundTruth) -> TruthResult:
+    def truths(self, settings: CampaignSettings, asked: config.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
         by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
         if not self.plan.vut.kind.files_are_known and not is_here(settings.vut):
@@ -173,7 +174,7 @@ class Study:
         return TruthResult(settings.vut, by_level, settings.criterion)
 
     def compare(
-        self, levels: tuple[int, ...], samplers: Sequence[str], asked: verbs.Benchmark
+        self, levels: tuple[int, ...], samplers: Sequence[str], asked: config.Benchmark
     ) -> SamplerStudy:
         """Let each sampler search with the seeds 0, 1, ... beside the truth of each level.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from merge_sumo import api, verbs
+from merge_sumo import api
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import failures
+from merge_sumo.config import NoFailures
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.counterfactuals import causes
@@ -14,12 +15,12 @@ from merge_sumo.system.printable import printable
 from merge_sumo.verdict.score import Outcome
 
 
-@verb(verbs.NoFailures)
-def assert_no_failures(asked: verbs.NoFailures) -> CampaignRun:
+@verb(NoFailures)
+def assert_no_failures(config: NoFailures) -> CampaignRun:
     """Test a VUT in a campaign, and raise where a case fails or ends in an error."""
     __tracebackhide__ = True
-    run = api.campaign(**{**asked.values(), "progress": False})
-    message = _message(run, asked.seed)
+    run = api.campaign(**{**vars(config), "progress": False})
+    message = _message(run, config.seed)
     if message is not None:
         raise AssertionError(message)
     return run

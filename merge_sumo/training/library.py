@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_of, read_manifest, scenario_of
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -33,7 +33,7 @@ class PolicyChecks(Result, dict[str, PolicyCheck]):
 
 
 def checks_of(
-    asked: verbs.Train,
+    asked: config.Train,
     scenario: Scenario | None,
     on_part: Callable[[str, int, int, str, str], None],
     say: Callable[[str], None],

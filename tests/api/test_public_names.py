@@ -8,13 +8,11 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-import typer
+from calling import commands
 
 import merge_sumo as ms
-from merge_sumo import cli
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "reference" / "python.md"
@@ -40,16 +38,6 @@ class TestATypeChecker:
         assert mypy(tmp_path, names, *options) == ['ms.campagn("design2")', "ms.Nonsense"]
 
 
-def commands(group: Any, front: str = "") -> set[str]:
-    """Return what a person types for each command."""
-    below = getattr(group, "commands", None)
-    if below is None:
-        return {front}
-    return {
-        name for part, one in below.items() for name in commands(one, f"{front} {part}".strip())
-    }
-
-
 OF_SCENARIO = {
     "scenario list": "scenarios",
     "scenario new": "new_scenario",
@@ -61,8 +49,7 @@ NO_COMMAND = {"open_in_gui", "open_run", "resume", "stress"}
 
 class TestTheNames:
     def test_are_those_of_the_commands(self):
-        typed = commands(typer.main.get_command(cli.app))
-        verbs = {OF_SCENARIO.get(name, name.replace("-", "_")) for name in typed}
+        verbs = {OF_SCENARIO.get(name, name.replace("-", "_")) for name in commands()}
         assert verbs == {name for name in ms.__all__ if name.islower()} - NO_COMMAND - {
             "__version__"
         }
@@ -96,6 +83,6 @@ class TestTheNames:
         assert ours <= shown
 
 
-def test_a_keyword_that_is_unknown_is_a_type_error_that_says_which_was_meant():
-    with pytest.raises(TypeError, match="'scenari': did you mean 'scenario'"):
+def test_a_keyword_that_is_unknown_is_a_type_error():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'scenari'"):
         ms.campaign("design2", scenari="us23")  # type: ignore[call-arg]

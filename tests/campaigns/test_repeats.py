@@ -6,11 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
+from calling import invoke
 from campaigning import campaign_settings, run_campaign
-from typer.testing import CliRunner
 
 import merge_sumo as ms
-from merge_sumo import cli
 from merge_sumo.campaigns.repeats import (
     REPEATS,
     Repeat,
@@ -62,7 +61,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path):
     spec, folder = vut(IN_ITS_MODULE), tmp_path / "run"
     arguments = ["campaign", "--vut", spec, "--level", "0", "--cases", "60", "--sampler"]
     arguments += ["uniform"]
-    done = CliRunner().invoke(cli.app, [*arguments, "--out", str(folder), "-q"])
+    done = invoke(*arguments, "--out", str(folder), "-q")
     assert done.stdout.startswith("Not repeatable: ")
     run = Run(folder)
     assert len(run.outcomes) == 60
@@ -78,7 +77,7 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path):
     assert said.split(" (case")[0] in write_report(run).read_text()
     assert said.split(" (case")[0] in ms.open_run(folder)._repr_html_()
     # check-vut tells that it is no randomness.
-    checked = CliRunner().invoke(cli.app, ["check-vut", spec])
+    checked = invoke("check-vut", spec)
     assert checked.exit_code == 1
     assert "It keeps something from earlier episodes" in checked.stdout
 

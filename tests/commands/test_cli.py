@@ -10,17 +10,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-from calling import Said, assert_refused, contents, invoke, run_in_a_process
+from calling import Said, assert_refused, commands, contents, invoke, run_in_a_process
 from lxml import etree
 
-from merge_sumo import cli
 from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports.reproduction_page import TABLE_JSON
 from merge_sumo.studies.reproduction import TABLE_II, Scale
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES
 from merge_sumo.sumo.replay_folder import RECORD
 
-COMMANDS = [command.name or command.callback.__name__ for command in cli.app.registered_commands]
+COMMANDS = [name for name in commands() if " " not in name]
 SMALL = ("campaign", "--vut", "design1", "--level", "0")
 GPR = ("--sampler", "gpr")
 

@@ -11,49 +11,79 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
+from calling import commands, invoke
 
-from merge_sumo import cli
-from merge_sumo.commands.application import PANELS
-from merge_sumo.options import GROUPS
-
-
-def commands() -> dict[str, Any]:
-    """Return all commands by what a person types."""
-    found = {}
-    waiting: list[tuple[str, Any]] = [("", typer.main.get_command(cli.app))]
-    while waiting:
-        name, one = waiting.pop()
-        below = getattr(one, "commands", {})
-        waiting += [(f"{name} {part}".strip(), command) for part, command in below.items()]
-        if not below:
-            found[name] = one
-    return found
-
+from merge_sumo import api, cli, config
+from merge_sumo.errors import UserError
 
 COMMANDS = commands()
+PANELS = {
+    "Search": {"campaign", "probability", "run"},
+    "Look": {"explain", "export", "replay", "report"},
+    "Change": {"compare", "repair", "rerun"},
+    "Bring your own": {"check-vut", "scenario", "train", "vuts"},
+    "Research": {"benchmark", "reproduce", "truth"},
+}
 
 
 def test_seventeen_commands_stand_in_five_panels():
-    application: Any = typer.main.get_command(cli.app)
-    panels: dict[str | None, tuple[str, ...]] = {}
-    for name in application.list_commands(None):
-        panel = application.commands[name].rich_help_panel
-        panels[panel] = (*panels.get(panel, ()), name)
+    panels: dict[str, set[str]] = {}
+    for name, command in cli.app.resolved_commands().items():
+        if not name.startswith("-"):
+            group: Any = command.group
+            panels.setdefault(group[0].name, set()).add(name)
     assert panels == PANELS
     assert sum(map(len, panels.values())) == 17
 
 
 class TestOptions:
-    def test_of_a_campaign_are_at_most_28_with_json_and_help(self):
-        options = [p.opts[0] for p in COMMANDS["campaign"].params if p.name != "context"]
-        assert len({*options, "--help"}) <= 28, options
-
     @pytest.mark.parametrize("name", COMMANDS)
-    def test_stand_in_groups(self, name):
-        options = [p for p in COMMANDS[name].params if p.param_type_name == "option"]
-        groups = [p.rich_help_panel for p in options if p.name != "help"]
-        assert groups == sorted(groups, key=GROUPS.index)
+    def test_all_have_a_group_and_a_text(self, name):
+        for argument in COMMANDS[name].assemble_argument_collection(parse_docstring=True):
+            if argument.parse and argument.keys:
+                assert argument.parameter.group, argument.name
+                assert argument.parameter.help, argument.name
+
+    @pytest.mark.parametrize(
+        ("name", "flags"),
+        [
+            ("campaign", "--vut --follow-up --deadline --vut-memory --tolerate --gate --quiet -q"),
+            ("run", "--x --v --psi --headway-ahead --headway-behind --from --case --at --json"),
+            ("explain", "--param"),
+            ("export", "--format"),
+        ],
+    )
+    def test_keep_the_flags_that_are_shorter_than_their_fields(self, name, flags):
+        shown = invoke(name, "--help").output.split()
+        assert set(flags.split()) <= set(shown)
+
+    @pytest.mark.parametrize(
+        ("words", "sentence"),
+        [
+            (["campaign", "--samplr", "gpr"], "Did you mean --sampler?"),
+            (["campain"], 'Did you mean "campaign"?'),
+            (["campaign", "--cases", "few"], "--cases"),
+            (["campaign", "--seed", "1", "--seed", "2"], "--seed specified multiple times"),
+            (["run", "--at", "x_pov0_m"], "give NAME=NUMBER"),
+        ],
+    )
+    def test_that_are_mistyped_are_named(self, words, sentence):
+        said = invoke(*words)
+        assert said.exit_code == 2
+        assert sentence in str(said.exception)
+
+    def test_give_a_command_all_cores_and_python_none(self, monkeypatch):
+        seen = {}
+
+        def truth(**options):
+            seen.update(options)
+            raise UserError("enough")
+
+        monkeypatch.setattr(api, "truth", truth)
+        for words, workers in ((), None), (("--workers", "2"), 2), (("--workers", "auto"), None):
+            invoke("truth", "design1", *words)
+            assert seen["workers"] == workers
+        assert config.GroundTruth("design1").workers == 1
 
 
 @pytest.mark.skipif(not hasattr(os, "openpty"), reason="needs a pseudo-terminal")

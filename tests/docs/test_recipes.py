@@ -94,9 +94,9 @@ RECIPES = {
     ),
     "an option of `campaign` that reaches the engine": Recipe(
         more={
-            "options.py": {
-                "    sense: Sensing": "    late_m: float | None = option(None, float, "
-                '"Distance behind M at which episodes end.", TESTED, "--late")\n'
+            "config.py": {
+                "    sense: AnySensing": "    late_m: float | None = None\n"
+                '    """Distance after M at which episodes end."""\n'
             },
             "scenario/scenario.py": {
                 "    mainline: Edges": "    late_m: float = 0.0\n",
@@ -165,7 +165,7 @@ def test_a_recipe_is_of_so_many_files_which_the_page_names(name, files):
 def test_a_campaign_has_what_the_recipes_add(copied):
     words = ("--level", "0", "--cases", "8", "--sampler", "corner", "--workers", "1", "--quiet")
     vut = "cruise?v_mps=20&gain_per_s=2"
-    ran(copied, "campaign", "--vut", vut, *words, "--late", "50", "--out", "run")
+    ran(copied, "campaign", "--vut", vut, *words, "--late-m", "50", "--out", "run")
     records = [json.loads(line) for line in (copied / "run/outcomes.jsonl").open(encoding="utf-8")]
     assert len(records) == 8
     assert all(50.0 <= record["last_m"] < 53.0 for record in records), "by the option"

@@ -11,7 +11,7 @@ import pytest
 from campaigning import campaign_settings, run_campaign
 from scipy.stats import kstest, norm, truncnorm
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
@@ -241,7 +241,7 @@ class TestATraffic:
 def failure_probability(run, out, engine="kinematic", **other):
     settings = settings_of(run.folder, run.record)
     study = RunStudy(run, settings, resolve(settings).with_engine(engine))
-    return failure_probability_of(study, verbs.Probability(run, **other), out)
+    return failure_probability_of(study, config.Probability(run, **other), out)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import pytest
 from plans import key_of, plan_for
 from vut_contract import factory
 
-from merge_sumo import verbs
+from merge_sumo import config
 from merge_sumo.coverage.fmc import fmc
 from merge_sumo.scenario.case import from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
@@ -139,7 +139,7 @@ def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_pa
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):
     study = Study(plan_for("design1"), cache=cache)
-    asked = verbs.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
+    asked = config.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
     result = study.compare((0,), ["uniform"], asked)
     found = result.samplers["uniform"]
     assert found.cases_by_batch == [20, 40, 50]

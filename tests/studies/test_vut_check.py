@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
-from typer.testing import CliRunner
+from calling import invoke
 
-from merge_sumo import check_vut, cli
+from merge_sumo import check_vut
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.registry import KINDS
 
@@ -22,19 +22,19 @@ def check(tmp_path):
         path = tmp_path / f"vut{len(list(tmp_path.iterdir()))}.py"
         path.write_text(source)
         arguments = "check-vut", f"{path}:Vut", *arguments
-        done = CliRunner().invoke(cli.app, arguments)
+        done = invoke(*arguments)
         return done.exit_code, done.stdout
 
     return run
 
 
 def test_the_list_names_every_vut_and_every_kind_with_an_example():
-    said = CliRunner().invoke(cli.app, ["vuts"]).stdout
+    said = invoke("vuts").stdout
     for kind in KINDS.values():
         assert kind.form in said
         assert kind.example in said
     assert all(name in said for name in BUILT_IN_VUTS)
-    listed = json.loads(CliRunner().invoke(cli.app, ["vuts", "--json"]).stdout)
+    listed = json.loads(invoke("vuts", "--json").stdout)
     forms = [kind.form for kind in KINDS.values() if kind.form]
     assert [kind["form"] for kind in listed["kinds"]] == forms
 

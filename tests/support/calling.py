@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
 
-from typer.testing import CliRunner, Result
+from cyclopts import App
 
 from merge_sumo import cli
+from merge_sumo.errors import UserError
 
 
 class Said(NamedTuple):
@@ -20,9 +23,42 @@ class Said(NamedTuple):
     err: str
 
 
+def commands() -> dict[str, App]:
+    """Return all commands by their words."""
+    found: dict[str, App] = {}
+    waiting: list[tuple[str, App]] = [("", cli.app)]
+    while waiting:
+        front, group = waiting.pop()
+        for name, command in group.resolved_commands().items():
+            if command.default_command is None:
+                waiting.append((f"{name} ", command))
+            elif not name.startswith("-"):
+                found[front + name] = command
+    return found
+
+
+class Result(NamedTuple):
+    """What a command printed in this process, and the `UserError` that it raised."""
+
+    exit_code: int
+    stdout: str
+    stderr: str
+    exception: UserError | None
+
+    @property
+    def output(self) -> str:
+        return self.stdout + self.stderr
+
+
 def invoke(*words: object) -> Result:
-    """Run a command in this process by typer's runner: an error is an exception of the result."""
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
+    """Run a command in this process: bad use is an exception of the result."""
+    out, err = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            code, raised = cli.execute([str(word) for word in words]), None
+        except UserError as error:
+            code, raised = 2, error
+    return Result(code, out.getvalue(), err.getvalue(), raised)
 
 
 def run_in_a_process(folder: Path, *arguments: object) -> Said:

@@ -10,12 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from calling import invoke
+from calling import Result, invoke
 from campaigning import campaign_settings, run_campaign
 from handmade import write_run
 from lxml import etree
 from test_chance import CASE, outcomes
-from typer.testing import Result
 
 import merge_sumo as ms
 from merge_sumo.campaigns.run import failures
@@ -266,7 +265,7 @@ class TestACampaignWithGates:
 
         monkeypatch.setattr("merge_sumo.system.interrupt.Interrupt.check", stop)
         said: list = []
-        monkeypatch.setattr("merge_sumo.commands.printing.say", said.append)
+        monkeypatch.setattr("merge_sumo.console.say", said.append)
         file = tmp_path / "a file.xml"
         with pytest.raises(Stopped):
             campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)

@@ -1,0 +1,140 @@
+"""What commands print: results on standard output, sentences for the user on standard error."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, TextIO
+
+from merge_sumo import config
+from merge_sumo.errors import Notice, UserError, WorkersLostError
+from merge_sumo.system.interrupt import Interrupt, Stopped
+from merge_sumo.system.printable import printable
+
+if TYPE_CHECKING:
+    from merge_sumo.system.result import Result
+
+FLAGS: Final[Mapping[str, str]] = {
+    "deadline_s": "--deadline",
+    "vut_memory_gib": "--vut-memory",
+    "follow_up_s": "--follow-up",
+    "from_s": "--from",
+    "x_pov0_m": "--x",
+    "v_pov0_mps": "--v",
+    "svo_rad": "--psi",
+    "headway_ahead_s": "--headway-ahead",
+    "headway_behind_s": "--headway-behind",
+    "recorded": "--case",
+    "tolerated": "--tolerate",
+    "gates": "--gate",
+    "params": "--param",
+    "file_format": "--format",
+}
+"""Options with another name than their field."""
+
+
+def flag_of(name: str) -> str:
+    """Return the option of the command line for a field."""
+    return FLAGS.get(name, f"--{name.replace('_', '-')}")
+
+
+def show(line: object) -> None:
+    """Print a line of a result on standard output."""
+    print(printable(str(line)), flush=True)
+
+
+def say(line: str) -> None:
+    """Print a line for the user on standard error."""
+    print(printable(_with_flags(line)), file=sys.stderr, flush=True)
+
+
+@cache
+def _field_names() -> set[str]:
+    """Return the names of the fields that are options."""
+    kinds = [kind for kind in vars(config).values() if is_dataclass(kind)]
+    names = {field.name for kind in kinds for field in fields(kind) if field.kw_only}
+    return names | {"vut"}
+
+
+def _with_flags(sentence: str) -> str:
+    """Return a sentence of the package with options in the place of keywords in backticks."""
+
+    def in_place(keyword: re.Match[str]) -> str:
+        return flag_of(keyword[1]) if keyword[1] in _field_names() else keyword[0]
+
+    return re.sub(r"`(\w+)`", in_place, sentence)
+
+
+def print_json(record: dict[str, Any]) -> None:
+    """Print a JSON object in one line."""
+    show(json.dumps(record, allow_nan=False))
+
+
+def print_result(result: Result, as_json: bool, **paths: object) -> None:
+    """Print a result in lines or as one JSON object.
+
+    Args:
+        result: the result.
+        as_json: whether to print JSON.
+        paths: paths that belong to the result, or None; in lines each follows its name.
+    """
+    written = {name: str(path) for name, path in paths.items() if path is not None}
+    if as_json:
+        print_json({**result.to_record(), **written})
+        return
+    for line in result.lines():
+        show(_with_flags(line))
+    for name, path in written.items():
+        show(f"{name}: {path}")
+
+
+@contextmanager
+def stoppable(how_to_go_on: Callable[[], str | None]) -> Iterator[Callable[[], None]]:
+    """Yield a `check` for a campaign: after Ctrl-C the running batch ends, and a sentence follows.
+
+    Args:
+        how_to_go_on: returns the sentence; None where nothing was written.
+
+    Raises:
+        UserError: where the cluster of the workers is gone.
+    """
+    try:
+        with Interrupt("finishing the running batch; once more stops at once") as interrupt:
+            yield interrupt.check
+    except Stopped:
+        sentence = how_to_go_on()
+        say(f"stopped; {sentence or 'before the first case; nothing was written'}")
+        raise
+    except WorkersLostError as lost:
+        sentence = how_to_go_on()
+        raise UserError(f"{lost}; {sentence}" if sentence else str(lost)) from lost
+
+
+@contextmanager
+def notices_printed() -> Iterator[None]:
+    """Print each `Notice` on standard error; other warnings are shown as always."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", Notice)
+        show_warning = warnings.showwarning
+
+        def print_notice(
+            message: Warning | str,
+            category: type[Warning],
+            filename: str,
+            lineno: int,
+            file: TextIO | None = None,
+            line: str | None = None,
+        ) -> None:
+            if issubclass(category, Notice):
+                say(str(message))
+            else:
+                show_warning(message, category, filename, lineno, file, line)
+
+        warnings.showwarning = print_notice
+        yield
