@@ -8,15 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from merge_sumo.sumo.traci_names import named
-from merge_sumo.vuts.traci.commands import Effect, effect_of
-from merge_sumo.vuts.traci.questions import is_answered
-from merge_sumo.vuts.traci.session import OWN_ANSWERS, QUESTIONS
+from merge_sumo.sumo.traci_names import functions
+from merge_sumo.vuts.traci.session import QUESTIONS, Effect, effect_of, is_answered
 
-HEADINGS = (
-    *("Answered here", "Answered by SUMO", "Not answered"),
-    *(effect.value for effect in Effect),
-)
+HEADINGS = ("Answered", "Not answered", *(effect.value for effect in Effect))
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# What a TraCI controller can do
 
@@ -29,13 +24,14 @@ act and the rest does not.
 
 Made by `python tools/traci_page.py` from SUMO's own client: do not edit.
 
-A shadow SUMO answers questions. It has the original net and the vehicles `pov` and `vut` (in \
+A second SUMO answers questions. It has the original net and the vehicles `pov` and `vut` (in \
 traffic also `ahead` and `behind`) in their present state, and runs as a library in a process of \
 its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
 vehicle after the step, and the vehicles that departed and arrived during several steps. A \
 question about an unknown object is refused as by SUMO. Subscriptions to variables of an object \
 are available for all questions, and context subscriptions for what is around a vehicle or a \
-junction, without filters. `getCollisions` tells of contacts, which change no motion.
+junction, without filters; they hold until they are ended, \
+whatever their begin and end. `getCollisions` tells of contacts, which change no motion.
 
 The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
 the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
@@ -59,16 +55,14 @@ def sections() -> Iterator[str]:
     """Yield the page, domain by domain."""
     yield HEAD
     domains: dict[str, dict[str, list[str]]] = {}
-    for (command, variable), functions in named().items():
-        domain = functions[0].partition(".")[0]
-        if (command, variable) in OWN_ANSWERS:
-            heading = "Answered here"
-        elif command in QUESTIONS:
-            heading = "Answered by SUMO" if is_answered(functions) else "Not answered"
+    for (command, _), names in functions().items():
+        domain = names[0].partition(".")[0]
+        if command in QUESTIONS:
+            heading = "Answered" if is_answered(names) else "Not answered"
         else:
-            heading = effect_of(functions).value
-        names = (f"`{function.partition('.')[2]}`" for function in functions)
-        domains.setdefault(domain, {}).setdefault(heading, []).extend(names)
+            heading = effect_of(names).value
+        listed = domains.setdefault(domain, {}).setdefault(heading, [])
+        listed += [f"`{name.partition('.')[2]}`" for name in names]
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
         yield f"\n## {domain}\n"
         for heading in HEADINGS:

@@ -27,7 +27,7 @@ from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.sumo import shadow_sumo
+from merge_sumo.sumo import mirror
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import (
@@ -245,8 +245,8 @@ def test_a_net_that_is_taken_once_is_taken_by_every_kind_of_controller_and_expor
     path.write_bytes(ODD[name](default_net_path().read_text(encoding="utf-8")))
     road = road_of(path)
     assert (road.mainline, road.ramp) == (road_of().mainline, road_of().ramp)
-    shadow_sumo.write_files(tmp_path, road, US23)
-    assert b"main_out" in (tmp_path / shadow_sumo.NET).read_bytes()
+    mirror.write_files(tmp_path, road, US23)
+    assert b"main_out" in (tmp_path / mirror.NET).read_bytes()
     assert b"<road " in opendrive(road)
     with World(1, road, scenario=US23) as world:
         world.advance()

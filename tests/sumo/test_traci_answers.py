@@ -7,17 +7,17 @@ from __future__ import annotations
 import subprocess
 from contextlib import contextmanager
 
-from traci_pair import Pair, ToSession, answer, close_shadow, end_program, open_program, shadow
+from traci_pair import Pair, ToSession, answer, close_mirror, end_program, mirror, open_program
 
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.shadow_sumo import NET
+from merge_sumo.sumo.mirror import NET
 from merge_sumo.vuts.traci.session import Session
 
 
 @contextmanager
 def lit_crossing(folder):
     """Give connections to our SUMO and a real one, each with two cars before a traffic light."""
-    sumo = shadow(folder)
+    sumo = mirror(folder)
     netgenerate = [sumo_program("netgenerate"), "--grid", "--grid.number", "3"]
     netgenerate += ["--grid.length", "90", "-j", "traffic_light", "-o", str(folder / NET)]
     subprocess.run(netgenerate, check=True, capture_output=True)
@@ -36,7 +36,7 @@ def lit_crossing(folder):
         sumo.at_m = {"vut": 0.0}
         yield ours, real
     finally:
-        close_shadow()
+        close_mirror()
         end_program(process)
 
 

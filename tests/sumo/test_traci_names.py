@@ -61,7 +61,7 @@ class TestSubscriptions:
 
         assert seen(pair.ours) == seen(pair.real)
         pair.ours.vehicle.unsubscribe("vut")
-        assert pair.session.subscriptions == []
+        assert pair.session.subscriptions == {}
 
     @pytest.mark.parametrize("range_m", [0.0, 50.0, 300.0, 2000.0])
     @pytest.mark.parametrize("around", [("vehicle", "vut"), ("junction", "M")])
@@ -84,7 +84,7 @@ class TestSubscriptions:
             # What was found before stays in the answers of SUMO that follow in the step.
             ours, real = seen(pair.ours, of), seen(pair.real, of)
             assert ours == real, of
-        assert pair.session.subscriptions == []
+        assert pair.session.subscriptions == {}
         assert pair.ours.poi.getIDList() == ()
 
     def test_of_what_is_around_it_follow_the_steps(self, pair):

@@ -1,4 +1,4 @@
-"""Ours and a real SUMO side by side, for a client's questions: who answers what."""
+"""Ours and a real SUMO next to each other, for a client's questions: who answers what."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.sumo.binding import sumo_environment, sumo_program
-from merge_sumo.sumo.shadow_sumo import (
+from merge_sumo.sumo.mirror import (
     COLOURS,
-    COMMANDED_VUT,
+    DEPARTURE_SPEED_MODE,
     NET,
-    SHADOW_OPTIONS,
+    OPTIONS,
     TYPES,
-    ShadowSumo,
-    _edges,
+    MirrorSimulation,
+    edges_of,
     write_files,
 )
 from merge_sumo.vuts.traci import protocol as tp
@@ -122,7 +122,7 @@ def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
     files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
     program = sumo_program("sumo")
     process = subprocess.Popen(
-        [program, *files, *SHADOW_OPTIONS, "--remote-port", str(port)],
+        [program, *files, *OPTIONS, "--remote-port", str(port)],
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -142,24 +142,26 @@ def end_program(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-_shadows: list[ShadowSumo] = []
+_mirrors: list[MirrorSimulation] = []
 """libsumo holds one simulation per process."""
 
 
-def shadow(folder: Path, scenario: Scenario = US23, road: Corridor | None = None) -> ShadowSumo:
-    """Return the shadow SUMO of this process, with an empty road at time 0."""
+def mirror(
+    folder: Path, scenario: Scenario = US23, road: Corridor | None = None
+) -> MirrorSimulation:
+    """Return the mirror simulation of this process, with an empty road at time 0."""
     road = road or road_of()
     write_files(folder, road, scenario)
-    sumo = ShadowSumo(folder)
-    sumo._started = bool(_shadows)
+    sumo = MirrorSimulation(folder)
+    sumo._started = bool(_mirrors)
     sumo.load()
-    _shadows[:] = [sumo]
+    _mirrors[:] = [sumo]
     return sumo
 
 
-def close_shadow() -> None:
-    if _shadows:
-        _shadows.pop()._libsumo.close()
+def close_mirror() -> None:
+    if _mirrors:
+        _mirrors.pop()._libsumo.close()
 
 
 class Pair:
@@ -174,13 +176,13 @@ class Pair:
     ) -> None:
         """Let both drive some steps from `pov`, x and v, on, and change their speeds in each."""
         road = road_of()
-        self.session = Session(shadow(folder))
+        self.session = Session(mirror(folder))
         self.process, self.real = open_program(folder)
         vehicle = self.real.vehicle
         changes_mps = {"vut": change_mps, "pov": -change_mps}
         starts = {"pov": (road.mainline, *pov), "vut": (road.ramp, -182.0, 18.0)}
         for name, (path, x_m, v_mps) in starts.items():
-            self.real.route.add(f"route.{name}", _edges(path))
+            self.real.route.add(f"route.{name}", edges_of(path))
             point = path.point(x_m)
             lane = point.lane.rpartition("_")[2]
             place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
@@ -196,7 +198,7 @@ class Pair:
             self.real.simulationStep()
             states = {}
             for name in starts:
-                vehicle.setSpeedMode(name, COMMANDED_VUT if name == "vut" else 32)
+                vehicle.setSpeedMode(name, DEPARTURE_SPEED_MODE if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + changes_mps[name])
                 v_mps = vehicle.getSpeed(name)
@@ -212,7 +214,7 @@ class Pair:
         self.ours = ToSession(self.session)
 
     def close(self) -> None:
-        close_shadow()
+        close_mirror()
         end_program(self.process)
 
 
@@ -227,19 +229,19 @@ class Drive:
         self.road, self.folder = road_of(), folder
         write_files(folder, self.road, US23)
         self.process, self.real = open_program(folder)
-        self.real.route.add("route.vut", _edges(self.road.ramp))
+        self.real.route.add("route.vut", edges_of(self.road.ramp))
 
     def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
         """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
         self.pov = pov
-        self.session = Session(shadow(self.folder))
+        self.session = Session(mirror(self.folder))
         self.ours = ToSession(self.session)
         _as_at_first(self.real)
         if "vut" in self.real.vehicle.getIDList():
             self.real.vehicle.remove("vut")
         self.real.vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
         self.real.simulationStep()
-        self.real.vehicle.setSpeedMode("vut", COMMANDED_VUT)
+        self.real.vehicle.setSpeedMode("vut", DEPARTURE_SPEED_MODE)
         self.real.vehicle.setLaneChangeMode("vut", 0)
         self.real.vehicle.setColor("vut", COLOURS[1])
         self.real.vehicle.setSpeed("vut", 18.0)
@@ -247,7 +249,7 @@ class Drive:
 
     def again(self) -> None:
         """Let the vehicles of the session depart, after they have arrived."""
-        if self.session.driving:
+        if self.session.sumo.at_m:
             self.session.step()
             self.session.clear()
         (x_m, v_mps) = self.pov
@@ -278,7 +280,7 @@ class Drive:
         }
 
     def close(self) -> None:
-        close_shadow()
+        close_mirror()
         end_program(self.process)
 
 

@@ -47,7 +47,7 @@ class Played:
         thread = threading.Thread(target=self._client, args=(client,))
         thread.start()
         options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
-        vut = TraciVut(1, road_of(), US23, self.port, None, options)
+        vut = TraciVut(road_of(), US23, self.port, None, options)
         try:
             for _ in range(episodes):
                 self._episode(vut, steps)
@@ -219,11 +219,11 @@ def children() -> set[str]:
         ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
         ("hangs", "the controller made no step within the deadline of 0.5 s"),
         ("says goodbye", "the controller closed the connection during the episode"),
-        ("a huge message", "bytes that are no TraCI: a message of 2147483647 bytes was announced"),
+        ("a huge message", "bytes that are not TraCI: a message of 2147483647 bytes was announced"),
         ("nan", "the controller commanded vehicle.setSpeed(nan)"),
         ("steps to nan", "the controller stepped to time nan"),
         ("half a message", "sent half a message and no more within the deadline of 0.5 s"),
-        ("half a message and closes", "the controller closed the connection in a message"),
+        ("half a message and closes", "the controller closed the connection"),
     ],
 )
 def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):

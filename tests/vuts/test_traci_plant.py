@@ -17,7 +17,7 @@ from vut_contract import factory, in_process, run_on
 
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.imperfection import Actuation
-from merge_sumo.vuts.traci.commands import NotFiniteError
+from merge_sumo.vuts.traci.session import NotFiniteError
 
 LAW = """
 from math import sin

@@ -8,22 +8,21 @@ import pytest
 import traci
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from traci_pair import close_shadow, shadow
+from traci_pair import close_mirror, mirror
 
-from merge_sumo.sumo.shadow_sumo import ShadowSumo
+from merge_sumo.sumo.mirror import MirrorSimulation
 from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.commands import NotFiniteError
-from merge_sumo.vuts.traci.session import Session
+from merge_sumo.vuts.traci.session import NotFiniteError, Session
 
-SUMO: list[ShadowSumo] = []
+SUMO: list[MirrorSimulation] = []
 """The one that answers; Hypothesis knows no fixtures."""
 
 
 @pytest.fixture(scope="module", autouse=True)
 def _sumo(tmp_path_factory):
-    SUMO[:] = [shadow(tmp_path_factory.mktemp("sumo"))]
+    SUMO[:] = [mirror(tmp_path_factory.mktemp("sumo"))]
     yield
-    close_shadow()
+    close_mirror()
 
 
 def reference_commands() -> list[bytes]:
@@ -31,22 +30,20 @@ def reference_commands() -> list[bytes]:
     sent: list[bytes] = []
     kept = traci.connection.Connection.__new__(traci.connection.Connection)
     for form, values in (("d", (3.0,)), ("tdd", (2, 1.0, 2.0)), ("s", ("a",)), ("i", (5,))):
-        payload = bytes((0x40,)) + tp.raw_string("vut") + kept._pack(form, *values)
+        payload = bytes((0x40,)) + tp.string("vut") + kept._pack(form, *values)
         sent.append(tp.command(bytes((0xC4,)) + payload))
     sent.append(tp.command(bytes((0x02,)) + struct.pack("!d", 0.0)))
-    sent.append(
-        tp.command(bytes((0xD4,)) + struct.pack("!dd", 0, 9) + tp.raw_string("vut") + b"\1@")
-    )
-    sent.append(tp.command(b"\xa4\x68" + tp.raw_string("vut") + tp.pack("d", 9.0)))
+    sent.append(tp.command(bytes((0xD4,)) + struct.pack("!dd", 0, 9) + tp.string("vut") + b"\1@"))
+    sent.append(tp.command(b"\xa4\x68" + tp.string("vut") + tp.pack("d", 9.0)))
     on_road, point = ("ramp", 10.0, 0), (1.0, 2.0)
     places: list[tuple[bytes, str, tuple[object, ...]]] = [
-        (b"\xab\x82" + tp.raw_string(""), "trB", (2, on_road, 1)),
-        (b"\xab\x82" + tp.raw_string(""), "toBs", (3, point, 4, "ignoring")),
-        (b"\xab\x83" + tp.raw_string(""), "toou", (3, point, point, 1)),
-        (b"\xa4\x83" + tp.raw_string("vut"), "tru", (2, on_road, 1)),
+        (b"\xab\x82" + tp.string(""), "trB", (2, on_road, 1)),
+        (b"\xab\x82" + tp.string(""), "toBs", (3, point, 4, "ignoring")),
+        (b"\xab\x83" + tp.string(""), "toou", (3, point, point, 1)),
+        (b"\xa4\x83" + tp.string("vut"), "tru", (2, on_road, 1)),
     ]
     sent += [tp.command(head + kept._pack(form, *asked)) for head, form, asked in places]
-    around = struct.pack("!dd", 0, 9) + tp.raw_string("vut")
+    around = struct.pack("!dd", 0, 9) + tp.string("vut")
     sent += [tp.command(b"\x84" + around + kept._pack("uDuu", d, 50.0, 1, 1)) for d in (0xA3, 0xA4)]
     return sent
 

@@ -1,47 +1,35 @@
 """The bytes of TraCI, the protocol by which a program controls SUMO; no sockets here.
 
 A message is a length and commands; a command is a length, an identifier and a payload; numbers are
-big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html). Bytes that are not that raise
-`ProtocolError` and nothing else, whatever they are.
+big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html).
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from merge_sumo.sumo.binding import SUMO_VERSION
 from merge_sumo.sumo.traci_names import packer
 
 MAX_MESSAGE_BYTES: Final = 1 << 20
-"""A controller of one vehicle never says more at a time; garbage read as a length mostly does."""
+"""Limit of a message; garbage that is read as a length mostly exceeds it."""
+MAX_NESTING: Final = 4
 API_VERSION: Final = 22
-"""Of the TraCI of SUMO 1.28."""
-
-GET_VERSION, SIMULATION_STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
-GET_VEHICLE, GET_JUNCTION, GET_SIMULATION, SET_VEHICLE = 0xA4, 0xA9, 0xAB, 0xC4
-"""Identifiers of commands."""
-
-TYPE_UBYTE, TYPE_BYTE, TYPE_INTEGER, TYPE_DOUBLE = 0x07, 0x08, 0x09, 0x0B
-TYPE_STRING, TYPE_STRINGLIST, TYPE_COMPOUND, TYPE_DOUBLELIST, TYPE_COLOR = 0x0C, *range(0x0E, 0x12)
-"""Types of values."""
-LON_LAT, ROADMAP = 0x00, 0x04
-"""Types of positions that are no points of the plane or of space, 0x01 and 0x03."""
+"""Version of the TraCI of SUMO 1.28."""
+VERSION, STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
+GET_VEHICLE, GET_JUNCTION, SET_VEHICLE = 0xA4, 0xA9, 0xC4
+OK, ERROR = 0x00, 0xFF
+NUMBERS: Final = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d"}
+"""Forms of `struct` by the types of numbers."""
+STRING, STRING_LIST, COMPOUND, DOUBLE_LIST, COLOR = 0x0C, 0x0E, 0x0F, 0x10, 0x11
+LON_LAT, ROAD = 0x00, 0x04
 PLACES: Final = "goGOr"
-"""The letters of `pack` by the types of positions: on earth, in the plane, both with height, and on
-a road."""
-OK, NOT_IMPLEMENTED, ERROR = 0x00, 0x01, 0xFF
-"""Results of commands."""
-
-_FIXED: Final = {
-    TYPE_UBYTE: struct.Struct("!B"),
-    TYPE_BYTE: struct.Struct("!b"),
-    TYPE_INTEGER: struct.Struct("!i"),
-    TYPE_DOUBLE: struct.Struct("!d"),
-    TYPE_COLOR: struct.Struct("!BBBB"),
-}
-_INT, _DOUBLE = _FIXED[TYPE_INTEGER], _FIXED[TYPE_DOUBLE]
-_MAX_NESTING: Final = 4
+"""Letters of `pack` by the types of positions: on earth, in the plane, both with height, and on a
+road."""
 
 
 class ProtocolError(Exception):
@@ -56,15 +44,14 @@ class Command(NamedTuple):
 
 
 class Reader:
-    """Reads values from bytes, one after the other."""
+    """Reads values from bytes, one after the other; raises `ProtocolError`."""
 
     def __init__(self, data: bytes) -> None:
-        self._data = data
-        self._at = 0
+        self._data, self._at = data, 0
 
     @property
     def left(self) -> int:
-        """Bytes that have not been read."""
+        """Number of bytes that have not been read."""
         return len(self._data) - self._at
 
     def raw(self, count: int) -> bytes:
@@ -74,62 +61,55 @@ class Reader:
         start, self._at = self._at, self._at + count
         return self._data[start : self._at]
 
+    def number(self, form: str) -> Any:
+        """Return the next number, in a form of `struct`."""
+        form = f"!{form}"
+        (value,) = struct.unpack(form, self.raw(struct.calcsize(form)))
+        return value
+
     def ubyte(self) -> int:
         """Return the next unsigned byte."""
         return self.raw(1)[0]
 
-    def integer(self) -> int:
-        """Return the next 32-bit integer."""
-        value: int = _INT.unpack(self.raw(4))[0]
-        return value
-
-    def double(self) -> float:
-        """Return the next double."""
-        value: float = _DOUBLE.unpack(self.raw(8))[0]
-        return value
-
     def string(self) -> str:
         """Return the next string."""
         try:
-            return self.raw(self.integer()).decode("utf-8")
+            return self.raw(self.number("i")).decode("utf-8")
         except UnicodeDecodeError as error:
             raise ProtocolError("a string is not UTF-8") from error
 
     def count(self) -> int:
-        """Return of how many values the compound is made whose type is next."""
-        if self.ubyte() != TYPE_COMPOUND:
-            raise ProtocolError("there is no compound where one is due")
-        return self._count(1)
+        """Return the number of values of a compound, whose type is next."""
+        if self.ubyte() != COMPOUND:
+            raise ProtocolError("a compound was expected")
+        return self._length()
 
     def place(self) -> tuple[int, list[Any]]:
-        """Return the type and the coordinates of the position that is next."""
+        """Return the type and the coordinates of a position."""
         kind = self.ubyte()
-        if kind == ROADMAP:
-            return kind, [self.string(), self.double(), self.ubyte()]
+        if kind == ROAD:
+            return kind, [self.string(), self.number("d"), self.ubyte()]
         if kind >= len(PLACES):
-            raise ProtocolError(f"type 0x{kind:02x} is no position")
-        return kind, [self.double() for _ in range(2 if PLACES[kind] in "go" else 3)]
+            raise ProtocolError(f"type 0x{kind:02x} is not a position")
+        dimensions = 2 if PLACES[kind].islower() else 3
+        return kind, [self.number("d") for _ in range(dimensions)]
 
     def typed(self, nesting: int = 0) -> Any:
-        """Return the next value with a type before it.
-
-        Lists and colours are tuples; compounds are lists of what they are made of.
-        """
+        """Return the next value, with a type before it; a compound is a list of its values."""
         kind = self.ubyte()
-        if kind in _FIXED:
-            values = _FIXED[kind].unpack(self.raw(_FIXED[kind].size))
-            return values[0] if len(values) == 1 else values
-        if kind == TYPE_STRING:
+        if kind in NUMBERS:
+            return self.number(NUMBERS[kind])
+        if kind == STRING:
             return self.string()
-        if kind == TYPE_STRINGLIST:
-            return tuple(self.string() for _ in range(self._count(4)))
-        if kind == TYPE_DOUBLELIST:
-            return tuple(self.double() for _ in range(self._count(8)))
-        if kind == TYPE_COMPOUND:
-            if nesting >= _MAX_NESTING:
-                raise ProtocolError("compounds are nested too deeply")
-            return [self.typed(nesting + 1) for _ in range(self._count(1))]
-        raise ProtocolError(f"there is no type 0x{kind:02x} that a controller could send")
+        if kind == COLOR:
+            return tuple(self.raw(4))
+        if kind == STRING_LIST:
+            return tuple(self._items(self.string))
+        if kind == DOUBLE_LIST:
+            return tuple(self._items(partial(self.number, "d")))
+        if kind == COMPOUND and nesting < MAX_NESTING:
+            return self._items(partial(self.typed, nesting + 1))
+        raise ProtocolError(f"a value of type 0x{kind:02x} is not expected here")
 
     def typed_bytes(self) -> bytes:
         """Return the bytes of the next value with its type."""
@@ -138,29 +118,34 @@ class Reader:
         return self._data[start : self._at]
 
     def arguments(self) -> list[Any]:
-        """Return the values that are left, in order; those of compounds singly."""
+        """Return the values that are left, in order; those of compounds one by one."""
         values: list[Any] = []
         while self.left:
             values += _flat(self.typed())
         return values
 
-    def _count(self, smallest: int) -> int:
-        """Return a number of items that can be there, each of at least `smallest` bytes."""
-        count = self.integer()
-        if not 0 <= count * smallest <= self.left:
-            raise ProtocolError(f"{count} items were announced where {self.left} bytes are left")
-        return count
+    def _items(self, read: Callable[[], Any]) -> list[Any]:
+        return [read() for _ in range(self._length())]
+
+    def _length(self) -> int:
+        length: int = self.number("i")
+        if not 0 <= length <= self.left:
+            raise ProtocolError(f"{length} items were announced where {self.left} bytes are left")
+        return length
 
 
 def _flat(value: Any) -> list[Any]:
     if not isinstance(value, list):
         return [value]
-    return [inner for part in value for inner in _flat(part)]
+    values = []
+    for part in value:
+        values += _flat(part)
+    return values
 
 
 def message_length(head: bytes) -> int:
-    """Return the bytes that follow the first four of a message."""
-    length: int = _INT.unpack(head)[0] - 4
+    """Return the number of bytes that follow the first four of a message."""
+    length = int.from_bytes(head, "big", signed=True) - 4
     if not 0 <= length <= MAX_MESSAGE_BYTES:
         raise ProtocolError(f"a message of {length + 4} bytes was announced")
     return length
@@ -168,55 +153,52 @@ def message_length(head: bytes) -> int:
 
 def commands_of(body: bytes) -> list[Command]:
     """Return the commands of a message without its first four bytes."""
-    reader, commands = Reader(body), []
-    while reader.left:
+    reader = Reader(body)
+    commands: list[Command] = []
+    while reader.left or not commands:
         length, head = reader.ubyte(), 1
         if length == 0:
-            length, head = reader.integer(), 5
+            length, head = reader.number("i"), 5
         if length <= head:
             raise ProtocolError(f"a command of {length} bytes was announced")
-        content = reader.raw(length - head)
-        commands.append(Command(content[0], content[1:]))
-    if not commands:
-        raise ProtocolError("a message has no command")
+        identifier, *_ = content = reader.raw(length - head)
+        commands.append(Command(identifier, content[1:]))
     return commands
 
 
 def message(content: bytes) -> bytes:
-    """Return what is sent: the content behind its length."""
-    return _INT.pack(len(content) + 4) + content
-
-
-def status(identifier: int, result: int = OK, text: str = "") -> bytes:
-    """Return the answer that every command gets first.
-
-    Clients read its length as one byte, so a long text is cut.
-    """
-    said = text.encode("utf-8")[:200].decode("utf-8", errors="ignore")
-    return command(bytes((identifier, result)) + raw_string(said))
+    """Return what is sent: the content after its length."""
+    return struct.pack("!i", len(content) + 4) + content
 
 
 def command(content: bytes) -> bytes:
-    """Return an identifier and its payload behind their length."""
+    """Return an identifier and its payload after their length."""
     if len(content) < 255:
         return bytes((len(content) + 1,)) + content
-    return b"\x00" + _INT.pack(len(content) + 5) + content
+    return b"\x00" + struct.pack("!i", len(content) + 5) + content
 
 
-def raw_string(value: str) -> bytes:
+def status(identifier: int, result: int = OK, text: str = "") -> bytes:
+    """Return the first answer to every command.
+
+    Args:
+        identifier: that of the command.
+        result: `OK` or `ERROR`.
+        text: message of an error; cut, because clients read the length as one byte.
+    """
+    short = text.encode()[:200].decode(errors="ignore")
+    return command(bytes((identifier, result)) + string(short))
+
+
+def string(value: str) -> bytes:
     """Return a string without its type."""
-    encoded = value.encode("utf-8")
-    return _INT.pack(len(encoded)) + encoded
+    encoded = value.encode()
+    return struct.pack("!i", len(encoded)) + encoded
 
 
-def raw_integer(value: int) -> bytes:
-    """Return an integer without its type."""
-    return _INT.pack(value)
-
-
-def raw_double(value: float) -> bytes:
-    """Return a double without its type."""
-    return _DOUBLE.pack(value)
+def compound(count: int, content: bytes) -> bytes:
+    """Return `count` typed values as one."""
+    return struct.pack("!Bi", COMPOUND, count) + content
 
 
 def pack(form: str, *values: Any) -> bytes:
@@ -228,12 +210,133 @@ def pack(form: str, *values: Any) -> bytes:
     return packer()(form, *values)
 
 
-def compound(count: int, content: bytes) -> bytes:
-    """Return `count` typed values as one."""
-    return bytes((TYPE_COMPOUND,)) + _INT.pack(count) + content
-
-
 def version_answer() -> bytes:
-    """Return the answer to the question for the version, behind its status."""
-    text = raw_string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
-    return command(bytes((GET_VERSION,)) + raw_integer(API_VERSION) + text)
+    """Return the answer to the question for the version, without its status."""
+    text = string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
+    return command(struct.pack("!Bi", VERSION, API_VERSION) + text)
+
+
+def packed(function: str, answer: Any) -> bytes:
+    """Return the typed value of what libsumo answers, as SUMO's own server packs it.
+
+    Args:
+        function: the function of libsumo, which decides where the type in Python does not.
+        answer: what it returned.
+
+    Raises:
+        ProtocolError: if there is no such form.
+    """
+    layout = LAYOUTS.get(function) or LAYOUTS.get(function.partition(".")[2])
+    try:
+        if layout is not None:
+            return layout(answer)
+        return pack(_form_of(answer), answer)
+    except (TypeError, ValueError, AttributeError, struct.error) as error:
+        raise ProtocolError("there is no form for the answer") from error
+
+
+def _form_of(answer: Any) -> str:
+    if isinstance(answer, str):
+        return "s"
+    if isinstance(answer, float):
+        return "d"
+    if not isinstance(answer, tuple):
+        return "i"
+    if all(isinstance(item, str) for item in answer):
+        return "l"
+    if len(answer) == 4 and all(isinstance(item, int) for item in answer):
+        return "c"
+    return {2: "o", 3: "O"}.get(len(answer), "f")
+
+
+def _fields(form: str, values: Iterable[Any]) -> bytes:
+    """Return values as one compound."""
+    return compound(len(form), pack(form, *values))
+
+
+def _rows(form: str, rows: Sequence[Iterable[Any]]) -> bytes:
+    """Return rows of values as one compound that begins with their number."""
+    content = pack("i", len(rows))
+    for row in rows:
+        content += pack(form, *row)
+    return compound(1 + len(rows) * len(form), content)
+
+
+def _objects(form: str, names: str) -> Callable[[Sequence[Any]], bytes]:
+    """Return what packs objects as rows of their attributes."""
+    values = attrgetter(*names.split())
+    return lambda answer: _rows(form, list(map(values, answer)))
+
+
+def _links(answer: Sequence[Sequence[Any]]) -> bytes:
+    """Pack links: libsumo has the lane inside the junction at another position than the wire."""
+    return _rows("ssBBBssd", [(link[0], link[4], *link[1:4], *link[5:]) for link in answer])
+
+
+def _neighbours(answer: Sequence[tuple[str, float]]) -> bytes:
+    content = b""
+    for name, gap_m in answer:
+        content += string(name) + struct.pack("!d", gap_m)
+    return compound(len(answer), content)
+
+
+def _lists(answer: Sequence[Sequence[Sequence[str]]]) -> bytes:
+    count, content = 1, pack("i", len(answer))
+    for links in answer:
+        count += 1 + len(links)
+        content += pack("i", len(links))
+        for link in links:
+            content += pack("l", link)
+    return compound(count, content)
+
+
+def _programs(answer: Sequence[Any]) -> bytes:
+    programs = b""
+    for program in answer:
+        phases = b""
+        for phase in program.getPhases():
+            values = pack("dsdd", phase.duration, phase.state, phase.minDur, phase.maxDur)
+            following = _fields("i" * len(phase.next), phase.next)
+            phases += compound(6, values + following + pack("s", phase.name))
+        pairs = program.subParameter.items()
+        head = pack("sii", program.programID, program.type, program.currentPhaseIndex)
+        head += compound(len(program.getPhases()), phases)
+        programs += compound(5, head + _fields("l" * len(pairs), pairs))
+    return compound(len(answer), programs)
+
+
+def _stage(stage: Any) -> bytes:
+    names = "type vType line destStop edges travelTime cost length intended depart departPos"
+    names += " arrivalPos description"
+    return _fields("isssldddsddds", attrgetter(*names.split())(stage))
+
+
+STOP: Final = "lane endPos stoppingPlaceID stopFlags duration until"
+LAYOUTS: Final[dict[str, Callable[[Any], bytes]]] = {
+    "getLeader": lambda answer: _fields("sd", answer or ("", -1.0)),
+    "getFollower": lambda answer: _fields("sd", answer or ("", -1.0)),
+    "getNeighbors": _neighbours,
+    "getLaneChangeState": lambda answer: _fields("ii", answer),
+    "getBestLanes": lambda answer: _rows("sddbBl", answer),
+    "getJunctionFoes": lambda answer: _rows("sddddssBB", answer),
+    "getNextLinks": _links,
+    "getLinks": _links,
+    "getNextStops": _objects("sdsidd", STOP),
+    "getStops": _objects(
+        "sdsiddddddsssssd",
+        f"{STOP} startPos intendedArrival arrival depart split join actType tripId line speed",
+    ),
+    "getNextTLS": lambda answer: _rows("sidb", [(*light, ord(state)) for *light, state in answer]),
+    "getCollisions": _objects(
+        "ssssddssd",
+        "collider victim colliderType victimType colliderSpeed victimSpeed type lane pos",
+    ),
+    "findRoute": _stage,
+    "findIntermodalRoute": lambda answer: compound(len(answer), b"".join(map(_stage, answer))),
+    "getAllProgramLogics": _programs,
+    "getControlledLinks": _lists,
+    "getShape": lambda answer: pack("p", answer),
+    "getNetBoundary": lambda answer: pack("p", answer),
+    "getParameterWithKey": lambda answer: _fields("ss", answer),
+}
+"""Answers whose form does not follow from their type in Python, by the name of the function."""

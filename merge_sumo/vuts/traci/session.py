@@ -1,80 +1,166 @@
-"""What a TraCI client sees and may do: questions and commands go to the shadow SUMO.
+"""What a TraCI client asks and commands: libsumo's functions of the same names answer.
 
 The session has no socket and does not decide when a step is made. Time runs on over the episodes:
-in each the vehicles depart, and when it ends they arrive. What a client has subscribed to it gets
-with the answer to every step; SUMO's own results are those before the vehicles are put back, so
-every value is asked for anew.
+in each the vehicles depart, and when it ends they arrive. A client gets what it has subscribed to
+with the answer to every step. SUMO's own results are those before the vehicles are put where those
+of the campaign are, so every value is read again.
 """
 
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from typing import Final, NamedTuple, TypeVar
+from enum import Enum
+from functools import cache
+from typing import Any, Final, NamedTuple
 
 from merge_sumo.scenario.scenario import DT_S, VEHICLES
-from merge_sumo.sumo.shadow_sumo import NAME_OF_VUT, RefusedError, ShadowSumo, State
-from merge_sumo.sumo.traci_names import name_of, named
-from merge_sumo.vuts.traci import commands
-from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.commands import Effect
+from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, RefusedError, State
+from merge_sumo.sumo.traci_names import functions, name_of
 from merge_sumo.vuts.traci.protocol import (
+    ERROR,
     GET_JUNCTION,
-    GET_SIMULATION,
     GET_VEHICLE,
+    LON_LAT,
+    OK,
+    PLACES,
+    ROAD,
+    SET_ORDER,
+    SET_VEHICLE,
+    VERSION,
     Command,
+    ProtocolError,
     Reader,
+    command,
     pack,
+    packed,
+    status,
+    string,
+    version_answer,
 )
-from merge_sumo.vuts.traci.questions import call_of_question, packed
-
-T = TypeVar("T")
 
 QUESTIONS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
-SET: Final = 0x20
-SUBSCRIBE, AROUND = 0x30, -0x20
-RESPONSE: Final = 0x10
-"""Distances from there to the identifiers of a domain's commands, of its subscriptions and of its
-context subscriptions, and from questions and subscriptions to those of their answers."""
-FOR_EVER: Final = -1073741824.0
+SET, SUBSCRIBE, CONTEXT, RESPONSE = 0x20, 0x30, -0x20, 0x10
+"""Offsets from the questions of a domain to its commands, subscriptions and context subscriptions,
+and from questions and subscriptions to their answers."""
+SERVED_BY: Final = {
+    "trafficlight.getNemaPhaseCalls": "trafficlight.getParameter",
+    "vehicle.couldChangeLane": "vehicle.getLaneChangeState",
+    "vehicle.getLeftFollowers": "vehicle.getNeighbors",
+}
+"""Of several functions that read one variable, by the first: the one that SUMO's server calls."""
+DISTANCES: Final = ("simulation.getDistance2D", "vehicle.getDrivingDistance")
 WITH_PARAMETER: Final = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
 """Functions whose variables have a parameter in a subscription."""
-OWN_TYPE: Final = f"{NAME_OF_VUT}@{NAME_OF_VUT}"
+OWN_TYPE: Final = f"{VUT_ID}@{VUT_ID}"
 """What SUMO calls the type of a vehicle that has numbers of its own."""
 STAYED: Final = (
     "vut came to the end of the acceleration lane without a lane change: it departs in lane change "
     "mode 0, in which changeLane merges it at once; in 1621, SUMO's own, SUMO merges it"
 )
-"""Noted of a controller that may not know of the lane."""
 OFF_THE_LANE_M: Final = 2.0
 """A vehicle that its own model moves is on a lane up to here: half of the width of a wide one."""
-EXPECTED: Final = 2
+COMING: Final = 2
 """Vehicles that are expected between two episodes."""
 
 
-@dataclass(frozen=True, slots=True)
-class Subscription:
-    """Variables of an object, or of those around it, sent from begin to end."""
+class Effect(Enum):
+    """What becomes of a command."""
 
-    getter: int  # identifier of the questions of the object's domain
-    object_id: str
-    begin_s: float
-    end_s: float
+    CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
+    ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
+    REACHED = "Taken as what a vehicle model of the controller's own reaches in the step"
+    OWN_KEYS = "Carried out by SUMO on the VUT, for keys without a dot"
+    LOOKS = "Accepted, changes nothing"
+    IN_VAIN = "Accepted, changes nothing here but would in SUMO"
+    REFUSED = "Refused: the scenario and the campaign decide it"
+
+
+SPEEDS: Final = frozenset({"setSpeed", "slowDown", "setAcceleration", "setSpeedMode"})
+GAPS_AND_STOPS: Final = frozenset({"openGap", "setStop", "resume", "setLaneChangeMode"})
+MODEL: Final = frozenset(
+    {
+        *("setMaxSpeed", "setAccel", "setDecel", "setEmergencyDecel", "setApparentDecel"),
+        *("setTau", "setMinGap", "setImperfection", "setSpeedFactor"),
+    }
+)
+"""Numbers of SUMO's car-following model."""
+EFFECTS: Final = {
+    Effect.CARRIED_OUT: SPEEDS | GAPS_AND_STOPS | MODEL,
+    Effect.ON_A_LANE: frozenset({"changeLane", "changeLaneRelative"}),
+    Effect.REACHED: frozenset({"setPreviousSpeed", "moveToXY"}),
+    Effect.LOOKS: frozenset(
+        {
+            *("setColor", "setSignals", "setShapeClass", "setWidth", "setHeight", "setLine"),
+            *("highlight", "setEmissionClass", "setBoardingDuration"),
+        }
+    ),
+    Effect.IN_VAIN: frozenset(
+        {
+            *("setMass", "setLateralAlignment", "setMaxSpeedLat", "setMinGapLat", "changeSublane"),
+            *("setImpatience", "setSpeedDeviation", "setRoutingMode", "setAdaptedTraveltime"),
+            *("setEffort", "setVia", "updateBestLanes", "rerouteTraveltime", "rerouteEffort"),
+            "setParameter",
+        }
+    ),
+}
+"""Commands on vehicles and their types by what becomes of them; others are refused."""
+ONLY_SEEN: Final = ("gui", "poi", "polygon")
+"""Domains of objects that are only looked at."""
+
+
+@cache
+def effect_of(names: tuple[str, ...]) -> Effect:
+    """Return what becomes of the commands that share a number."""
+    domain = names[0].partition(".")[0] if names else ""
+    own = {name.partition(".")[2] for name in names}
+    if "vehicle.setParameter" in names:
+        return Effect.OWN_KEYS
+    if domain in ("vehicle", "vehicletype"):
+        for effect, accepted in EFFECTS.items():
+            if not own.isdisjoint(accepted):
+                return effect
+    elif domain in ONLY_SEEN or "setParameter" in own:
+        return Effect.LOOKS
+    return Effect.REFUSED
+
+
+def is_answered(names: tuple[str, ...]) -> bool:
+    """Return whether SUMO is asked what the questions that share a number ask.
+
+    Not of its window, without which SUMO may end, nor of signals of trains.
+    """
+    return bool(names) and not names[0].startswith("gui.") and "Constraint" not in names[0]
+
+
+class NotFiniteError(Exception):
+    """A command with a number that is not finite; the text is the command."""
+
+
+class Subject(NamedTuple):
+    """An object of a domain whose values, or the objects around it, are subscribed to.
+
+    Attributes:
+        getter: identifier of the questions of its domain.
+        name: its id.
+        around: identifier of the questions of the objects around it, and their largest distance in
+            m; None where its own values are subscribed to.
+    """
+
+    getter: int
+    name: str
     around: tuple[int, float] | None = None
-    """Identifier of the questions of those around it, and how far away they are at most, in m."""
-    variables: tuple[tuple[int, bytes], ...] = ()
-    """Numbers of the variables, each with its parameter as it was sent."""
 
 
 class _Place(NamedTuple):
-    """Where a client moves the VUT to: along its lanes, in the plane, beside the lane that ends."""
+    """Where a client moves the VUT to: along its lanes, in the plane, on the mainline or not."""
 
     x_m: float
     point: tuple[float, float]
-    beside: bool
+    on_mainline: bool
 
 
 class Session:
@@ -84,244 +170,295 @@ class Session:
         notes: sentences on what a command does less than in SUMO, once each.
         in_vain: commands of this episode that change nothing here, and would in SUMO.
         expected: whether more vehicles may come.
-        departed: vehicles that departed since the client was last answered; and `arrived`.
-        subscriptions: in the order in which they were made.
+        subscriptions: variables, each with its parameter as it was sent.
     """
 
-    def __init__(self, sumo: ShadowSumo) -> None:
+    def __init__(self, sumo: MirrorSimulation) -> None:
         self.sumo = sumo
-        self.subscriptions: list[Subscription] = []
+        self.subscriptions: dict[Subject, dict[int, bytes]] = {}
         self.notes: list[str] = []
         self.in_vain: set[str] = set()
         self.expected = True
-        self.departed: list[str] = []
-        self.arrived: list[str] = []
         self._reached_mps: dict[str, float] = {}
-        """Speeds at the end of the coming step, by the commands of REACHED that told them."""
-        self._moved: list[_Place | None] = [None, None]
-        """Where the client moved the VUT to in the last step, and in the coming one."""
-        self._commands_speeds = False  # by the client, in this episode
-        self._knows_of_the_lane = False
-        """Whether the client has ever commanded anything of lanes."""
-
-    @property
-    def driving(self) -> bool:
-        """Whether the vehicles of an episode are on the road."""
-        return bool(self.sumo.at_m)
+        """Speeds at the end of the coming step, by the commands that gave them."""
+        self._moved: _Place | None = None
+        """Where the client moved the VUT to in the last step."""
+        self._moves: _Place | None = None
+        """Where it moves it to in the coming one."""
+        self._commands_speeds = False  # in this episode
+        self._knows_of_the_lane = False  # it has commanded anything of lanes
+        self.answered()
 
     def answered(self) -> None:
-        """Forget which vehicles departed and arrived: the client knows."""
-        self.departed.clear()
-        self.arrived.clear()
+        """Forget the departures and arrivals that the client has read."""
+        self.sumo.departed.clear()
+        self.sumo.arrived.clear()
 
     def enter(self, states: Mapping[str, State], seed: int = 0) -> None:
         """Make a step in which the vehicles depart; `seed` is a parameter of the VUT."""
-        self._moved, self._reached_mps = [None, None], {}
+        self._moved, self._moves, self._reached_mps = None, None, {}
         self._commands_speeds = False
         self.in_vain.clear()
         self.sumo.enter(states)
-        self.sumo.call("vehicle.setParameter", NAME_OF_VUT, "seed", str(seed))
-        self.departed += states
-
-    def position(self, name: str) -> tuple[float, ...]:
-        """Return where a vehicle is in the plane; as in SUMO, the VUT is where it was moved to."""
-        moved = self._moved[0] if name == NAME_OF_VUT else None
-        return moved.point if moved else self.sumo.point(name)[2:4]
+        self.sumo.call("vehicle.setParameter", VUT_ID, "seed", str(seed))
 
     def step(self) -> float | None:
         """Make a step; return the speed that the VUT has reached, or that SUMO gives it."""
-        v_mps = self._noting_arrivals(self.sumo.step)
+        v_mps = self.sumo.step()
         if v_mps is not None and self._reached_mps:
             # setPreviousSpeed goes before moveToXY: a place does not say how fast it is passed.
             _, v_mps = max(self._reached_mps.items())
             self.sumo.by_sumo = False
-            self.sumo.wants_to_merge |= self._moved[1] is not None and self._moved[1].beside
+            self.sumo.wants_to_merge |= self._moves is not None and self._moves.on_mainline
         if self.sumo.was_forced and not self._knows_of_the_lane:
             self._note(STAYED)
         return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles into their states after the step; `merged` is of the VUT."""
-        self._noting_arrivals(lambda: self.sumo.put(states, merged=merged))
-        if self._reached_mps and not self._commands_speeds and NAME_OF_VUT in self.sumo.at_m:
+        self.sumo.put(states, merged=merged)
+        if self._reached_mps and not self._commands_speeds and VUT_ID in self.sumo.at_m:
             # As from its departure on, it keeps its speed where nothing is commanded.
-            self.sumo.call("vehicle.setSpeed", NAME_OF_VUT, states[NAME_OF_VUT][1])
+            self.sumo.call("vehicle.setSpeed", VUT_ID, states[VUT_ID][1])
 
     def clear(self) -> None:
-        """End the episode: all vehicles arrive, and what was subscribed of them ends."""
-        self._noting_arrivals(self.sumo.clear)
-        self.subscriptions = [
-            kept
-            for kept in self.subscriptions
-            if kept.getter != GET_VEHICLE or kept.object_id not in VEHICLES
-        ]
-
-    def _noting_arrivals(self, change: Callable[[], T]) -> T:
-        before = list(self.sumo.at_m)
-        result = change()
-        self.arrived += [name for name in before if name not in self.sumo.at_m]
-        return result
+        """End the episode: all vehicles arrive, and subscriptions to them end."""
+        self.sumo.clear()
+        for subject in list(self.subscriptions):
+            if subject.getter == GET_VEHICLE and subject.name in VEHICLES:
+                del self.subscriptions[subject]
 
     def results(self) -> bytes:
-        """Return the answer to a step behind its status: the subscribed values."""
-        self._moved, self._reached_mps = [self._moved[1], None], {}
+        """Return the answer to a step without its status: the subscribed values."""
+        self._moved, self._moves, self._reached_mps = self._moves, None, {}
         answers = []
-        for subscription in self.subscriptions:
-            end_s = math.inf if subscription.end_s == FOR_EVER else subscription.end_s
-            if subscription.begin_s <= self.sumo.time_s <= end_s:
-                # Of what SUMO cannot tell any more, nothing is sent.
-                with suppress(RefusedError):
-                    answers.append(self._result(subscription))
-        return tp.raw_integer(len(answers)) + b"".join(answers)
+        for subject, variables in self.subscriptions.items():
+            with suppress(RefusedError):  # SUMO has it no more
+                answers.append(self._result(subject, variables))
+        return struct.pack("!i", len(answers)) + b"".join(answers)
 
-    def handle(self, command: Command) -> bytes:
+    def handle(self, request: Command) -> bytes:
         """Return the answer to any command but a step or a close; raises `ProtocolError`."""
-        identifier = command.identifier
+        identifier, reader = request.identifier, Reader(request.payload)
         try:
-            return tp.status(identifier) + self._answer(identifier, Reader(command.payload))
+            return status(identifier) + self._answer(identifier, reader)
         except RefusedError as refused:
-            return tp.status(identifier, tp.ERROR, str(refused))
+            return status(identifier, ERROR, str(refused))
 
     def _answer(self, identifier: int, reader: Reader) -> bytes:
-        """Return the answer behind its status."""
+        """Return the answer without its status."""
         if identifier in QUESTIONS:
-            variable, object_id = reader.ubyte(), reader.string()
-            value = self._value(identifier, variable, object_id, reader)
-            head = bytes((identifier + RESPONSE, variable)) + tp.raw_string(object_id)
-            return tp.command(head + value)
+            variable, name = reader.ubyte(), reader.string()
+            value = self._value(identifier, variable, name, reader)
+            return command(bytes((identifier + RESPONSE, variable)) + string(name) + value)
         if identifier - SET in QUESTIONS:
-            self._set(identifier, reader)
+            self._command(identifier, reader)
             return b""
-        for kind in (SUBSCRIBE, AROUND):
-            if identifier - kind in QUESTIONS:
-                return self._subscribe(identifier - kind, reader, around=kind == AROUND)
-        if identifier == tp.GET_VERSION:
-            return tp.version_answer()
-        if identifier == tp.SET_ORDER:
-            reader.integer()
+        if identifier - SUBSCRIBE in QUESTIONS:
+            return self._subscribe(Subject(identifier - SUBSCRIBE, _subscribed(reader)), reader)
+        if identifier - CONTEXT in QUESTIONS:
+            name, around = _subscribed(reader), (reader.ubyte(), reader.number("d"))
+            return self._subscribe(Subject(identifier - CONTEXT, name, around), reader)
+        if identifier == VERSION:
+            return version_answer()
+        if identifier == SET_ORDER:
             return b""
         raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
 
-    def _value(self, getter: int, variable: int, object_id: str, reader: Reader) -> bytes:
+    # Questions
+
+    def _value(self, getter: int, variable: int, name: str, reader: Reader) -> bytes:
         """Return the typed value of a variable; raises `RefusedError` where SUMO has none."""
-        own = OWN_ANSWERS.get((getter, variable))
-        if own is not None and (getter == GET_SIMULATION or object_id in self.sumo.at_m):
-            return own(self, object_id)
-        if (getter, variable) not in named():
+        names = functions().get((getter, variable), ())
+        if not is_answered(names):
             raise RefusedError(f"merge-sumo does not answer {name_of(getter, variable)}")
-        call = call_of_question(named()[getter, variable], object_id, reader)
-        for point in call.on_roads:
-            self.sumo.call("simulation.convertRoad", *point)
-        return packed(call, self.sumo.call(call.function, *call.arguments))
-
-    def _subscribe(self, getter: int, reader: Reader, *, around: bool) -> bytes:
-        """Subscribe to variables of an object, or of those around it; return the first values.
-
-        As in SUMO it adds to one that differs in its variables alone; one without variables ends
-        all of the object.
-        """
-        begin_s, end_s, object_id = reader.double(), reader.double(), reader.string()
-        near = (reader.ubyte(), reader.double()) if around else None
-        of = near[0] if near else getter
-        variables = []
-        for _ in range(reader.ubyte()):
-            variable = reader.ubyte()
-            name = named().get((of, variable), ("",))[-1].partition(".")[2]
-            with_parameter = not near and name in WITH_PARAMETER
-            variables.append((variable, reader.typed_bytes() if with_parameter else b""))
-        wanted = Subscription(getter, object_id, begin_s, end_s, near, tuple(variables))
-        if not variables:
-            self.subscriptions = [
-                kept
-                for kept in self.subscriptions
-                if replace(kept, begin_s=begin_s, end_s=end_s, variables=()) != wanted
-            ]
-            return b""
-        others = []
-        for kept in self.subscriptions:
-            if replace(kept, variables=wanted.variables) == wanted:
-                both = dict.fromkeys((*kept.variables, *wanted.variables))
-                wanted = replace(wanted, variables=tuple(both))
+        function = SERVED_BY.get(names[0], names[0])
+        if function in OWN_ANSWERS and (getter != GET_VEHICLE or name in self.sumo.at_m):
+            return packed(function, OWN_ANSWERS[function](self, name))
+        try:
+            if function == "simulation.convert2D":
+                return self._conversion(reader)
+            if function in DISTANCES:
+                function, arguments = self._distance(function, name, reader)
             else:
-                others.append(kept)
-        answer = self._result(wanted)
-        self.subscriptions = [*others, wanted]
+                of_all = not name or function.endswith(("getIDList", "getIDCount"))
+                arguments = [*([] if of_all else [name]), *reader.arguments()]
+            return packed(function, self.sumo.call(function, *arguments))
+        except ProtocolError as error:
+            raise RefusedError(f"merge-sumo does not answer {function}: {error}") from error
+
+    def _conversion(self, reader: Reader) -> bytes:
+        """Return a place in other coordinates."""
+        others = reader.count() - len(("place", "kind"))
+        kind, place = reader.place()
+        target = reader.typed()
+        if not (isinstance(target, int) and 0 <= target < len(PLACES)):
+            raise ProtocolError(f"there are no coordinates {target!r}")
+        letter = PLACES[target]
+        if target == ROAD:
+            v_class = [reader.typed() for _ in range(others)]
+            function, arguments = "convertRoad", [*place[:2], kind == LON_LAT, *v_class]
+        elif kind == ROAD:
+            function = "convert2D" if letter.islower() else "convert3D"
+            arguments = [*place, letter in "gG"]
+        elif letter.islower():
+            function, arguments = "convertGeo", [*place[:2], PLACES[kind] in "gG"]
+        else:
+            raise ProtocolError(f"there are no coordinates {target}")
+        return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
+
+    def _distance(self, function: str, name: str, reader: Reader) -> tuple[str, list[Any]]:
+        """Return what measures from a vehicle to a place, or from one place to another."""
+        vehicle = [name] if name else []
+        kinds, ends = [], []
+        for _ in range(reader.count() - 1):
+            kind, place = reader.place()
+            kinds.append(kind)
+            ends.append(place)
+        driving = bool(reader.ubyte())
+        points = []
+        for place in ends:
+            points += place[:2]
+        if all(kind == ROAD for kind in kinds):
+            if not vehicle:
+                return "simulation.getDistanceRoad", [*points, driving]
+            return function, [name, *points, *(place[2] for place in ends)]
+        on_earth = LON_LAT in kinds
+        if driving or vehicle:
+            for place in ends:  # where there is no road, SUMO would end
+                v_class = "passenger" if vehicle else "ignoring"
+                self.sumo.call("simulation.convertRoad", *place[:2], on_earth, v_class)
+        if vehicle:
+            return f"{function}2D", [name, *points]
+        return function, [*points, on_earth, driving]
+
+    def position(self, name: str) -> tuple[float, ...]:
+        """Return where a vehicle is in the plane; as in SUMO, the VUT is where it was moved to."""
+        if name == VUT_ID and self._moved is not None:
+            return self._moved.point
+        return self.sumo.point(name)[2:4]
+
+    # Subscriptions
+
+    def _subscribe(self, subject: Subject, reader: Reader) -> bytes:
+        """Add to what is subscribed of a subject; return the first values.
+
+        A subscription without variables ends those of the subject.
+        """
+        of = subject.around[0] if subject.around else subject.getter
+        variables = dict(self.subscriptions.get(subject, {}))
+        count = reader.ubyte()
+        for _ in range(count):
+            variable = reader.ubyte()
+            name = functions().get((of, variable), ("",))[-1].partition(".")[2]
+            takes_parameter = subject.around is None and name in WITH_PARAMETER
+            variables[variable] = reader.typed_bytes() if takes_parameter else b""
+        if not count:
+            self.subscriptions.pop(subject, None)
+            return b""
+        answer = self._result(subject, variables)
+        self.subscriptions[subject] = variables
         return answer
 
-    def _result(self, subscription: Subscription) -> bytes:
-        getter, object_id, near = subscription.getter, subscription.object_id, subscription.around
-        if getter == GET_VEHICLE and (object_id or near):
-            self._check_vehicle(object_id)
-        kind = AROUND if near else SUBSCRIBE
-        content = bytes((getter + kind + RESPONSE,)) + tp.raw_string(object_id)
-        count = bytes((len(subscription.variables),))
-        if near is None:
-            return tp.command(content + count + self._values(getter, object_id, subscription))
-        of, range_m = near
-        found = self._around(getter, object_id, of, range_m)
-        content += bytes((of,)) + count + tp.raw_integer(len(found))
-        for name in found:
-            content += tp.raw_string(name) + self._values(of, name, subscription)
-        return tp.command(content)
+    def _result(self, subject: Subject, variables: Mapping[int, bytes]) -> bytes:
+        getter, name, around = subject
+        if getter == GET_VEHICLE and (name or around):
+            self._check_vehicle(name)
+        count = bytes((len(variables),))
+        if around is None:
+            head = bytes((getter + SUBSCRIBE + RESPONSE,)) + string(name) + count
+            return command(head + self._values(getter, name, variables))
+        of, range_m = around
+        found = self._around(getter, name, of, range_m)
+        content = bytes((getter + CONTEXT + RESPONSE,)) + string(name) + bytes((of,)) + count
+        content += struct.pack("!i", len(found))
+        for other in found:
+            content += string(other) + self._values(of, other, variables)
+        return command(content)
 
-    def _values(self, getter: int, object_id: str, subscription: Subscription) -> bytes:
-        """Return the values of the variables of a subscription for an object of a domain."""
+    def _values(self, getter: int, name: str, variables: Mapping[int, bytes]) -> bytes:
         content = b""
-        for variable, parameter in subscription.variables:
+        for variable, parameter in variables.items():
             try:
-                value, code = self._value(getter, variable, object_id, Reader(parameter)), tp.OK
+                value, result = self._value(getter, variable, name, Reader(parameter)), OK
             except RefusedError as refused:
-                value, code = pack("s", refused), tp.ERROR
-            content += bytes((variable, code)) + value
+                value, result = pack("s", refused), ERROR
+            content += bytes((variable, result)) + value
         return content
 
-    def _around(self, getter: int, object_id: str, of: int, range_m: float) -> list[str]:
-        """Return the objects of a domain that are at most so far away from an object."""
+    def _around(self, getter: int, name: str, of: int, range_m: float) -> list[str]:
+        """Return the objects of a domain that are at most `range_m` away from an object."""
         if getter == GET_VEHICLE:
-            point = self.position(object_id)
+            point = self.position(name)
         elif getter == GET_JUNCTION:
-            point = self.sumo.call("junction.getPosition", object_id)
+            point = self.sumo.call("junction.getPosition", name)
         else:
             raise RefusedError("there are context subscriptions of vehicles and junctions")
         if of != GET_VEHICLE:
             return self.sumo.around(point, of, range_m)
         # SUMO may still have them where they were before they were put back.
         names = sorted(self.sumo.at_m)
-        return [name for name in names if math.dist(point, self.position(name)) <= range_m]
+        return [other for other in names if math.dist(point, self.position(other)) <= range_m]
 
-    def _set(self, command: int, reader: Reader) -> None:
+    # Commands
+
+    def _command(self, setter: int, reader: Reader) -> None:
         """Have a command carried out, or note that it changes nothing, or refuse it."""
-        variable, object_id = reader.ubyte(), reader.string()
-        functions = named().get((command, variable), ())
-        name, effect = name_of(command, variable), commands.effect_of(functions)
+        variable, target = reader.ubyte(), reader.string()
+        names = functions().get((setter, variable), ())
+        name, effect = name_of(setter, variable), effect_of(names)
         if effect is Effect.REFUSED:
             raise RefusedError(
                 f"merge-sumo does not carry out {name}: the scenario and the campaign decide it"
             )
-        if command == tp.SET_VEHICLE:
-            self._check_vehicle(object_id)
+        if setter == SET_VEHICLE:
+            self._check_vehicle(target)
         self._knows_of_the_lane |= "Lane" in name
         if effect is Effect.OWN_KEYS:
             key, *value = reader.arguments() or [""]
-            if object_id == NAME_OF_VUT and "." not in str(key):
-                self.sumo.call(commands.OWN_KEYS, object_id, key, *value)
+            if target == VUT_ID and "." not in str(key):  # such keys are of devices and models
+                self.sumo.call("vehicle.setParameter", target, key, *value)
                 return
-            effect = Effect.NOTHING
-        if effect is Effect.NOTHING or (effect is Effect.ON_A_LANE and not self.sumo.has_lane):
+            effect = Effect.IN_VAIN
+        if effect is Effect.ON_A_LANE and not self.sumo.has_lane:
+            effect = Effect.IN_VAIN
+        if effect in (Effect.LOOKS, Effect.IN_VAIN):
             self._note(f"{name} is accepted and changes nothing here")
-            if commands.is_in_vain(functions):
+            if effect is Effect.IN_VAIN:
                 self.in_vain.add(name)
             return
-        if object_id not in (NAME_OF_VUT, OWN_TYPE):
-            raise RefusedError(f"{object_id!r} is not the controller's to command")
-        function, arguments, *_ = commands.call_of_command(functions, object_id, reader)
-        if effect is Effect.REACHED:
-            self._reach(function, [value for value in arguments if isinstance(value, float)])
+        if target not in (VUT_ID, OWN_TYPE):
+            raise RefusedError(f"{target!r} is not the controller's to command")
+        self._drive(names[-1], target, reader.arguments())
+
+    def _drive(self, function: str, target: str, arguments: list[Any]) -> None:
+        """Carry out a command on the VUT or its type.
+
+        Raises:
+            RefusedError: for a value that SUMO's models cannot have.
+            NotFiniteError: for another number that is not finite: the VUT would drive on as if
+                nothing was commanded.
+        """
+        name = function.partition(".")[2]
+        numbers = [value for value in arguments if isinstance(value, float)]
+        for number in numbers if name in MODEL else ():
+            if not 0.0 <= number < math.inf or (name, number) == ("setMaxSpeed", 0.0):
+                raise RefusedError(f"Invalid value {number:g} of {function}.")
+        if not all(map(math.isfinite, numbers)):
+            raise NotFiniteError(f"{function}({', '.join(f'{n:g}' for n in numbers)})")
+        if name in EFFECTS[Effect.REACHED]:
+            self._reach(function, numbers)
             return
-        self._commands_speeds |= function.partition(".")[2] in commands.SPEEDS
-        if function == "vehicle.changeLane":
-            self._check_lane(*arguments[:2])
-        self.sumo.call(function, *arguments)
+        self._commands_speeds |= name in SPEEDS
+        if function == "vehicle.changeLaneRelative":
+            lane, duration_s, *relative = arguments
+            arguments = [lane, duration_s]
+            if not relative:  # a third value marks an offset
+                function = "vehicle.changeLane"
+                self._check_lane(target, lane)
+        elif function == "vehicle.openGap" and arguments[:2] == [-1.0, -1.0]:
+            function, arguments = "vehicle.deactivateGapControl", []
+        self.sumo.call(function, target, *arguments)
 
     def _reach(self, function: str, numbers: Sequence[float]) -> None:
         """Take the speed, or the place (x, y), that the VUT has at the end of the coming step."""
@@ -332,17 +469,17 @@ class Session:
                 raise RefusedError("Previous speed must not be negative.")
             self._reached_mps[function] = numbers[0]
             return
-        paths = [self.sumo.path(NAME_OF_VUT), self.sumo.road.mainline][: 1 + self.sumo.has_lane]
+        paths = [self.sumo.path(VUT_ID), self.sumo.road.mainline][: 1 + self.sumo.has_lane]
         x, y = numbers[:2]
-        away_m, x_m, beside = min((*path.nearest(x, y), i) for i, path in enumerate(paths))
+        away_m, x_m, number = min((*path.nearest(x, y), i) for i, path in enumerate(paths))
         if not away_m <= OFF_THE_LANE_M:
             raise RefusedError(
                 f"{function} takes points up to {OFF_THE_LANE_M} m from the lane of the VUT: "
                 f"this one is {away_m:.4g} m away"
             )
         # By eq. (4) the VUT has this speed from the end of the step on, and comes elsewhere.
-        before_m = self._moved[0].x_m if self._moved[0] else self.sumo.at_m[NAME_OF_VUT]
-        self._moved[1] = _Place(x_m, (x, y), bool(beside))
+        before_m = self._moved.x_m if self._moved else self.sumo.at_m[VUT_ID]
+        self._moves = _Place(x_m, (x, y), number > 0)
         self._reached_mps[function] = (x_m - before_m) / DT_S
 
     def _check_vehicle(self, name: str) -> None:
@@ -361,18 +498,26 @@ class Session:
             self.notes.append(sentence)
 
 
-OWN_ANSWERS: Final[dict[tuple[int, int], Callable[[Session, str], bytes]]] = {
+def _subscribed(reader: Reader) -> str:
+    """Return the id of the object of a subscription, which holds from now on until it is ended."""
+    reader.raw(16)  # its begin and its end
+    return reader.string()
+
+
+OWN_ANSWERS: Final[dict[str, Callable[[Session, str], Any]]] = {
     # SUMO's own answers to these are those before the vehicle was put back.
-    (GET_VEHICLE, 0x42): lambda s, name: pack("o", s.position(name)),  # getPosition
-    (GET_VEHICLE, 0x39): lambda s, name: pack("O", (*s.position(name), 0.0)),  # in space
-    (GET_VEHICLE, 0x43): lambda s, name: pack("d", s.sumo.point(name).angle_deg),
+    "vehicle.getPosition": lambda session, name: session.position(name),
+    "vehicle.getPosition3D": lambda session, name: (*session.position(name), 0.0),
+    "vehicle.getAngle": lambda session, name: session.sumo.point(name).angle_deg,
     # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
-    (GET_SIMULATION, 0x73): lambda s, _: pack("i", len(s.departed)),
-    (GET_SIMULATION, 0x74): lambda s, _: pack("l", s.departed),
-    (GET_SIMULATION, 0x71): lambda s, _: pack("i", len(s.departed)),  # loaded
-    (GET_SIMULATION, 0x72): lambda s, _: pack("l", s.departed),
-    (GET_SIMULATION, 0x79): lambda s, _: pack("i", len(s.arrived)),
-    (GET_SIMULATION, 0x7A): lambda s, _: pack("l", s.arrived),
-    (GET_SIMULATION, 0x7D): lambda s, _: pack("i", max(len(s.sumo.at_m), EXPECTED * s.expected)),
+    "simulation.getDepartedNumber": lambda session, _: len(session.sumo.departed),
+    "simulation.getDepartedIDList": lambda session, _: tuple(session.sumo.departed),
+    "simulation.getLoadedNumber": lambda session, _: len(session.sumo.departed),
+    "simulation.getLoadedIDList": lambda session, _: tuple(session.sumo.departed),
+    "simulation.getArrivedNumber": lambda session, _: len(session.sumo.arrived),
+    "simulation.getArrivedIDList": lambda session, _: tuple(session.sumo.arrived),
+    "simulation.getMinExpectedNumber": lambda session, _: max(
+        len(session.sumo.at_m), COMING * session.expected
+    ),
 }
-"""What is answered here and not by SUMO, by the numbers of domain and variable."""
+"""What SUMO cannot know here."""

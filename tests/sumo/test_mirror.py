@@ -1,4 +1,4 @@
-"""The shadow SUMO beside ours: its vehicles are where ours are, on whatever road."""
+"""The mirror simulation: its vehicles are where ours are, on whatever road."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 from foreign_nets import LANE_M, LANES, lane_corridor_of
-from traci_pair import ToSession, close_shadow, shadow
+from traci_pair import ToSession, close_mirror, mirror
 
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
@@ -17,14 +17,14 @@ from merge_sumo.vuts.traci.session import Session
 @pytest.fixture(autouse=True)
 def _closed_in_the_end():
     yield
-    close_shadow()
+    close_mirror()
 
 
 @pytest.mark.parametrize("name", ["roundabout", "us23-traffic"])
 def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name, tmp_path):
     scenario = named_scenario(name)
     road = road_for(scenario)
-    sumo = shadow(tmp_path, scenario, road)
+    sumo = mirror(tmp_path, scenario, road)
     names = VEHICLES[: scenario.vehicles]
     for episode in range(2):  # they may come again
         for step in range(60):
@@ -48,7 +48,7 @@ def test_the_sumo_that_answers_has_every_vehicle_where_it_is(name, tmp_path):
 
 def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answered_for(tmp_path):
     scenario = named_scenario("roundabout")
-    session = Session(shadow(tmp_path, scenario, road_for(scenario)))
+    session = Session(mirror(tmp_path, scenario, road_for(scenario)))
     for number, x_m in enumerate((-50.0, 100.0, 600.0, 610.0)):
         states = {"pov": (x_m, 10.0, 0.0), "vut": (-40.0, 10.0, 0.0)}
         if number:
@@ -59,7 +59,7 @@ def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answere
     vehicle = ToSession(session).vehicle
     assert vehicle.getIDList() == ("vut",)
     assert vehicle.getSpeed("vut") == 10.0
-    assert session.arrived == ["pov"]
+    assert session.sumo.arrived == ["pov"]
     session.step()
     session.clear()
     session.enter({"pov": (-50.0, 10.0, 0.0), "vut": (240.0, 10.0, 0.0)})
@@ -73,7 +73,7 @@ def test_who_drives_beyond_the_end_of_the_net_arrives_and_the_others_are_answere
 @pytest.mark.parametrize("name", LANES)
 def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_wish_in_that_step(name, tmp_path):
     road = lane_corridor_of(name, tmp_path)
-    session = Session(shadow(tmp_path, replace(US23, lane_m=LANE_M), road))
+    session = Session(mirror(tmp_path, replace(US23, lane_m=LANE_M), road))
     vehicle, v_mps = ToSession(session).vehicle, 15.0
     begin_m, end_m = road.lane_m or (0.0, 0.0)
     for merges_m in (begin_m + 1.0, (begin_m + end_m) / 2.0, end_m - 8.0, None):

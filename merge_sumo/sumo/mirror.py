@@ -1,13 +1,13 @@
-"""The shadow SUMO: it has the net as it is in its file, and decides what commands to the VUT mean.
+"""A second SUMO with the net as it is in its file, in which a TraCI client sees and commands cars.
 
-Ours hosts copies of two lanes under other names. This one has all of the road by the ids of the
-file. After each of its steps the vehicles are put where ours has them. It runs as libsumo in a
-process of its own (`child.py`), so no port is open.
+The SUMO of a campaign hosts copies of two lanes under other names. This one has the whole road by
+the ids of the file, and decides what commands to the VUT mean. After each of its steps the vehicles
+are put where those of the campaign are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,70 +23,75 @@ from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_lib
 
 NET: Final = "road.net.xml"
 TYPES: Final = "types.add.xml"
-SETUP: Final = "setup.json"
-SHADOW_OPTIONS: Final = (*SUMO_OPTIONS, "--collision.action", "warn")
-"""It tells controllers of collisions, which change nothing."""
-COMMANDED_VUT: Final = 38
-"""Speed mode of the VUT as it departs: its limits of acceleration act, SUMO's checks do not."""
+ROAD: Final = "road.json"
+OPTIONS: Final = (*SUMO_OPTIONS, "--collision.action", "warn")
+"""SUMO reports collisions, which change nothing."""
+DEPARTURE_SPEED_MODE: Final = 38
+"""Of the VUT: its limits of acceleration act, SUMO's checks of safety do not."""
 COLOURS: Final = (*rgb("pov"), 255), (*rgb("vut"), 255)
 """Of the cars of the mainline, and of the VUT."""
 FASTEST_MPS: Final = 45.0
 """Speed that a car can drive wherever the road allows less; the limit of the shipped road."""
-WIDTH_M: Final = 1.8
-HEIGHT_M: Final = 1.5
-NAME_OF_VUT: Final = VEHICLES[VUT]
+VUT_ID: Final = VEHICLES[VUT]
 ID_COUNT: Final = 0x01
-"""The variable of `getIDCount` in every domain."""
+"""Variable that every domain has."""
 SPEED_MARGIN_MPS: Final = 2.0
 """More than a vehicle gains in a step, unless a controller commands it without any limit."""
 
-State = tuple[float, float, float]
+State = Sequence[float]
 """Position along the lanes in m, M = 0; speed in m/s; acceleration of the last step in m/s2."""
 
 
-class _Setup(msgspec.Struct, frozen=True):
-    """The input of a shadow SUMO besides its net."""
-
-    road: Corridor
-    names: tuple[str, ...]
+class RefusedError(Exception):
+    """A question or command that is answered by an error, as SUMO would; the connection stays."""
 
 
 def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
-    """Write what a shadow SUMO loads; `UserError` for a net that cannot be read."""
+    """Write the files that a `MirrorSimulation` loads.
+
+    Args:
+        folder: where they are written.
+        road: both paths, with the net that they are in.
+        scenario: gives the vehicles, their lengths and limits.
+
+    Raises:
+        UserError: if the net cannot be read.
+    """
     net = allowed.road_net(received.read_net(road.path), road.path)
     (folder / NET).write_bytes(received.serialize(net))
     (folder / TYPES).write_bytes(_types(road, scenario))
-    setup = _Setup(road, VEHICLES[: scenario.vehicles])
-    (folder / SETUP).write_bytes(msgspec.json.encode(setup, enc_hook=str))
+    (folder / ROAD).write_bytes(msgspec.json.encode(road, enc_hook=str))
 
 
-class ShadowSumo:
-    """libsumo with the road of a scenario and its vehicles; one a process.
+class MirrorSimulation:
+    """libsumo with the road and the vehicles of a scenario; one per process.
 
     Attributes:
         road: both paths.
         at_m: positions of the vehicles on the road along their lanes, M = 0.
+        departed: vehicles that departed since they were last read; and `arrived`.
         merged: whether the VUT has left the acceleration lane of a road with one.
-        wants_to_merge: whether SUMO has put the VUT beside that lane in its last step.
-        was_forced: whether the VUT came to the end of that lane in it, and was moved beside it.
+        wants_to_merge: whether SUMO has put the VUT on the mainline in its last step.
+        was_forced: whether the VUT was at the end of the acceleration lane in it.
         by_sumo: whether SUMO's own driver chose the speed of the VUT in it.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Take the folder of `write_files`; `load` starts it."""
+        """Take the folder of `write_files`; `load` starts SUMO."""
         self._libsumo = load_libsumo()
-        setup = msgspec.json.decode(
-            (folder / SETUP).read_bytes(), type=_Setup, dec_hook=lambda kind, text: kind(text)
+        self.road = msgspec.json.decode(
+            (folder / ROAD).read_bytes(), type=Corridor, dec_hook=lambda kind, text: kind(text)
         )
-        self.road, self._names = setup.road, setup.names
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
-        self._options = [*files, *SHADOW_OPTIONS]
-        self._started, self._asked = False, 0
+        self._options = [*files, *OPTIONS]
+        self._started, self._searches = False, 0
         self.at_m: dict[str, float] = {}
+        self.departed: list[str] = []
+        self.arrived: list[str] = []
         self.merged = self.wants_to_merge = self.was_forced = self.by_sumo = False
         on_ramp = {piece.lane for piece in self.road.ramp.pieces}
-        self._beside = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
-        """Lanes of the mainline alone; on those beside an acceleration lane a VUT has merged."""
+        self._mainline = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
+        """Lanes of the mainline alone: there a VUT has left the acceleration lane."""
 
     @property
     def has_lane(self) -> bool:
@@ -100,28 +105,33 @@ class ShadowSumo:
 
     def path(self, name: str) -> LanePath:
         """Return the lanes that a vehicle drives on."""
-        on_ramp = name == NAME_OF_VUT and not self.merged
+        on_ramp = name == VUT_ID and not self.merged
         return self.road.ramp if on_ramp else self.road.mainline
+
+    def point(self, name: str) -> LanePoint:
+        """Return the place of a vehicle; SUMO's own answer is that before it was put there."""
+        return self.path(name).point(self.at_m[name])
 
     def load(self) -> None:
         """Start with an empty road at time 0; `UserError` where SUMO cannot use the net."""
-        libsumo, self.merged = self._libsumo, False
+        libsumo, self.merged, self.at_m = self._libsumo, False, {}
         try:
             if self._started:
                 libsumo.load(self._options)
             else:
                 libsumo.start(["sumo", *self._options])
                 self._started = True
-            for name in self._names:
-                libsumo.route.add(f"route.{name}", _edges(self.path(name)))
+            for name in libsumo.vehicletype.getIDList():
+                if name in VEHICLES:
+                    libsumo.route.add(f"route.{name}", edges_of(self.path(name)))
         except libsumo.TraCIException as error:
             raise UserError(str(error)) from error
-        self.at_m = {}
 
     def call(self, function: str, *arguments: Any) -> Any:
-        """Call a function of libsumo, named as "vehicle.getSpeed".
+        """Call a function of libsumo by its name, as `vehicle.getSpeed`.
 
-        Raises `RefusedError` where SUMO refuses, or has no such function of these arguments.
+        Raises:
+            RefusedError: if SUMO refuses, or has no such function of these arguments.
         """
         domain, _, name = function.partition(".")
         called = getattr(getattr(self._libsumo, domain, None), name, None)
@@ -135,14 +145,19 @@ class ShadowSumo:
             given = ", ".join(f"{argument!r:.40}" for argument in arguments)
             raise RefusedError(f"{function} takes no ({given})") from error
 
-    def around(self, point: tuple[float, ...], domain: int, range_m: float) -> list[str]:
-        """Return the objects of a domain, by its number, around a point; raises as `call` does.
+    def around(self, point: Sequence[float], domain: int, range_m: float) -> list[str]:
+        """Return the objects around a point, found by a context subscription of a new object.
 
-        A context subscription finds them. What it found stays up to the next step, so that each has
-        a point of interest of its own.
+        Args:
+            point: x and y in m.
+            domain: number of the domain of the objects.
+            range_m: largest distance.
+
+        Raises:
+            RefusedError: if SUMO refuses.
         """
-        self._asked += 1
-        name = f"around {self._asked}"
+        self._searches += 1  # an object that has found others keeps them up to the next step
+        name = f"around {self._searches}"
         self.call("poi.add", name, *point[:2], COLOURS[0])
         try:
             self.call("poi.subscribeContext", name, domain, range_m, [ID_COUNT])
@@ -156,18 +171,17 @@ class ShadowSumo:
         """Make a step in which the vehicles depart, and put them into their states."""
         vehicle, self.merged = self._libsumo.vehicle, False
         for name, state in states.items():
-            start = self._start(name, state)
-            vehicle.add(name, f"route.{name}", typeID=name, **start)
-            vehicle.setColor(name, COLOURS[name == NAME_OF_VUT])
-        self.at_m = {name: x_m for name, (x_m, _, _) in states.items()}
+            vehicle.add(name, f"route.{name}", typeID=name, **self._departure(name, state))
+            vehicle.setColor(name, COLOURS[name == VUT_ID])
+            self.at_m[name] = state[0]
+        self.departed += states
         self.step()
         for name in self.at_m:
             vehicle.setLaneChangeMode(name, 0)
-            vehicle.setSpeedMode(
-                name, COMMANDED_VUT if name == NAME_OF_VUT else SPEED_MODE_COMMANDED
-            )
-        if NAME_OF_VUT in self.at_m:
-            vehicle.setSpeed(NAME_OF_VUT, states[NAME_OF_VUT][1])
+            vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
+        if VUT_ID in self.at_m:
+            vehicle.setSpeedMode(VUT_ID, DEPARTURE_SPEED_MODE)
+            vehicle.setSpeed(VUT_ID, states[VUT_ID][1])
         self.put(states)
 
     def step(self) -> float | None:
@@ -175,53 +189,57 @@ class ShadowSumo:
 
         A vehicle that comes to the end of the net arrives.
         """
-        forced = self._change_lanes()
+        vehicle, moved = self._libsumo.vehicle, self._change_lanes()
         self._libsumo.simulation.step()
-        left = self._libsumo.vehicle.getIDList()
-        self.at_m = {name: x_m for name, x_m in self.at_m.items() if name in left}
-        if NAME_OF_VUT not in self.at_m:
+        left = vehicle.getIDList()
+        for name in list(self.at_m):
+            if name not in left:
+                self._arrive(name)
+        if VUT_ID not in self.at_m:
             return None
-        vehicle = self._libsumo.vehicle
-        v_mps = float(vehicle.getSpeed(NAME_OF_VUT))
-        self.was_forced = self.has_lane and NAME_OF_VUT in forced
-        lane = vehicle.getLaneID(NAME_OF_VUT)
-        self.wants_to_merge = self.has_lane and not self.was_forced and lane in self._beside
-        own_mps = vehicle.getSpeedWithoutTraCI(NAME_OF_VUT)
+        v_mps = float(vehicle.getSpeed(VUT_ID))
+        on_mainline = self.has_lane and vehicle.getLaneID(VUT_ID) in self._mainline
+        self.was_forced = self.has_lane and VUT_ID in moved
+        self.wants_to_merge = on_mainline and not self.was_forced
+        own_mps = vehicle.getSpeedWithoutTraCI(VUT_ID)
         self.by_sumo = bool(own_mps == v_mps) and not self.was_forced
         return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles that are on the road into their states.
 
-        Those beyond the end of the net, where paths go on without a road, arrive. `merged` is
-        whether the VUT has left the acceleration lane.
+        Those beyond the end of the net, where paths go on without a road, arrive.
+
+        Args:
+            states: by the names of the vehicles.
+            merged: whether the VUT has left the acceleration lane.
         """
         vehicle, self.merged = self._libsumo.vehicle, merged
         for name in list(self.at_m):
             x_m, v_mps, a_mps2 = states[name]
             if x_m >= self.road.drawn_after_m:
                 vehicle.remove(name)
-                del self.at_m[name]
+                self._arrive(name)
                 continue
             point = self.path(name).point(x_m)
             vehicle.moveTo(name, point.lane, point.position_m)
             vehicle.setPreviousSpeed(name, v_mps, a_mps2)
-            if name != NAME_OF_VUT:
+            if name != VUT_ID:
                 vehicle.setSpeed(name, v_mps)
             self.at_m[name] = x_m
 
     def clear(self) -> None:
         """Take all vehicles from the road."""
-        for name in self.at_m:
+        for name in list(self.at_m):
             self._libsumo.vehicle.remove(name)
-        self.at_m = {}
+            self._arrive(name)
 
-    def point(self, name: str) -> LanePoint:
-        """Return the place of a vehicle; SUMO's own answer is that before it was put there."""
-        return self.path(name).point(self.at_m[name])
+    def _arrive(self, name: str) -> None:
+        del self.at_m[name]
+        self.arrived.append(name)
 
     def _change_lanes(self) -> list[str]:
-        """Move vehicles at the end of a lane that ends to the lane beside it, and return them.
+        """Move vehicles at the end of a lane that ends to the lane next to it, and return them.
 
         SUMO would stop them there.
         """
@@ -231,58 +249,53 @@ class ShadowSumo:
         if self.road.ramp_approach.yields:
             ends, goes_on = goes_on, ends
         _, end_m = self.road.lane_m or (0.0, 0.0)
-        beside = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < end_m)
+        target = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < end_m)
         moved = []
         for name, x_m in self.at_m.items():
             next_m = (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S
             if self.path(name) is ends and x_m < end_m <= x_m + next_m:
-                self._libsumo.vehicle.moveTo(name, beside.lane, beside.length_m + x_m - end_m)
+                self._libsumo.vehicle.moveTo(name, target.lane, target.length_m + x_m - end_m)
                 moved.append(name)
         return moved
 
-    def _start(self, name: str, state: State) -> dict[str, str]:
+    def _departure(self, name: str, state: State) -> dict[str, str]:
         """Return the departure of a vehicle, which must be on the first edge of its route."""
-        path = self.path(name)
-        point = path.point(state[0])
-        edge, lane = _edge_of(point.lane), point.lane.rpartition("_")[2]
-        # It is told its own speed behind the step; SUMO lets none depart faster than the limit.
+        path, (x_m, v_mps, _) = self.path(name), state
+        point = path.point(x_m)
+        edge, _, lane = point.lane.rpartition("_")
+        # SUMO lets none depart faster than the limit; it gets its own speed after the step.
         own_mps = self._libsumo.vehicletype.getMaxSpeed(name)
-        fastest_mps = min(path.piece(state[0]).speed_limit_mps, own_mps)
-        speed = {"departSpeed": str(min(state[1], fastest_mps))}
-        if edge != _edges(path)[0]:
+        fastest_mps = min(path.piece(x_m).speed_limit_mps, own_mps)
+        speed = {"departSpeed": str(min(v_mps, fastest_mps))}
+        if edge != edges_of(path)[0]:
             return {"departLane": "best", **speed}
         return {"departLane": lane, "departPos": str(point.position_m), **speed}
 
 
-class RefusedError(Exception):
-    """A command that is answered by an error, as SUMO would; the connection goes on."""
-
-
-def _edge_of(lane: str) -> str:
-    return lane.rpartition("_")[0]
-
-
-def _edges(path: LanePath) -> list[str]:
-    return list(dict.fromkeys(_edge_of(p.lane) for p in path.pieces if not p.is_internal))
+def edges_of(path: LanePath) -> list[str]:
+    """Return the edges of a path, without those inside junctions."""
+    edges = [piece.lane.rpartition("_")[0] for piece in path.pieces if not piece.is_internal]
+    return list(dict.fromkeys(edges))
 
 
 def _types(road: Corridor, scenario: Scenario) -> bytes:
     root = etree.Element("additional")
     for name in VEHICLES[: scenario.vehicles]:
-        length_m = scenario.vut_length_m if name == NAME_OF_VUT else scenario.pov_length_m
-        values = {
-            "id": name,
-            "length": repr(length_m),
-            "width": repr(WIDTH_M),
-            "height": repr(HEIGHT_M),
-            "minGap": "0",
+        length_m = scenario.vut_length_m if name == VUT_ID else scenario.pov_length_m
+        etree.SubElement(
+            root,
+            "vType",
+            id=name,
+            length=repr(length_m),
+            width="1.8",
+            height="1.5",
+            minGap="0",
             # Where SUMO's models drive the VUT, an episode must not depend on those before it.
-            "sigma": "0",
-            "maxSpeed": repr(max(road.speed_limit_mps, FASTEST_MPS)),
-            "accel": repr(scenario.a_max_mps2),
-            "decel": repr(-scenario.a_min_mps2),
-            "emergencyDecel": repr(-scenario.a_min_mps2),
-            "guiShape": "passenger/sedan",
-        }
-        etree.SubElement(root, "vType", values)
+            sigma="0",
+            maxSpeed=repr(max(road.speed_limit_mps, FASTEST_MPS)),
+            accel=repr(scenario.a_max_mps2),
+            decel=repr(-scenario.a_min_mps2),
+            emergencyDecel=repr(-scenario.a_min_mps2),
+            guiShape="passenger/sedan",
+        )
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
