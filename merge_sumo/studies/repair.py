@@ -40,7 +40,7 @@ from merge_sumo.campaigns.again import campaign_in
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import RADIUS
-from merge_sumo.engine.evaluate import Episodes, evaluate
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, from_unit, to_unit
@@ -50,6 +50,7 @@ from merge_sumo.system.folders import add_to, make_folder
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record, to_json, to_plain
 from merge_sumo.system.result import Result
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.summary import summarise
 from merge_sumo.vuts.factory import VutFactory
@@ -425,7 +426,7 @@ class _Repair:
         return abs(trial.values[one.name] - self.today[one.name]) / (one.high - one.low)
 
     def _run(self, plan: SimulationPlan, cases: Sequence[Case]) -> list[Outcome]:
-        ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcomes_of)
+        ran = evaluate(plan.for_cases(len(cases)), cases, self._workers, _outcome_of)
         return [outcome for _, outcome in sorted(ran, key=itemgetter(0))]
 
     def _selected(self) -> list[int]:
@@ -564,5 +565,5 @@ def with_neighbours(cases: Sequence[Case], rng: np.random.Generator) -> list[Cas
     return found
 
 
-def _outcomes_of(results: Episodes) -> list[Outcome]:
-    return [episode.outcome for episode in results]
+def _outcome_of(episode: Episode) -> Outcome:
+    return episode.outcome
