@@ -71,6 +71,7 @@ GONE: Final[Mapping[str, str]] = {
     "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
     "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
     "stress": "`merge-sumo rerun RUN --stress` does it",
+    "repair": "`examples/repair.py`, in a checkout, searches by optuna and `merge_sumo.rerun`",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
     "bounds how much of the pool can fail",
 }
@@ -347,15 +348,6 @@ def compare(config: Options[c.Compare], *, json: Json = False) -> int:
     result = api.compare(**vars(config))
     print_result(result, json, page=config.out)
     return 1 if result.worse else 0
-
-
-@command(c.Repair, CHANGE)
-def repair(config: Options[c.Repair], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    result = api.repair(**vars(config))
-    print_result(result, json, page=result.folder / "repair.html")
-    return 0 if result.verified else 1
 
 
 @command(c.Vuts, OWN)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from merge_sumo.scenario.imperfection import Actuation, Sensing
@@ -113,9 +113,9 @@ class Search:
     in_flight: int | None = None
     """Most cases that run or wait for a worker while the sampler is asked for more, instead of
     batches: for controllers that take seconds for a case. About three times the workers."""
-    repeat: int | Literal["auto"] = 1
-    """Number of runs of each case, each with other random numbers; auto repeats a case where chance
-    decides on it. Each run is one of the --cases."""
+    repeat: int = 1
+    """Number of runs of each case, each with other random numbers. Each run is one of the
+    --cases."""
     tolerated: float = 0.0
     """A case fails where more than this share of its runs do."""
     seed: int = 0
@@ -478,41 +478,6 @@ class Compare(Page):
 
     runs: Iterable[AnyRun]
     """The campaigns, or their folders, the oldest first."""
-
-
-@dataclass(frozen=True)
-class Repair(Recorded):
-    """Find the smallest change of a controller's parameters that removes its failures.
-
-    optuna proposes values; the failures, near misses and a share of the other cases of the campaign
-    run with each. No case that passed may fail. Of the values with the fewest failures those are
-    chosen that cost least, and of these the smallest change. Then all cases run, and a fresh
-    campaign with another seed is compared with the one before. Needs the extra repair.
-
-    Exit code 0 when values were found and the fresh campaign shows no case that broke, else
-    1: then it says which cases stay.
-
-    Example:  merge-sumo repair runs/design1 --param gap_m=10..40 --param x2_m=10..90
-    """
-
-    run: AnyRun
-    """The campaign, or its folder."""
-    params: Iterable[str]
-    """A parameter that may change, NAME=LOW..HIGH: of a built-in VUT or of SUMO's model, a keyword
-    of the constructor, or an attribute. May be given several times."""
-    _: KW_ONLY
-    cost: str = "time"
-    """Cost to keep low, as a mean over the cases: time to the merge, or braking of the VUT."""
-    trials: int = 60
-    """Sets of values that a round tries."""
-    rounds: int = 3
-    """Most rounds: the failures of a fresh campaign join the cases of the next."""
-    cases: int | None = None
-    """Cases of a fresh campaign; by default as many as the campaign."""
-    seed: int = 0
-    """Seed of random numbers: same seed, same values."""
-    out: AnyPath | None = None
-    """New folder to write; runs/repair-RUN-DATE by default."""
 
 
 # Bring your own

@@ -17,7 +17,6 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib.util import find_spec
-from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,8 +25,6 @@ from merge_sumo.api.campaigns import notice_povs, run_and_report
 from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.settings import (
     case_in,
-    current,
-    opened,
     opened_study,
     opened_truths,
     overrides,
@@ -40,19 +37,20 @@ from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.one_case import run_one
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
+from merge_sumo.campaigns.run import SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.policies import policies_in
+from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError, notice
 from merge_sumo.reports import exports, figures
+from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.export_format import EXPORTS
 from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars
-from merge_sumo.reports.repair_page import write_repair
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import SUFFIX
@@ -67,16 +65,14 @@ from merge_sumo.studies import (
     vut_check,
 )
 from merge_sumo.studies import probability as estimates
-from merge_sumo.studies import repair as mending
 from merge_sumo.studies import rerun as rerunning
 from merge_sumo.studies import stress as ladder
 from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import Comparison
 from merge_sumo.studies.explanation import EXPLANATIONS, ExplanationResult
 from merge_sumo.studies.probability import PROBABILITY, ProbabilityResult
-from merge_sumo.studies.repair import RepairResult
 from merge_sumo.studies.reproduction import Reproduction
-from merge_sumo.studies.run_study import RunStudy, notice_changes
+from merge_sumo.studies.run_study import notice_changes
 from merge_sumo.studies.sampler_study import SamplerStudy
 from merge_sumo.studies.stress import STRESS, StressResult
 from merge_sumo.studies.truth import TruthResult
@@ -96,7 +92,6 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import check_toml_size, to_plain
 from merge_sumo.system.result import Shown
-from merge_sumo.system.workers import open_workers
 from merge_sumo.verdict.conflict import check_from
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
@@ -108,7 +103,7 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch"]
 __all__ += ["benchmark", "campaign", "check_scenario", "check_vut", "compare", "dated", "explain"]
-__all__ += ["export", "new_scenario", "open_in_gui", "open_run", "probability", "repair", "replay"]
+__all__ += ["export", "new_scenario", "open_in_gui", "open_run", "probability", "replay"]
 __all__ += ["report", "reproduce", "rerun", "resume", "run", "scenarios", "stress", "train"]
 __all__ += ["truth", "vuts"]
 
@@ -190,7 +185,7 @@ def rerun(config: c.Rerun) -> Comparison:
     with opened_study(before, config, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
     if isinstance(before, CasesFile):
-        compared = before.compared(compared, out or before.folder)
+        compared = with_file(compared, before, out or before.folder)
     return _written(compared, out, junit)
 
 
@@ -208,7 +203,7 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
 
 
 def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
-    """Write the page, or the cases file of now, and JUnit, where they are config for."""
+    """Write the page, or the cases file of now, and JUnit, where they are asked for."""
     text = compared.text
     if out is not None and text is not None:
         check_toml_size(text.encode(errors="backslashreplace"), out)
@@ -346,39 +341,6 @@ def stress(config: c.Stress) -> StressResult:
         return ladder.stress(study)
 
 
-@verb(c.Repair)
-def repair(config: c.Repair) -> RepairResult:
-    """Search for values of a controller's parameters that repair it."""
-    mending.ranges_of(config)
-    before = campaign_of(config.run).run
-    folder = path_of(config.out) or dated(f"repair-{before.folder.name}")
-    check_new(folder)
-    settings, plan, where = current(before, config)
-    study = RunStudy(before, settings, plan.with_engine(None))
-    study.check_same_system()
-    with opened(where, plan) as workers, Bars(shown=where.progress) as bars:
-
-        def fresh(spec: str, number: int) -> Run:
-            of_round = mending.fresh_settings(settings, before, config, spec, number)
-            to, total, number_of = (
-                folder / mending.CAMPAIGN.format(number),
-                of_round.cases,
-                count(1),
-            )
-
-            def on_case(_: object) -> None:
-                bars.counted(f"fresh campaign {number}", next(number_of), total, "cases")
-
-            of_plan, listening = resolve(of_round), c.CampaignCalls(on_case=on_case)
-            quietly = replace(where, progress=False)
-            return run_and_report(of_round, of_plan, to, quietly, listening, workers=workers).run
-
-        study = replace(study, workers=workers)
-        found = mending.repair(study, config, folder, fresh, bars.counted)
-    write_repair(found, before)
-    return found
-
-
 @verb(c.Explain)
 def explain(config: c.Explain) -> ExplanationResult:
     """Find the smallest changes with which a failure passes."""
@@ -397,7 +359,7 @@ def reproduce(config: c.Reproduce) -> Reproduction:
     policies, folder = policies_folder(config.policies, US23), path_of(config.out)
     figures.require_matplotlib()
     folder = folder or dated("reproduce")
-    with open_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
+    with evaluation_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
         make_folder(folder)
         result = reproduction.reproduce(
             scale, policies=policies, workers=workers, on_part=bars.counted

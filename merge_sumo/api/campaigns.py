@@ -1,10 +1,9 @@
-"""A campaign from its settings to its report: what `campaign`, `resume` and `repair` share."""
+"""A campaign from its settings to its report: what `campaign` and `resume` share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
-from dataclasses import asdict, replace
+from collections.abc import Callable
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -16,11 +15,12 @@ from merge_sumo.campaigns.again import call_again
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import WorkersLostError, notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
-from merge_sumo.reports.report import RunningReport, check_report, write_report
+from merge_sumo.reports.report import check_report, write_report
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import (
     LEVELS,
@@ -37,7 +37,7 @@ from merge_sumo.studies.share import note_shares
 from merge_sumo.system.folders import check_new, link_latest
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers, workers_or_here
+from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.campaign_verdict import parse_gates
 from merge_sumo.verdict.score import Outcome
 
@@ -50,12 +50,10 @@ def run_and_report(
     config: c.CampaignCalls,
     *,
     goes_on: bool = False,
-    workers: Workers | None = None,
 ) -> CampaignRun:
     """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
 
-    It begins in a new folder, or goes on in one, with its own workers or those of a caller. An
-    interruption has a note on how to go on.
+    It begins in a new folder, or goes on in one. An interruption has a note on how to go on.
     """
     junit = None if config.junit is None else Path(config.junit)
     parse_gates(config.gates, against=settings.against is not None)
@@ -69,29 +67,26 @@ def run_and_report(
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
-    report = RunningReport(folder)
-
-    def on_cases(outcomes: Sequence[Outcome]) -> None:
+    def case_ended(outcome: Outcome) -> None:
+        bars.case_ended(outcome)
         if config.on_case is not None:
-            for outcome in outcomes:
-                config.on_case(outcome)
-        check()
+            config.on_case(outcome)
 
     try:
-        available = opened(where, plan) if workers is None else nullcontext(workers)
-        with available as present, bars, report:
+        with opened(where, plan) as workers, bars:
             begun_s = perf_counter()
             run = run_campaign
             if goes_on:
                 run = partial(resume_campaign, on_before=bars.ran_before, warn=notice)
             done = run(
-                *(settings, plan, folder, (bars.ended, report.rewrite, on_cases)),
-                workers=present,
+                *(settings, plan, folder, case_ended),
+                workers=workers,
+                check=check,
                 begin=lambda: bars.begin(title),
             )
             result = CampaignRun(done, config.gates)
             took_s = perf_counter() - begun_s
-            _write_findings(result, replace(plan, against=None), present, took_s, bars, check)
+            _write_findings(result, plan, workers, took_s, bars, check)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)

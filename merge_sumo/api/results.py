@@ -15,6 +15,7 @@ from merge_sumo.config import AnyRun
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.motion import lines_of
+from merge_sumo.reports.text import comparison_headline, transitions
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import US23
@@ -227,8 +228,8 @@ class CampaignRun(Result):
             return []
         earlier = printable(str(self._run.settings.against)[:NAME_CHARACTERS])
         return [
-            f"against {earlier}: {self.against.headline}",
-            *self.against.steps[0].table_lines(),
+            f"against {earlier}: {comparison_headline(self.against)}",
+            *transitions(self.against.steps[0]),
             f"both motions in one picture: {self.folder / AGAINST_PAGE}",
         ]
 

@@ -132,7 +132,8 @@ class Run:
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
         try:
-            names = {field.name for field in fields(RecordedSettings)}
+            # No reader needs `repeat`, which was auto in some campaigns of earlier versions.
+            names = {field.name for field in fields(RecordedSettings)} - {"repeat"}
             known = {name: value for name, value in self.record.items() if name in names}
             self.settings = convert(known, RecordedSettings)
         except UserError as error:

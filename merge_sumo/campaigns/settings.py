@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.draws import EachCaseRepeated, RepeatedWhereItMatters
+from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search
@@ -88,7 +88,7 @@ class CampaignSettings(Search):
         check_tolerated(self.tolerated)
         if not self.may_vary:  # a case fails in all of its runs or in none
             object.__setattr__(self, "tolerated", 0.0)
-        if isinstance(self.repeat, int) and self.repeat > self.cases:
+        if self.repeat > self.cases:
             raise UserError(
                 f"`repeat` is {self.repeat} and `cases` is {self.cases}: runs of a case are among "
                 "the cases of the campaign, and cannot be more"
@@ -167,12 +167,7 @@ class CampaignSettings(Search):
 
     def with_repeats(self, sampler: Sampler) -> Sampler:
         """Return a sampler that was told nothing, with repeats among its picks."""
-        if self.repeat == "auto" and self.may_vary:
-            known = self.scenario.sense.is_random
-            return RepeatedWhereItMatters(sampler, self.tolerated, known=known)
-        if isinstance(self.repeat, str) or self.repeat == 1:
-            return sampler
-        return EachCaseRepeated(sampler, self.repeat)
+        return sampler if self.repeat == 1 else RepeatingSampler(sampler, self.repeat)
 
     @property
     def may_vary(self) -> bool:

@@ -11,11 +11,13 @@ import numpy as np
 
 from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.reports.pages import X_AXIS, page
+from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.system.folders import replace_own
+from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.cause import cause
 
 SHOWN: Final = 200
@@ -51,6 +53,10 @@ def comparison_page(compared: Comparison) -> str:
         "comparison.html.jinja",
         styles=STYLES,
         compared=compared,
+        headline=comparison_headline(compared),
+        counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
+        fmc=fmc_rows(compared),
+        change_in_words=change_in_words,
         steps=[(step, _maps(step), _sections(step, compared)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
         most=MOST_REGIONS,

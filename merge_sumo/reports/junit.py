@@ -19,6 +19,7 @@ from lxml import etree
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.facts import Fact, by_level
+from merge_sumo.reports.text import change_in_words, step_headline
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
@@ -118,15 +119,15 @@ def _step(root: etree._Element, name: str, step: Step) -> None:
     suite = etree.SubElement(root, "testsuite", name=name)
     if step.passes_less:
         test = _test(suite, "share of cases that pass", f"{CLASS}.against", 0.0)
-        _wrong(test, "failure", REGRESSION, step.headline)
+        _wrong(test, "failure", REGRESSION, step_headline(step))
     for one in step.cases:
         if one.change is not Change.BOTH or one.judged:
             case = f"case {one.b.index}: {described(one.b.case)}"
             test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
             if one.change in GOT_WORSE:
-                _wrong(test, "failure", REGRESSION, one.became)
+                _wrong(test, "failure", REGRESSION, change_in_words(one))
             if one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
-                etree.SubElement(test, "skipped", message=f"{one.change}: {one.became}")
+                etree.SubElement(test, "skipped", message=f"{one.change}: {change_in_words(one)}")
 
 
 def _case(

@@ -12,6 +12,7 @@ import numpy as np
 from merge_sumo.coverage.fmc import fmc, radius_for
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.text import changes, name_and_unit
 from merge_sumo.road.drawing import road_data
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import Coordinate
@@ -27,7 +28,6 @@ from merge_sumo.scenario.scenario import (
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.studies.explanation import in_words, name_and_unit
 from merge_sumo.studies.surface import Grid, Surface, nodes
 from merge_sumo.system.records import to_plain
 from merge_sumo.verdict.campaign_verdict import shortened
@@ -157,7 +157,7 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
         ]
         axes = zip(titles, (*known.start, *known.parameters), strict=True)
         found[index] = {
-            "words": list(in_words(known, outcome.case)),
+            "words": list(changes(known, outcome.case)),
             "axes": [{**to_plain(axis), "name": name, "unit": unit} for (name, unit), axis in axes],
         }
     return found

@@ -15,6 +15,7 @@ from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_data import pairs_of
 from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.text import comparison_headline, robustness
 from merge_sumo.scenario.scenario import MergeScenario, lane_of
 from merge_sumo.system.registry import Registry
 from merge_sumo.verdict.diagnosis import BRAKED_MPS
@@ -55,6 +56,8 @@ def shared(model: ReportModel) -> dict[str, Any]:
         "meanings": meanings,
         "by_level": by_level,
         "headline": headline(model.run, model.facts),
+        "comparison_headline": comparison_headline,
+        "robustness": robustness,
         "starts_that_fail": STARTS_THAT_FAIL,
         "pairs_of": pairs_of,
         "radius_for": radius_for,

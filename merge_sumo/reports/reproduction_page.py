@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 from merge_sumo.reports import figures
 from merge_sumo.reports.pages import page
+from merge_sumo.reports.text import table_ii
 from merge_sumo.studies.reproduction import Reproduction
 from merge_sumo.system.folders import write_new
 from merge_sumo.system.records import to_json
@@ -31,7 +32,7 @@ def write_reproduction(result: Reproduction, folder: Path) -> Path:
     for name, figure in _figures(result):
         figures.save(figure, folder / f"{name}.png")
         pictures.append(f"{name}.png")
-    text = page("reproduce.html.jinja", result=result, pictures=pictures)
+    text = page("reproduce.html.jinja", result=result, table=table_ii(result), pictures=pictures)
     write_new(folder / PAGE, text.encode())
     return folder / PAGE
 

@@ -3,52 +3,31 @@
 from __future__ import annotations
 
 import math
-import os
-from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
-from itertools import product
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import numpy as np
 from msgspec import Meta
-from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.run import Run, spread_failures
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.campaigns.run import Run
 from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
-from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.studies.comparison import GOT_WORSE, Change, ComparedCase, Comparison, passes, short
-from merge_sumo.system.folders import check_ending, make_place, write_new
-from merge_sumo.system.printable import printable
+from merge_sumo.studies.comparison import Change, ComparedCase, passes, short
 from merge_sumo.system.records import (
     Record,
-    check_toml_size,
     convert,
     read_toml,
     to_json,
-    toml_value,
 )
-from merge_sumo.verdict.campaign_verdict import judge
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.chance import one_per_case
-from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion, condition_of
+from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.verdict.score import Measures, Outcome, record_fields
 from merge_sumo.verdict.severity import Severity
 
-MOST: Final = 40
-"""Cases of a file for which nobody names any."""
 TOLERANCE: Final = 0.01
-ABOUT: Final = """\
-# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
-# error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is
-# less by more than the tolerance. A known failure may have in its line: accepted = "the reason"
-"""
 
 
 class Head(Record, frozen=True):
@@ -121,27 +100,6 @@ class CasesFile(Run):
             raise UserError(f"{self.folder} has no case {index}")
         return self._by_index[index]
 
-    def compared(self, compared: Comparison, path: Path) -> Comparison:
-        """Return a comparison of its cases with its text, which is that for a path, and notes."""
-        (step,), (_, now) = compared.steps, compared.versions
-        outcomes = {one.index: one for one in (*self.outcomes, *now.outcomes)}
-        before = cases_toml(self, self.outcomes, path, self.settings.vut)
-        text = cases_toml(self, outcomes.values(), path, now.vut)
-        notes = list[str]()
-        for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
-            notes += [] if old == new else [f"- {old.strip()}", f"+ {new.strip()}"]
-        for index, one in ((one.b.index, one) for one in step.cases):
-            if one.change in GOT_WORSE:
-                why = cause(one.b, now.motions([index]).get(index))
-                notes.append(f"case {index}, {one.change}: {why}")
-            elif reason := self.accepted.get(index):
-                so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
-                notes.append(f"case {index} is accepted ({reason}) and {so}")
-        if not any(one.is_tested for one in now.outcomes):
-            notes.append(judge(now.outcomes).nothing_tested)
-        notes += compared.notes
-        return replace(compared, text=text, notes=tuple(map(printable, notes)))
-
     def change_of(self, one: ComparedCase) -> Change:
         """Return what the file calls a change; it excuses neither a new error nor a new contact."""
         a, b = one.a.measures, one.b.measures
@@ -162,71 +120,8 @@ def verdict_of(outcome: Outcome) -> str:
     return "error" if outcome.measures.end.is_error else "timeout"
 
 
-def watching(run: Run) -> list[Outcome]:
-    """Return at most 40 outcomes of a campaign: of more, those that watch a controller.
-
-    A quarter are the worst failures of regions. The others pass, if as many do, the levels in turn:
-    by turns that of least margin and of least clearance that lies apart, and the farthest.
-    """
-    if len(run.outcomes) <= MOST:
-        return run.outcomes
-    cases, scenario = one_per_case(run.outcomes, run.tolerated), run.scenario
-    failing = spread_failures(cases)
-    chosen = failing[: MOST // 4]
-    for turn, level in product(range(MOST), run.levels):
-        left = [o for o in cases if o.case.level == level and passes(o) and o not in chosen]
-        if left and len(chosen) < MOST:
-            known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
-            points = to_unit((one.case for one in left), level, scenario)
-            away = cKDTree(known).query(points)[0]
-            near = [(one.margin, one.measures.clearance_m, 0.0)[turn % 3] for one in left]
-            apart = away > radius_for(points.shape[1]) if turn % 3 < 2 else away
-            # The last key decides first; no clearance is the largest.
-            chosen.append(left[np.lexsort((np.array(near, dtype=float), -1.0 * apart))[0]])
-    return [*chosen, *failing[MOST // 4 :]][:MOST]
-
-
-def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
-    """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
-    if target.suffix and not target.is_dir():
-        check_ending(target, (SUFFIX,))
-    outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
-    path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
-    content = cases_toml(run, outcomes, path, run.settings.vut).encode()
-    check_toml_size(content, path)
-    if path != target:
-        make_place(target)
-    write_new(path, content)
-    return path
-
-
-def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
-    """Return a cases file for a path; `vut` is who drove."""
-    scenario = run.scenario
-    ordered = sorted(outcomes, key=lambda one: (one.case.level, one.index))
-    usual, place = {one.name: one.default for one in fields(scenario)}, scenario.to_record()
-    if len(Path(scenario.net or "").parts) > 1:
-        place["net"] = f"./{Path(os.path.relpath(str(scenario.net), path.parent)).as_posix()}"
-    place = {name: one for name, one in place.items() if name == "name" or one != usual.get(name)}
-    head = {name: run.record.get(name) for name in Head.__struct_fields__}
-    learned = {POLICIES.get(one.case.level) for one in ordered}
-    hashes = {of: one for of, one in (head["policies_sha256"] or {}).items() if of in learned}
-    head |= {"vut": vut, "policies_sha256": hashes or None, "scenario": place, "cases": None}
-    head["tolerance"] = run.tolerance if isinstance(run, CasesFile) else TOLERANCE
-    lines = [f"{name} = {toml_value(one)}" for name, one in head.items() if one is not None]
-    lines += ["cases = [", *(f"  {_line(run, outcome)}," for outcome in ordered), "]"]
-    return ABOUT + "\n".join(lines) + "\n"
-
-
-def _line(run: Run, outcome: Outcome) -> str:
-    """Return the line of a case: verdict and what decided it, its place, and what is accepted."""
-    accepted = run.accepted if isinstance(run, CasesFile) and not passes(outcome) else {}
-    record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
-    record |= {"accepted": accepted.get(outcome.index)}
-    record |= {"end": None} if outcome.measures.end.is_tested else {}
-    deciding = () if run.criterion.require else sorted(condition_of(run.criterion.words).names)
-    told = ("index", "level", "verdict", "end", "severity", "margin", *deciding, "error")
-    place = (of.field for of in run.scenario.dimensions(outcome.case.level))
-    line = {name: short(record.get(name)) for name in told}
-    line |= {name: record.get(name) for name in (*place, "draw", "accepted")}
-    return toml_value({name: value for name, value in line.items() if value is not None})
+def policies_of(run: Run, outcomes: Iterable[Outcome]) -> dict[str, str] | None:
+    """Return the hashes of the learned POVs of some cases, as a campaign records them."""
+    learned = {POLICIES.get(outcome.case.level) for outcome in outcomes}
+    known = run.record.get("policies_sha256") or {}
+    return {name: sha256 for name, sha256 in known.items() if name in learned} or None

@@ -34,13 +34,9 @@ from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.studies.version import Version
 from merge_sumo.system.folders import free
-from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record, to_plain
 from merge_sumo.system.result import Result
-from merge_sumo.verdict.campaign_verdict import judge
 from merge_sumo.verdict.chance import RunsOfCase, by_case, one_per_case
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.plausibility import behind
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.severity import Severity
 
@@ -129,20 +125,6 @@ class ComparedCase:
             return None
         return _fisher([(one.failures, one.runs) for one in runs])
 
-    @property
-    def became(self) -> str:
-        """Both outcomes in words, with the runs of each where there are several."""
-        if self.chance is not None and self.runs_a is not None and self.runs_b is not None:
-            shares = f"{self.runs_a.in_words} -> {self.runs_b.in_words}"
-            return f"{shares}, by Fisher's exact test p = {self.chance:.2g}"
-        before, after = _word(self.a), _word(self.b)
-        if before == after and self.change is not Change.BOTH:
-            verdicts = ("no failure" if passes(o) else "a failure" for o in (self.a, self.b))
-            if self.change in (Change.WORSE, Change.NOT_REPEATABLE):
-                verdicts = (f"margin {short(o.margin)}" for o in (self.a, self.b))
-            before, after = (f"{before}, {verdict}" for verdict in verdicts)
-        return f"{before} -> {after}"
-
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it."""
         record: dict[str, Any] = {"change": self.change, "level": self.a.case.level}
@@ -168,7 +150,8 @@ def short(value: Any) -> Any:
     return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
-def _word(outcome: Outcome) -> str:
+def outcome_word(outcome: Outcome) -> str:
+    """Return how a case ended, in words."""
     return outcome.measures.became.lower().replace("_", " ")
 
 
@@ -263,36 +246,15 @@ class Step:
     @property
     def transitions(self) -> dict[tuple[Change, str, str], int]:
         """Cases by what became of them, and the outcome before and after, in words."""
-        found = Counter((one.change, _word(one.a), _word(one.b)) for one in self.cases)
+        found = Counter(
+            (one.change, outcome_word(one.a), outcome_word(one.b)) for one in self.cases
+        )
         order = list(Change)
         return dict(sorted(found.items(), key=lambda row: (order.index(row[0][0]), -row[1])))
 
     def count(self, change: Change) -> int:
         """Return the number of cases of which that became."""
         return sum(case.change is change for case in self.cases)
-
-    @property
-    def headline(self) -> str:
-        """What pairs, regions and numbers say, in words."""
-        shared = counted(len(self.cases), "shared case") if self.cases else "no case is shared"
-        changes = [one for one in Change if one is Change.BROKE or self.count(one)]
-        became = ", ".join(f"{self.count(change)} {change}" for change in changes)
-        parts = [f"of {shared} {became}" if self.cases else shared]
-        if self.regions:
-            of_regions = Counter(one.change for found in self.regions.values() for one in found)
-            shown = [f"{of_regions[change]} {change}" for change in Change if change in of_regions]
-            parts.append(f"regions of failures: {', '.join(shown) or 'none'}")
-        if self.passes_less:
-            by = f"by Fisher's exact test p = {self.chance:.2g}"
-            parts.insert(0, f"{self.after} passes less often than {self.before}, {by}")
-        return "; ".join(parts)
-
-    def table_lines(self) -> list[str]:
-        """Return the table of transitions as lines."""
-        return [
-            f"{number:8d}  {before} -> {after} ({change})"
-            for (change, before, after), number in self.transitions.items()
-        ]
 
     def to_record(self) -> dict[str, Any]:
         """Return it as JSON shows it: counts first, then each case but those that always pass."""
@@ -346,64 +308,6 @@ class Comparison(Result):
         got_worse = any(one.change in GOT_WORSE for step in self.steps for one in step.cases)
         less = any(step.passes_less for step in self.steps)
         return got_worse or less or not any(o.is_tested for o in self.versions[-1].outcomes)
-
-    @property
-    def counts(self) -> list[str]:
-        """What each version found, in words."""
-        return [judge(one.outcomes, one.tolerated).counts for one in self.versions]
-
-    @property
-    def headline(self) -> str:
-        """The failures of each version, and how much broke and was fixed, in a sentence."""
-        many = len(self.steps) > 1
-        steps = [
-            f"from {step.before} to {step.after}: {step.headline}" if many else step.headline
-            for step in self.steps
-        ]
-        return "; ".join((" -> ".join(self.counts), *steps))
-
-    def lines(self) -> list[str]:
-        """Return the numbers, version by version and step by step, and the first of the cases."""
-        if self.text is not None:
-            return [self.headline, *self.notes]
-        text = [self.headline, self.source]
-        for number, version in enumerate(self.versions, start=1):
-            verdict = judge(version.outcomes, version.tolerated)
-            place = f"{version.folder} " if version.folder else "now "
-            text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
-            text += [*verdict.trouble_lines(), *(f"  {one}" for one in behind(version.outcomes))]
-        text += [
-            f"level {level_name(level)}: FMC {' -> '.join(row)}"
-            for level, row in self.fmc().items()
-        ]
-        for step in self.steps:
-            text += self._lines_of(step)
-        differ = any(c.change is not Change.BOTH for step in self.steps for c in step.cases)
-        if differ and self.page_command:
-            text.append(f"both motions in one picture: {self.page_command}")
-        return [*text, *self.notes]
-
-    def _lines_of(self, step: Step) -> list[str]:
-        named = f"from {step.before} to {step.after}: {counted(len(step.cases), 'case')} with both"
-        text = [named] if step.cases else []
-        text += step.table_lines()
-        for change in (
-            *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.STILL_CONTACT),
-        ):
-            cases = [case for case in step.cases if case.change is change]
-            if cases:
-                text.append(f"{change}{cut(len(cases), LISTED)}:")
-                text += [f"  case {case.b.index}: {case.became}" for case in cases[:LISTED]]
-        return text
-
-    def fmc(self) -> dict[int, list[str]]:
-        """Return by level the FMC of each version as text, of its own cases; "-" for none."""
-        levels = sorted({level for version in self.versions for level in version.levels})
-        found = {level: [version.at.get(level) for version in self.versions] for level in levels}
-        return {
-            level: [f"{one.fmc:.4f}" if one is not None and one.tested else "-" for one in row]
-            for level, row in found.items()
-        }
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
@@ -459,13 +363,6 @@ def compare_against(run: Run) -> Comparison | None:
     before = replace(Version.of(earlier), outcomes=outcomes, tolerated=run.tolerated)
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
     return of_two(before, Version.of(run), source)
-
-
-def compare_episodes(before: Sequence[Episode], after: Run, vut: str) -> Comparison:
-    """Compare a campaign with what another VUT does in its cases."""
-    later = Version.of(after)
-    earlier = later.with_vut(vut, before)
-    return of_two(earlier, later, f"the cases come from the search of {after.vut}")
 
 
 def of_two(before: Version, after: Version, source: str) -> Comparison:

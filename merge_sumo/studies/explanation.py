@@ -13,7 +13,7 @@ pass. What is said of a case runs a second time, in SUMO.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -21,22 +21,18 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta
 
-from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.engine.evaluate import evaluate
+from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.counterfactuals import causes
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record, replaced, to_plain
 from merge_sumo.system.result import Result
-from merge_sumo.system.suggestions import either
-from merge_sumo.system.workers import Workers, workers_or_here
-from merge_sumo.verdict.episode import Episode
+from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import VutSpec
 from merge_sumo.vuts.factory import VutFactory
@@ -184,19 +180,6 @@ class ExplanationResult(Result):
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
         return {**to_plain(self.found), "file": str(self.run.folder / EXPLANATIONS.name)}
-
-    def lines(self) -> list[str]:
-        """Return the failure, its cause, its changes, and a command that runs the smallest."""
-        outcome = self.run.outcome(self.found.index)
-        words = *causes(self.run, [outcome]).values(), *in_words(self.found, outcome.case)
-        lines = [f"case {outcome.index}, POV level {level_name(outcome.case.level)}: "]
-        lines[0] += described(outcome.case)
-        lines += [f"  {sentence}" for sentence in words]
-        if self.found.nearest_start is not None:
-            name, value = self.found.nearest_start
-            of_case = (self.run.folder, self.run.record, outcome.index)
-            lines.append(f"look at it: {again('run', *of_case, at={name: value})}")
-        return [*lines, f"in the report: {command('report', self.run.folder)}"]
 
 
 def failure_of(run: Run, index: int | None) -> Outcome:
@@ -361,35 +344,6 @@ def _axis(
     return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def pass_of(episode: Episode) -> bool:
-    """Return whether a case has a verdict and does not fail."""
-    return episode.outcome.is_tested and not episode.outcome.failed
-
-
-def in_words(found: Explanation, case: Case) -> Iterator[str]:
-    """Yield the changes of a failure with which it passes: along axes, and at other levels."""
-    for axis in found.start:
-        yield _axis_in_words(axis, *name_and_unit(case, axis.name))
-    for axis in found.parameters:
-        yield _axis_in_words(axis, f"the VUT's {axis.name}", "")
-    for level, passes in found.levels.items():
-        psi = f", psi {PSI:g}" if level == level_name(2) else ""
-        verb = "passes" if passes else "does not pass"
-        yield f"the same start {verb} at level {level}{psi}"
-
-
-def name_and_unit(case: Case, field: str) -> tuple[str, str]:
-    """Return name and unit of a coordinate; of an unknown one its field."""
-    named = {c.field: (c.name, c.unit) for c in coordinates(case.scenario, (case.level,))}
-    return named.get(field, (field, ""))
-
-
-def _axis_in_words(axis: Axis, name: str, unit: str) -> str:
-    def text(value: float) -> str:
-        return f"{value:.{axis.digits}f} {unit}".rstrip()
-
-    passing = either(map(text, axis.passing)) if axis.passing else "no other value"
-    return (
-        f"{name} is {text(axis.value)}; passes at {passing} (tried from {text(axis.low)} to "
-        f"{text(axis.high)}, every {text(axis.step)})"
-    )
+def pass_of(results: Episodes) -> list[bool]:
+    """Return of each result whether the case has a verdict and does not fail."""
+    return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]

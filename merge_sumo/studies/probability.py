@@ -34,11 +34,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from merge_sumo import config
-from merge_sumo.engine.evaluate import evaluate, open_simulators
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import Scenario, level_name
+from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.studies.exposure import Distribution, read_distribution
 from merge_sumo.studies.run_study import RunStudy, check_least
 from merge_sumo.studies.study_file import StudyFile
@@ -48,8 +48,6 @@ from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.system.records import Record, to_json
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.chance import clopper_pearson
-from merge_sumo.verdict.criterion import Criterion
-from merge_sumo.verdict.episode import Episode
 
 DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
 STREAM: Final = 7
@@ -155,50 +153,6 @@ class ProbabilityResult(Result, Record, frozen=True):
     engine: str
     campaign: dict[str, Any]
 
-    def lines(self) -> list[str]:
-        """Return the probability and its interval, the strata, the levels, and what is counted."""
-        at = f"{100.0 * self.confidence:g} % interval"
-        lines = [] if self.per_merge is None else _per_merge_lines(self.per_merge, at)
-        if self.overall is not None:
-            lines.append(f"P(fail): {_interval(self.overall)}, {at}, by {self.cases:,} cases")
-            lines += map(_stratum_line, self.overall.strata)
-        if self.overall is None or len(self.levels) > 1:
-            lines += [
-                f"  level {level_name(level)}: P(fail) {_interval(one)}"
-                for level, one in self.levels.items()
-            ]
-        criterion = Criterion(self.campaign["fail_when"], self.campaign["require"])
-        lines.append(f"  a case fails when {criterion.words}")
-        if errors := sum(s.without_verdict for e in self.levels.values() for s in e.strata):
-            lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
-        if self.in_sumo < self.cases:
-            lines.append(f"  by the equations of motion; {self.in_sumo:,} in SUMO too, all alike")
-        return lines
-
-
-def _interval(one: Estimate) -> str:
-    return f"{one.probability:.3g} [{one.low:.3g}, {one.high:.3g}]"
-
-
-def _stratum_line(one: Stratum) -> str:
-    expected = "failures" if one.expects_failures else "no failure"
-    return (
-        f"  where the campaign expects {expected}, {one.share:.2%} of the cases: {one.failures:,} "
-        f"of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
-    )
-
-
-def _per_merge_lines(one: PerMerge, at: str) -> list[str]:
-    traffic = one.traffic
-    most = "" if one.most == one.least else f" to {one.most:.3g}"
-    return [
-        f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
-        f"{at}, whatever the shares of the POV levels",
-        f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
-        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
-        f"{one.counted_speeds:.0%} of the speeds of this traffic",
-    ]
-
 
 PROBABILITY: Final = StudyFile("probability.json", ProbabilityResult)
 
@@ -257,7 +211,7 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
     counted, in_sumo = [], 0
     missed: list[dict[str, float]] = []
     for one, chances in zip(cells, drawn, strict=True):
-        at = study.settings.pool.cases(stated.points(one.level, chances), one.level)
+        at = CasesAt(study.settings.pool, one.level, stated.points(one.level, chances))
         failed, judged = np.zeros((2, len(at)), dtype=bool)
         for place, (fails, has_verdict, by_sumo) in evaluate(plan, at, study.workers, _judged):
             failed[place], judged[place] = fails, has_verdict
@@ -334,9 +288,12 @@ def draw(
     return [drawn[place] for place in range(len(cells))]
 
 
-def _judged(episode: Episode) -> tuple[bool, bool, bool]:
-    """Return whether a case failed, had a verdict, and ran in SUMO."""
-    return episode.outcome.failed, episode.outcome.margin is not None, episode.in_sumo
+def _judged(results: Episodes) -> list[tuple[bool, bool, bool]]:
+    """Return of each case whether it failed, had a verdict, and ran in SUMO."""
+    return [
+        (verdict.failed, verdict.margin is not None, place in results.in_sumo)
+        for place, verdict in enumerate(results.verdicts())
+    ]
 
 
 def _named(case: Case) -> dict[str, float]:

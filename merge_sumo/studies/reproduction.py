@@ -6,7 +6,7 @@ the median. Same seeds and same versions give the same files.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -200,62 +200,6 @@ class Reproduction(Result):
                 {**to_plain(one.column), **one.study.to_record()} for one in self.columns.values()
             ],
         }
-
-    def lines(self) -> list[str]:
-        """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
-        rows = [
-            f"| FMC: ours (the paper's) | {' | '.join(self.columns)} |",
-            "|---|" + "---|" * len(self.columns),
-            *(f"| {name} | {' | '.join(cells)} |" for name, cells in self.rows()),
-        ]
-        for title, one in self.columns.items():
-            truth = one.study.truths[one.column.level]
-            for remark in truth.remarks():
-                rows += ["", f"The truth of {title} is {remark}."]
-        return rows if self.page is None else [*rows, f"all of it: {self.page}"]
-
-    def rows(self) -> Iterator[tuple[str, list[str]]]:
-        """Yield the rows of the table: a name, and a cell for each column."""
-        results = list(self.columns.values())
-        studies = [one.study for one in results]
-
-        def row(name: str, values: Iterable[float | None], form: str) -> tuple[str, list[str]]:
-            return name, ["-" if value is None else f"{value:{form}}" for value in values]
-
-        def beside(
-            name: str, ours: Iterable[float | None], papers: Iterable[float | None], form: str
-        ) -> tuple[str, list[str]]:
-            pairs = zip(row(name, ours, form)[1], row(name, papers, form)[1], strict=True)
-            return name, [f"{one} ({paper})" for one, paper in pairs]
-
-        papers = [one.column.paper for one in results]
-        for name in ("truth", *SAMPLERS):
-            ours = [
-                one.truth_fmc if name == "truth" else one.samplers[name].fmc.median
-                for one in studies
-            ]
-            yield beside(name, ours, [paper.get(name) for paper in papers], ".4f")
-        dense = [sum(fmc(truth.failures) for truth in one.dense.values()) for one in studies]
-        if any(dense):
-            yield row("dense truth", [value or None for value in dense], ".4f")
-        yield row("limit", [one.limit_fmc for one in studies], ".4f")
-        for name in ADAPTIVE:
-            over = [one.samplers[name].fmc_over_truth.median for one in studies]
-            shares = [p[name] / p["truth"] if name in p else None for p in papers]
-            yield beside(f"{name} / truth", over, shares, ".2f")
-        for name in ADAPTIVE:
-            over = [one.samplers[name].fmc_over_limit.median for one in studies]
-            yield row(f"{name} / limit", over, ".2f")
-        for name in ADAPTIVE:
-            after = studies[0].samplers[name].cases_by_batch
-            # A quarter of all cases, or where a batch ended next.
-            place = next(k for k, number in enumerate(after) if number >= after[-1] / 4)
-            early = [one.samplers[name].fmc_by_batch[1][place] for one in studies]
-            shares = [
-                e / s.truth_fmc if s.truth_fmc and not s.is_small else None
-                for s, e in zip(studies, early, strict=True)
-            ]
-            yield row(f"{name} / truth after {after[place]} cases", shares, ".2f")
 
 
 def reproduce(

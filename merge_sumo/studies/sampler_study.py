@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from merge_sumo import config
-from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import covered, fmc
+from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError, notice
 from merge_sumo.road.centre_lines import centre_lines
@@ -33,10 +34,9 @@ from merge_sumo.studies.truth import (
     ground_truth,
     known_truth,
 )
-from merge_sumo.system.printable import counted
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.result import Result
-from merge_sumo.system.workers import Workers, workers_or_here
+from merge_sumo.system.workers import Workers
 from merge_sumo.twin.twin import Twin
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.in_memory import is_here
@@ -101,9 +101,7 @@ def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
         twin = Twin(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
         sampler, ran = make_sampler(task.name, pool, task.seed, twin), SamplerRun([], [])
         batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-        groups: Groups = []
-        SearchLoop(sampler, plan, task.cases, batch=batch).run(groups.extend)
-        for group in groups:
+        for group in groups_here(plan, sampler, task.cases, batch):
             ran.outcomes.extend(episode.outcome for episode in group)
             ran.fmc.append(sum(fmc(ran.failures(level)) for level in task.levels))
         found.append(ran)
@@ -231,14 +229,6 @@ class Spread:
 
         return cls(quantile(0.5), quantile(0.25), quantile(0.75))
 
-    def text(self, form: str) -> str:
-        """Return the median, with the quartiles in brackets."""
-        median, low, high = (
-            "-" if value is None else f"{value:{form}}"
-            for value in (self.median, self.low, self.high)
-        )
-        return f"{median} [{low}, {high}]"
-
 
 @dataclass(frozen=True, slots=True)
 class SamplerSummary:
@@ -269,21 +259,6 @@ class SamplerSummary:
     cases_by_batch: list[int]
     fmc_by_batch: list[list[float]]
     covered_share_by_batch: list[float] | None
-
-    def columns(self, *, small: bool) -> dict[str, str]:
-        """Return the cells of its row by heading; nothing is divided by a `small` truth."""
-        of_truth = {
-            "FMC / truth": self.fmc_over_truth.text(".3f"),
-            "FMC / limit": self.fmc_over_limit.text(".3f"),
-        }
-        return {
-            **({} if small else of_truth),
-            "covered share": self.covered_share.text(".3f"),
-            "FMC": self.fmc.text(".4f"),
-            "failures": self.failures.text(".0f"),
-            "regions": self.regions_found.text(".1f"),
-            "to 90 %": self.cases_to_90_percent.text(".0f"),
-        }
 
 
 @dataclass(frozen=True, repr=False)
@@ -392,34 +367,3 @@ class SamplerStudy(Result):
             "dense_fmc": {level: fmc(truth.failures) for level, truth in self.dense.items()},
             "samplers": to_plain(self.samplers),
         }
-
-    def lines(self) -> list[str]:
-        """Return truth and limit, and a table of the samplers: medians [quartiles]."""
-        failures = sum(len(truth.failures) for truth in self.truths.values())
-        return [
-            f"truth: FMC {self.truth_fmc:.4f}, {counted(failures, 'failure')}"
-            + ("" if self.regions is None else f", {counted(len(self.regions), 'region')}"),
-            *(
-                f"  at level {level_name(level)} it is {remark}"
-                for level, truth in self.truths.items()
-                for remark in truth.remarks()
-            ),
-            f"limit: FMC {self.limit_fmc:.4f}, of all that truth and searches found"
-            + (f", or of {DENSE_CASES:,} uniform cases, where that is more" if self.dense else ""),
-            *self._table(),
-            *([] if self.figure is None else [f"figure: {self.figure}"]),
-        ]
-
-    def _table(self) -> list[str]:
-        rows = [
-            {"sampler": name, **one.columns(small=self.is_small)}
-            for name, one in self.samplers.items()
-        ]
-        widths = {name: max(map(len, (name, *(row[name] for row in rows)))) for name in rows[0]}
-        table = [{name: name for name in widths}, *rows]
-        shares = sum(map(len, self.probes.values()))
-        return [
-            *("  ".join(row[n].rjust(width) for n, width in widths.items()) for row in table),
-            "medians [quartiles]",
-            *([f"covered share: of {counted(shares, 'failing uniform case')}"] if shares else []),
-        ]

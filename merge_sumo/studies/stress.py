@@ -17,18 +17,15 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import failures
-from merge_sumo.engine.evaluate import evaluate
+from merge_sumo.engine.evaluate import Episodes, evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COORDINATES, DT_S
-from merge_sumo.studies.comparison import cut
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
-from merge_sumo.system.printable import counted
 from merge_sumo.system.records import Record
 from merge_sumo.system.result import Result
-from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import CaseVerdict, Outcome
 
 LISTED: Final = 10
@@ -107,21 +104,6 @@ class StressResult(Result, Record, frozen=True):
         """Indices of the failures that fail in every run of every rung, the worst first."""
         return tuple(index for index in self.failures if not self.passes_in(index))
 
-    @property
-    def sentence(self) -> str:
-        """How many failures are robust, and which others hang by the thinnest threads."""
-        if not self.failures:
-            return "no case failed: which passes fail on a rung is in the table"
-        fragile = [index for index in self.failures if self.passes_in(index)]
-        fragile.sort(key=lambda index: -self.passes_in(index))
-        shown = ", ".join(f"{i} ({self.passes_in(i)})" for i in fragile[:LISTED])
-        others = "; others, with the number of runs in which they do not fail"
-        return (
-            f"robust, as they fail on every rung: {len(self.robust)} of "
-            f"{counted(len(self.failures), 'failure')}"
-            + (f"{others}{cut(len(fragile), LISTED)}: {shown}" if fragile else "")
-        )
-
     def passes_in(self, index: int) -> int:
         """Return in how many runs of all rungs a failure does not fail."""
         runs = (run for rung in self.rungs for run in rung.runs)
@@ -130,22 +112,6 @@ class StressResult(Result, Record, frozen=True):
     def share(self, rung: Rung) -> float:
         """Return the share of verdicts that flip on a rung."""
         return rung.flips / max(self.cases * len(rung.runs), 1)
-
-    def lines(self) -> list[str]:
-        """Return a table of the rungs, and which failures are robust."""
-        lines = [
-            f"{counted(self.cases, 'case')} of {self.vut}, {len(self.failures)} of them "
-            f"failures, {self.runs} times each",
-            "   flips  now pass  now fail  no verdict  what is changed",
-        ]
-        for rung in self.rungs:
-            if rung.skipped:
-                lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
-                continue
-            numbers = "{:10d}{:10d}{:12d}".format(*rung.counts)
-            drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
-            lines.append(f"{self.share(rung):8.1%}{numbers}  {rung.about}{drawn}")
-        return [*lines, self.sentence]
 
 
 STRESS: Final = StudyFile("stress.json", StressResult)
@@ -277,11 +243,6 @@ def stress(study: RunStudy) -> StressResult:
     return found
 
 
-def verdict_of(episode: Episode) -> CaseVerdict:
-    """Return the verdict on a case."""
-    return episode.outcome.verdict
-
-
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     """Run all cases with a change; one that cannot be is skipped with its reason."""
     flips: list[Flips] = []
@@ -293,7 +254,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
             if one.case is not None:
                 cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
             found: dict[int, CaseVerdict] = {}
-            for place, verdict in evaluate(plan, cases, study.workers, verdict_of):
+            for place, verdict in evaluate(plan, cases, study.workers, keep=Episodes.verdicts):
                 found[place] = verdict
                 study.on_cases(1)
             flips.append(flips_of(tested, found))

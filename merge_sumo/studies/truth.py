@@ -14,8 +14,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import fmc, growth_bound, has_neighbour, radius_for, regions
-from merge_sumo.engine.evaluate import evaluate
+from merge_sumo.coverage.fmc import fmc, growth_bound, has_neighbour, regions
+from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray, Pool
@@ -23,14 +23,12 @@ from merge_sumo.scenario.scenario import OWN, Scenario, level_name
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
 from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
 from merge_sumo.system.hashing import Files, changed
-from merge_sumo.system.printable import counted
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder
 from merge_sumo.system.result import Result
 from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.criterion import Criterion
-from merge_sumo.verdict.episode import Episode
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
@@ -91,25 +89,13 @@ class Truth:
     @property
     def tells_regions(self) -> bool:
         """Whether failures are dense enough to be linked into regions."""
-        linked = has_neighbour(self.failures)
-        return not len(linked) or float(linked.mean()) >= 1.0 - MOST_ALONE
+        return self.alone <= MOST_ALONE
 
-    def remarks(self) -> list[str]:
-        """Return what it is too small for, in clauses."""
-        remarks = []
-        if self.is_small:
-            remarks.append(
-                "too small to be divided by: "
-                f"as many cases again could add up to {self.growth:.0%} to its FMC"
-            )
-        if not self.tells_regions:
-            alone = 1.0 - float(has_neighbour(self.failures).mean())
-            radius = radius_for(self.points.shape[1])
-            remarks.append(
-                f"too small for regions: {alone:.0%} of the failures have no other one within "
-                f"{radius:.2f}"
-            )
-        return remarks
+    @property
+    def alone(self) -> float:
+        """Share of the failures that have no other one within the radius of FMC."""
+        linked = has_neighbour(self.failures)
+        return 1.0 - float(linked.mean()) if len(linked) else 0.0
 
     def to_record(self) -> dict[str, Any]:
         """Return what JSON says of it."""
@@ -204,8 +190,8 @@ def _run(
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
     margins, in_sumo = np.full(len(points), np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
-    cases = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
-    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margin_of):
+    cases = CasesAt(Pool(levels=(level,), scenario=plan.scenario), level, points)
+    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margins):
         margins[place] = margin
         in_sumo += by_sumo
         files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}
@@ -288,11 +274,13 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     return Truth(points, margin, int(in_sumo))
 
 
-def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
-    """Return the margin, NaN without a verdict, whether SUMO ran the case, and the loaded files."""
-    margin = episode.outcome.margin
-    files = episode.files | episode.pov_files
-    return np.nan if margin is None else margin, episode.in_sumo, files
+def _margins(results: Episodes) -> list[tuple[float, bool, Files]]:
+    """Return of each case the margin, NaN without a verdict, whether SUMO ran it, and the files."""
+    files = results.files | results.pov_files
+    return [
+        (np.nan if verdict.margin is None else verdict.margin, place in results.in_sumo, files)
+        for place, verdict in enumerate(results.verdicts())
+    ]
 
 
 @dataclass(frozen=True, repr=False)
@@ -324,19 +312,3 @@ class TruthResult(Result):
             sums[name] = None if None in of_levels else sum(of_levels)
         text, named = self.criterion.text, ",".join(map(level_name, self.truths))
         return {"vut": self.vut, "level": named, **sums, "fail_when": text, "levels": levels}
-
-    def lines(self) -> list[str]:
-        """Return a line for each level, and any criterion but the default one in words."""
-        lines = []
-        for level, truth in self.truths.items():
-            line = f"{self.vut} at level {level_name(level)}: "
-            line += f"{counted(len(truth.failures), 'failure')} in "
-            line += f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
-            if truth.tells_regions:
-                regions = counted(len(truth.real_regions()), "region")
-                line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
-            if truth.in_sumo < len(truth.margin):
-                cases = counted(truth.in_sumo, "case")
-                line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-            lines += [line, *(f"  {remark}" for remark in truth.remarks())]
-        return [*lines, f"  a case fails when {self.criterion.words}"]

@@ -58,15 +58,6 @@ class VutCheck(Result):
         """Whether nothing is wrong."""
         return not self.problems
 
-    def lines(self) -> list[str]:
-        """Return what is wrong in sentences, and the cost of a step."""
-        return [
-            *(self.problems or ["nothing wrong"]),
-            *(f"note: {sentence}" for sentence in self.notes),
-            f"a step costs {self.us_per_step_median:.0f} us (median), "
-            f"{self.us_per_step_worst:.0f} us at worst",
-        ]
-
 
 def check_vut(plan: SimulationPlan) -> VutCheck:
     """Let the VUT of a plan drive a few cases, some of them again, and one from a stand."""
@@ -75,16 +66,16 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
     from_stand = replace(cases[0], v_vut0_mps=0.0)
     with Simulator(plan) as ground:
         timed = ground.vut = _Timed(ground.vut)
-        first = ground.run(cases)
+        first = _run(ground, cases)
         problems, differing = _errors(cases, first), list[_Difference]()
         if not problems:
-            backwards = ground.run(cases[::-1])[::-1]
+            backwards = _run(ground, cases[::-1])[::-1]
             differing += _differences("the same cases in another order", first, backwards)
-            alone = [ground.run([case])[0] for case in cases]
+            alone = [_run(ground, [case])[0] for case in cases]
             differing += _differences("each case alone", first, alone)
             for corridor in range(ground.world.corridors):
                 ground.vut.begin(corridor, from_stand)
-            differing += _differences("a reset too many", first, ground.run(cases))
+            differing += _differences("a reset too many", first, _run(ground, cases))
         outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
         vain = Counter(command for one in first for command in one.in_vain)
         headline = [*filter(None, [mostly_clipped(outcomes)])]
@@ -92,7 +83,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:
-            after = ground.run(cases[:1])
+            after = _run(ground, cases[:1])
             differing += _differences("a state that is no number", first[:1], after)
     if differing:
         problems += [
@@ -127,6 +118,10 @@ class _Timed(DriverWrapper):
         spent = perf_counter() - start
         self.us_per_step.append(spent * 1e6 / max(int(scene.active.sum()), 1))
         return answer
+
+
+def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
+    return [t for _, t in sorted(ground.run(cases), key=lambda pair: pair[0])]
 
 
 def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
@@ -170,7 +165,7 @@ def _why(plan: SimulationPlan, difference: _Difference) -> str:
     motions = []
     for _ in range(2):
         with Simulator(plan.for_cases(1)) as ground:
-            motions.append(ground.run([difference.case])[0].motion)
+            motions.append(_run(ground, [difference.case])[0].motion)
     if not np.array_equal(motions[0], motions[1]):
         return (
             "It draws random numbers, reads a clock, or keeps something outside of its process: as "
@@ -184,7 +179,7 @@ def _why(plan: SimulationPlan, difference: _Difference) -> str:
 
 
 def _from_stand(ground: Simulator, from_stand: Case) -> list[str]:
-    (trajectory,) = ground.run([from_stand])
+    (trajectory,) = _run(ground, [from_stand])
     if trajectory.end.is_error:
         return [
             f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
@@ -222,10 +217,11 @@ def known_vuts(policies: Path | str | None) -> Shown:
     """Return the VUTs that can be tested, with the learned drivers of a folder or a library."""
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
-    kinds = [kind for kind in KINDS.values() if kind.form]
     names = {"built in": built_in, "installed": list(installed_vuts())}
     lines = [f"{title}: {', '.join(known)}" for title, known in names.items() if known]
-    for kind in kinds:
-        lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
-    listed = [{"form": kind.form, "what": kind.what, "example": kind.example} for kind in kinds]
-    return Shown({**names, "kinds": listed}, lines)
+    kinds = []
+    for kind in KINDS.values():
+        if kind.form:
+            kinds.append({"form": kind.form, "what": kind.what, "example": kind.example})
+            lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
+    return Shown({**names, "kinds": kinds}, lines)

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from dataclasses import dataclass
+from functools import singledispatch
 from html import escape
 from typing import Any, ClassVar
 
 from merge_sumo.system.printable import printable
 from merge_sumo.system.records import to_plain
+
+
+@singledispatch
+def lines_of(result: Result) -> list[str]:
+    """Return what a command prints of a result: `reports/text.py` says it of each study."""
+    raise TypeError(f"{type(result).__name__} has no lines")
 
 
 class Result:
@@ -26,9 +32,9 @@ class Result:
         record: dict[str, Any] = to_plain(self)
         return record | {name: to_plain(getattr(self, name)) for name in self.computed}
 
-    @abstractmethod
     def lines(self) -> list[str]:
         """Return what a command prints."""
+        return lines_of(self)
 
     def __str__(self) -> str:
         return "\n".join(map(printable, self.lines()))

@@ -80,7 +80,8 @@ def play(
         for make in (make_pov, make_vut)
     )
     with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
-        return rollout(world, pov, vut, cases)
+        played = dict(rollout(world, pov, vut, cases))
+    return [played[index] for index in sorted(played)]
 
 
 def check_policy(

@@ -142,7 +142,3 @@ class Range:
     def digits(self) -> int:
         """Digits behind the point of a rounded value."""
         return min(max(0, DIGITS - math.floor(math.log10(self.high - self.low))), MOST_DIGITS)
-
-    def rounded(self, value: float) -> float:
-        """Round a value of the range to few digits."""
-        return min(max(round(value, self.digits), self.low), self.high)

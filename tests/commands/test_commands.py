@@ -20,20 +20,20 @@ COMMANDS = commands()
 PANELS = {
     "Search": {"campaign", "probability", "run"},
     "Look": {"explain", "export", "replay", "report"},
-    "Change": {"compare", "repair", "rerun"},
+    "Change": {"compare", "rerun"},
     "Bring your own": {"check-vut", "scenario", "train", "vuts"},
     "Research": {"benchmark", "reproduce", "truth"},
 }
 
 
-def test_seventeen_commands_stand_in_five_panels():
+def test_sixteen_commands_stand_in_five_panels():
     panels: dict[str, set[str]] = {}
     for name, command in cli.app.resolved_commands().items():
         if not name.startswith("-"):
             group: Any = command.group
             panels.setdefault(group[0].name, set()).add(name)
     assert panels == PANELS
-    assert sum(map(len, panels.values())) == 17
+    assert sum(map(len, panels.values())) == 16
 
 
 class TestOptions:

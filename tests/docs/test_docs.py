@@ -86,7 +86,12 @@ class TestTheArchitecture:
         assert calling == named - {"campaigns/plan.py", "engine/rollout.py"}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+# The list of changes names what earlier versions had.
+@pytest.mark.parametrize(
+    "page",
+    [page for page in PAGES if page.name != "CHANGELOG.md"],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
 def test_files_that_a_page_names_exist(page: Path):
     names = NAMED_FILE.findall(page.read_text(encoding="utf-8"))
     assert [name for name in names if not (ROOT / name).exists()] == []

@@ -16,7 +16,8 @@ from handmade import write_run
 
 from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report
-from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation, in_words
+from merge_sumo.reports.text import changes
+from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation
 from merge_sumo.system.records import to_plain
 from merge_sumo.verdict.conflict import Conflict
 
@@ -191,7 +192,7 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     known = Explanation(first.index, start, {"0": True, "2": False}, (gap,))
     line = json.dumps(to_plain(known))
     (run.folder / EXPLANATIONS.name).write_text(f"{line}\n", encoding="utf-8")
-    words = list(in_words(known, first.case))
+    words = list(changes(known, first.case))
     moments = [
         t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None
     ]

@@ -20,7 +20,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.scenario.scenario import US23
 
-CONTROLLERS = Path(__file__).parents[2] / "tools" / "chance_vuts.py"
+CONTROLLERS = Path(__file__).parents[1] / "support" / "chance_vuts.py"
 TOLERATED, RUNS = 0.2, 4
 
 

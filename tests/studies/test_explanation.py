@@ -15,14 +15,14 @@ from plans import plan_for
 
 import merge_sumo as ms
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.engine.evaluate import simulate
+from merge_sumo.engine.evaluate import run_cases
 from merge_sumo.errors import UserError
+from merge_sumo.reports.text import changes
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.studies.explanation import (
     EXPLANATIONS,
     Axis,
     Explanation,
-    in_words,
     nearest,
 )
 from merge_sumo.verdict.criterion import Criterion
@@ -46,8 +46,7 @@ def uniform(vut, folder, cases, **keywords: Any):
 
 
 def passes(plan, case):
-    (episode,) = simulate(plan, [case])
-    verdict = episode.outcome.verdict
+    (verdict,) = run_cases(plan, [case]).verdicts()
     return verdict.is_tested and not verdict.failed
 
 
@@ -240,7 +239,7 @@ def test_words_by_hand(made):
     x = Axis("x_pov0_m", -200.04, -340.0, -180.0, 1.0, 1, below=-203.1, above=-199.0)
     v = Axis("v_pov0_mps", 30.0, 25.0, 35.0, 0.06, 2)
     found = Explanation(outcome.index, (x, v), {"0": True, "2": False})
-    assert list(in_words(found, outcome.case)) == [
+    assert list(changes(found, outcome.case)) == [
         "x_POV0 is -200.0 m; passes at -199.0 m or -203.1 m (tried from -340.0 m to -180.0 m, "
         "every 1.0 m)",
         "v_POV0 is 30.00 m/s; passes at no other value (tried from 25.00 m/s to 35.00 m/s, "

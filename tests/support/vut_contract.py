@@ -58,9 +58,14 @@ def in_process(spec: object, **options: Any) -> VutFactory:
 
 
 def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
-    """Return what became of every case, in order."""
+    """Return what became of every case, in order; every case must come back exactly once."""
+    found: dict[int, Trajectory] = {}
     with Simulator(plan_for(vut, corridors=corridors)) as ground:
-        return ground.run(cases)
+        for index, trajectory in ground.run(cases):
+            assert index not in found
+            found[index] = trajectory
+    assert sorted(found) == list(range(len(cases)))
+    return [found[index] for index in range(len(cases))]
 
 
 def run_on(
@@ -70,4 +75,5 @@ def run_on(
     points = np.random.default_rng(0).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
     with Simulator(plan_for(vut, scenario=scenario, corridors=corridors)) as ground:
-        return ground.run(cases)
+        found = dict(ground.run(cases))
+    return [found[index] for index in range(count)]

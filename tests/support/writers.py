@@ -19,7 +19,6 @@ WRITERS: Final = {
     "probability": ("probability run --cases 40 --out", ".json"),
     "compare": ("compare run run --out", ".html"),
     "junit of compare": ("compare run run --junit", ".xml"),
-    "repair": ("repair run --param gap_m=10..40 --trials 4 --rounds 1 --cases 20 --out", ""),
     "benchmark": (f"{BENCHMARK} --figure", ".png"),
     "reproduce": ("reproduce --quick --seeds 1 --workers 1 --out", ""),
     "export": ("export run 0 1 --out", ""),

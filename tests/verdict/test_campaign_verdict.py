@@ -27,7 +27,7 @@ from merge_sumo.verdict.campaign_verdict import Gate, judge, parse_gates
 from merge_sumo.verdict.summary import LevelSummary, Summary, summarise
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
-CHANCE = f"{Path(__file__).parents[2]}/tools/chance_vuts.py:Slope"
+CHANCE = f"{Path(__file__).parents[1]}/support/chance_vuts.py:Slope"
 VUTS = {
     "raises": "raise RuntimeError('boom')",
     "stops": "return -4.0",
@@ -157,13 +157,13 @@ class TestJUnit:
 
     def test_is_refused_where_something_is_or_nothing_can_be(self, tmp_path):
         folder = tmp_path / "run"
-        (tmp_path / "file").write_text("mine")
-        (tmp_path / "link").symlink_to(tmp_path / "nowhere")
-        for name in ("file", "link", "."):
+        (tmp_path / "file.xml").write_text("mine")
+        (tmp_path / "link.xml").symlink_to(tmp_path / "nowhere")
+        for name in ("file.xml", "link.xml"):
             with pytest.raises(UserError, match="exists"):
                 check_junit(tmp_path / name, folder)
         with pytest.raises(UserError, match="the folder of the campaign"):
-            check_junit(folder, folder)
+            check_junit(tmp_path / "run.xml", tmp_path / "run.xml")
         with pytest.raises(UserError, match="there is no folder"):
             check_junit(tmp_path / "no" / "junit.xml", folder)
         check_junit(folder / "junit.xml", folder)  # the campaign makes that folder

@@ -1,0 +1,422 @@
+"""What a terminal shows of the results of studies: `lines_of` has a function for each of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
+
+from merge_sumo.campaigns.again import again, command
+from merge_sumo.coverage.fmc import fmc, radius_for
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.scenario import level_name
+from merge_sumo.studies.comparison import (
+    LISTED,
+    Change,
+    ComparedCase,
+    Comparison,
+    Step,
+    cut,
+    outcome_word,
+    passes,
+    short,
+)
+from merge_sumo.studies.counterfactuals import causes
+from merge_sumo.studies.explanation import (
+    PSI,
+    Axis,
+    Explanation,
+    ExplanationResult,
+)
+from merge_sumo.studies.probability import Estimate, PerMerge, ProbabilityResult
+from merge_sumo.studies.reproduction import ADAPTIVE, SAMPLERS, Reproduction
+from merge_sumo.studies.sampler_study import SamplerStudy, SamplerSummary, Spread
+from merge_sumo.studies.stress import StressResult
+from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
+from merge_sumo.studies.vut_check import VutCheck
+from merge_sumo.system.printable import counted
+from merge_sumo.system.result import lines_of
+from merge_sumo.system.suggestions import either
+from merge_sumo.verdict.campaign_verdict import judge
+from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.plausibility import behind
+
+FRAGILE: Final = 10
+"""Failures that are not robust that a sentence names."""
+
+# Comparisons
+
+
+def change_in_words(case: ComparedCase) -> str:
+    """Return both outcomes of a case in words, with the runs of each where there are several."""
+    if case.chance is not None and case.runs_a is not None and case.runs_b is not None:
+        shares = f"{case.runs_a.in_words} -> {case.runs_b.in_words}"
+        return f"{shares}, by Fisher's exact test p = {case.chance:.2g}"
+    sides = case.a, case.b
+    words = [outcome_word(outcome) for outcome in sides]
+    if words[0] == words[1] and case.change in (Change.WORSE, Change.NOT_REPEATABLE):
+        words = [f"{words[0]}, margin {short(outcome.margin)}" for outcome in sides]
+    elif words[0] == words[1] and case.change is not Change.BOTH:
+        words = [f"{words[0]}, {'no' if passes(o) else 'a'} failure" for o in sides]
+    return " -> ".join(words)
+
+
+def step_headline(step: Step) -> str:
+    """Return what pairs, regions and numbers of a step say."""
+    parts = ["no case is shared"]
+    if step.cases:
+        changes = [one for one in Change if one is Change.BROKE or step.count(one)]
+        numbers = ", ".join(f"{step.count(change)} {change}" for change in changes)
+        parts = [f"of {counted(len(step.cases), 'shared case')} {numbers}"]
+    if step.regions:
+        of_regions = [one.change for found in step.regions.values() for one in found]
+        shown = [f"{of_regions.count(one)} {one}" for one in Change if one in of_regions]
+        parts.append(f"regions of failures: {', '.join(shown) or 'none'}")
+    if step.passes_less:
+        by = f"by Fisher's exact test p = {step.chance:.2g}"
+        parts.insert(0, f"{step.after} passes less often than {step.before}, {by}")
+    return "; ".join(parts)
+
+
+def comparison_headline(compared: Comparison) -> str:
+    """Return the failures of each version, and how much broke and was fixed, in a sentence."""
+    parts = [" -> ".join(judge(one.outcomes, one.tolerated).counts for one in compared.versions)]
+    for step in compared.steps:
+        between = f"from {step.before} to {step.after}: " if len(compared.steps) > 1 else ""
+        parts.append(between + step_headline(step))
+    return "; ".join(parts)
+
+
+def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
+    """Return by level the FMC of each version as text, of its own cases; "-" for none."""
+    rows: dict[int, list[str]] = {}
+    for level in sorted({level for version in compared.versions for level in version.levels}):
+        found = [version.at.get(level) for version in compared.versions]
+        rows[level] = ["-" if one is None or not one.tested else f"{one.fmc:.4f}" for one in found]
+    return rows
+
+
+@lines_of.register
+def comparison(compared: Comparison) -> list[str]:
+    """Return the numbers, version by version and step by step, and the first of the cases."""
+    text = [comparison_headline(compared)]
+    if compared.text is not None:
+        return [*text, *compared.notes]
+    text.append(compared.source)
+    for number, version in enumerate(compared.versions, start=1):
+        verdict = judge(version.outcomes, version.tolerated)
+        place = f"{version.folder} " if version.folder else "now "
+        text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
+        text += [*verdict.trouble_lines(), *(f"  {one}" for one in behind(version.outcomes))]
+    for level, row in fmc_rows(compared).items():
+        text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
+    for step in compared.steps:
+        text += _step_lines(step)
+    differ = any(c.change is not Change.BOTH for step in compared.steps for c in step.cases)
+    if differ and compared.page_command:
+        text.append(f"both motions in one picture: {compared.page_command}")
+    return [*text, *compared.notes]
+
+
+def transitions(step: Step) -> list[str]:
+    """Return the number of cases of each change as lines."""
+    lines = []
+    for (change, before, after), number in step.transitions.items():
+        lines.append(f"{number:8d}  {before} -> {after} ({change})")
+    return lines
+
+
+def _step_lines(step: Step) -> Iterator[str]:
+    if step.cases:
+        cases = counted(len(step.cases), "case")
+        yield f"from {step.before} to {step.after}: {cases} with both"
+    yield from transitions(step)
+    listed = (Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.STILL_CONTACT)
+    for change in listed:
+        changed = [case for case in step.cases if case.change is change]
+        if changed:
+            yield f"{change}{cut(len(changed), LISTED)}:"
+        for case in changed[:LISTED]:
+            yield f"  case {case.b.index}: {change_in_words(case)}"
+
+
+# Truths and samplers
+
+
+def truth_remarks(truth: Truth) -> list[str]:
+    """Return what a truth is too small for, in clauses."""
+    remarks = []
+    if truth.is_small:
+        remarks.append(
+            "too small to be divided by: "
+            f"as many cases again could add up to {truth.growth:.0%} to its FMC"
+        )
+    if not truth.tells_regions:
+        radius = radius_for(truth.points.shape[1])
+        remarks.append(
+            f"too small for regions: {truth.alone:.0%} of the failures have no other one within "
+            f"{radius:.2f}"
+        )
+    return remarks
+
+
+@lines_of.register
+def truths(found: TruthResult) -> list[str]:
+    """Return a line for each level, and the criterion."""
+    lines = []
+    for level, truth in found.truths.items():
+        line = (
+            f"{found.vut} at level {level_name(level)}: "
+            f"{counted(len(truth.failures), 'failure')} in "
+            f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
+        )
+        if truth.tells_regions:
+            regions = counted(len(truth.real_regions()), "region")
+            line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
+        if truth.in_sumo < len(truth.margin):
+            cases = counted(truth.in_sumo, "case")
+            line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
+        lines += [line, *(f"  {remark}" for remark in truth_remarks(truth))]
+    return [*lines, f"  a case fails when {found.criterion.words}"]
+
+
+def _spread(spread: Spread, form: str) -> str:
+    """Return the median, with the quartiles in brackets."""
+    values = spread.median, spread.low, spread.high
+    return "{} [{}, {}]".format(*(_cell(value, form) for value in values))
+
+
+def _cell(value: float | None, form: str) -> str:
+    return "-" if value is None else f"{value:{form}}"
+
+
+def _columns(one: SamplerSummary, *, small: bool) -> dict[str, str]:
+    """Return the cells of a sampler by heading; nothing is divided by a `small` truth."""
+    of_truth = {
+        "FMC / truth": _spread(one.fmc_over_truth, ".3f"),
+        "FMC / limit": _spread(one.fmc_over_limit, ".3f"),
+    }
+    return {
+        **({} if small else of_truth),
+        "covered share": _spread(one.covered_share, ".3f"),
+        "FMC": _spread(one.fmc, ".4f"),
+        "failures": _spread(one.failures, ".0f"),
+        "regions": _spread(one.regions_found, ".1f"),
+        "to 90 %": _spread(one.cases_to_90_percent, ".0f"),
+    }
+
+
+@lines_of.register
+def samplers(study: SamplerStudy) -> list[str]:
+    """Return truth and limit, and a table of the samplers: medians [quartiles]."""
+    failures = sum(len(truth.failures) for truth in study.truths.values())
+    line = f"truth: FMC {study.truth_fmc:.4f}, {counted(failures, 'failure')}"
+    if study.regions is not None:
+        line += f", {counted(len(study.regions), 'region')}"
+    lines = [line]
+    for level, truth in study.truths.items():
+        for remark in truth_remarks(truth):
+            lines.append(f"  at level {level_name(level)} it is {remark}")
+    line = f"limit: FMC {study.limit_fmc:.4f}, of all that truth and searches found"
+    if study.dense:
+        line += f", or of {DENSE_CASES:,} uniform cases, where that is more"
+    lines.append(line)
+    rows = []
+    for name, one in study.samplers.items():
+        rows.append({"sampler": name, **_columns(one, small=study.is_small)})
+    widths = {name: max(map(len, (name, *(row[name] for row in rows)))) for name in rows[0]}
+    for row in [{name: name for name in widths}, *rows]:
+        lines.append("  ".join(row[name].rjust(width) for name, width in widths.items()))
+    lines.append("medians [quartiles]")
+    if probes := sum(map(len, study.probes.values())):
+        lines.append(f"covered share: of {counted(probes, 'failing uniform case')}")
+    return lines if study.figure is None else [*lines, f"figure: {study.figure}"]
+
+
+@lines_of.register
+def reproduction(found: Reproduction) -> list[str]:
+    """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
+    rows = [
+        f"| FMC: ours (the paper's) | {' | '.join(found.columns)} |",
+        "|---|" + "---|" * len(found.columns),
+    ]
+    for name, cells in table_ii(found):
+        rows.append(f"| {name} | {' | '.join(cells)} |")
+    for title, one in found.columns.items():
+        for remark in truth_remarks(one.study.truths[one.column.level]):
+            rows += ["", f"The truth of {title} is {remark}."]
+    return rows if found.page is None else [*rows, f"all of it: {found.page}"]
+
+
+def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
+    """Yield the rows of Table II: a name, and a cell for each column."""
+    studies = [one.study for one in found.columns.values()]
+    papers = [one.column.paper for one in found.columns.values()]
+
+    def row(values: Iterable[float | None], form: str) -> list[str]:
+        return [_cell(value, form) for value in values]
+
+    def with_paper(
+        ours: Iterable[float | None], paper: Iterable[float | None], form: str
+    ) -> list[str]:
+        pairs = zip(row(ours, form), row(paper, form), strict=True)
+        return [f"{one} ({other})" for one, other in pairs]
+
+    for name in ("truth", *SAMPLERS):
+        ours: list[float | None] = [one.truth_fmc for one in studies]
+        if name != "truth":
+            ours = [one.samplers[name].fmc.median for one in studies]
+        yield name, with_paper(ours, [paper.get(name) for paper in papers], ".4f")
+    dense = [sum(fmc(truth.failures) for truth in one.dense.values()) for one in studies]
+    if any(dense):
+        yield "dense truth", row([value or None for value in dense], ".4f")
+    yield "limit", row([one.limit_fmc for one in studies], ".4f")
+    for name in ADAPTIVE:
+        over = [one.samplers[name].fmc_over_truth.median for one in studies]
+        shares = [paper[name] / paper["truth"] if name in paper else None for paper in papers]
+        yield f"{name} / truth", with_paper(over, shares, ".2f")
+    for name in ADAPTIVE:
+        over = [one.samplers[name].fmc_over_limit.median for one in studies]
+        yield f"{name} / limit", row(over, ".2f")
+    for name in ADAPTIVE:
+        after = studies[0].samplers[name].cases_by_batch
+        # A quarter of all cases, or where a batch ended next.
+        batch = next(k for k, number in enumerate(after) if number >= after[-1] / 4)
+        early: list[float | None] = []
+        for one in studies:
+            reached = one.samplers[name].fmc_by_batch[1][batch]
+            early.append(reached / one.truth_fmc if one.truth_fmc and not one.is_small else None)
+        yield f"{name} / truth after {after[batch]} cases", row(early, ".2f")
+
+
+# Of one campaign
+
+
+@lines_of.register
+def probability(found: ProbabilityResult) -> list[str]:
+    """Return the probability and its interval, the strata, the levels, and what is counted."""
+    at = f"{100.0 * found.confidence:g} % interval"
+    lines = [] if found.per_merge is None else _per_merge(found.per_merge, at)
+    if found.overall is not None:
+        lines.append(f"P(fail): {_interval(found.overall)}, {at}, by {found.cases:,} cases")
+        for one in found.overall.strata:
+            expected = "failures" if one.expects_failures else "no failure"
+            lines.append(
+                f"  where the campaign expects {expected}, {one.share:.2%} of the cases: "
+                f"{one.failures:,} of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
+            )
+    if found.overall is None or len(found.levels) > 1:
+        for level, estimate in found.levels.items():
+            lines.append(f"  level {level_name(level)}: P(fail) {_interval(estimate)}")
+    criterion = Criterion(found.campaign["fail_when"], found.campaign["require"])
+    lines.append(f"  a case fails when {criterion.words}")
+    if errors := sum(s.without_verdict for e in found.levels.values() for s in e.strata):
+        lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
+    if found.in_sumo < found.cases:
+        lines.append(f"  by the equations of motion; {found.in_sumo:,} in SUMO too, all alike")
+    return lines
+
+
+def _interval(one: Estimate) -> str:
+    return f"{one.probability:.3g} [{one.low:.3g}, {one.high:.3g}]"
+
+
+def _per_merge(one: PerMerge, at: str) -> list[str]:
+    traffic = one.traffic
+    most = "" if one.most == one.least else f" to {one.most:.3g}"
+    return [
+        f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
+        f"{at}, whatever the shares of the POV levels",
+        f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
+        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
+        f"{one.counted_speeds:.0%} of the speeds of this traffic",
+    ]
+
+
+@lines_of.register
+def stress(found: StressResult) -> list[str]:
+    """Return a table of the rungs, and which failures are robust."""
+    lines = [
+        f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
+        f"failures, {found.runs} times each",
+        "   flips  now pass  now fail  no verdict  what is changed",
+    ]
+    for rung in found.rungs:
+        if rung.skipped:
+            lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
+            continue
+        numbers = "{:10d}{:10d}{:12d}".format(*rung.counts)
+        drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
+        lines.append(f"{found.share(rung):8.1%}{numbers}  {rung.about}{drawn}")
+    return [*lines, robustness(found)]
+
+
+def robustness(found: StressResult) -> str:
+    """Return how many failures are robust, and which others pass most often."""
+    if not found.failures:
+        return "no case failed: which passes fail on a rung is in the table"
+    robust, failures = len(found.robust), counted(len(found.failures), "failure")
+    text = f"robust, as they fail on every rung: {robust} of {failures}"
+    fragile = [index for index in found.failures if found.passes_in(index)]
+    fragile.sort(key=lambda index: -found.passes_in(index))
+    shown = ", ".join(f"{index} ({found.passes_in(index)})" for index in fragile[:FRAGILE])
+    if fragile:
+        text += "; others, with the number of runs in which they do not fail"
+        text += f"{cut(len(fragile), FRAGILE)}: {shown}"
+    return text
+
+
+@lines_of.register
+def explanation(result: ExplanationResult) -> list[str]:
+    """Return the failure, its cause, its changes, and a command that runs the smallest."""
+    run, found = result.run, result.found
+    outcome = run.outcome(found.index)
+    level = level_name(outcome.case.level)
+    lines = [f"case {outcome.index}, POV level {level}: {described(outcome.case)}"]
+    for sentence in (*causes(run, [outcome]).values(), *changes(found, outcome.case)):
+        lines.append(f"  {sentence}")
+    if found.nearest_start is not None:
+        name, value = found.nearest_start
+        again_here = again("run", run.folder, run.record, outcome.index, at={name: value})
+        lines.append(f"look at it: {again_here}")
+    return [*lines, f"in the report: {command('report', run.folder)}"]
+
+
+def changes(found: Explanation, case: Case) -> Iterator[str]:
+    """Yield the changes of a failure with which it passes: along axes, and at other levels."""
+    for axis in found.start:
+        yield _axis(axis, *name_and_unit(case, axis.name))
+    for axis in found.parameters:
+        yield _axis(axis, f"the VUT's {axis.name}", "")
+    for level, passed in found.levels.items():
+        psi = f", psi {PSI:g}" if level == level_name(2) else ""
+        verb = "passes" if passed else "does not pass"
+        yield f"the same start {verb} at level {level}{psi}"
+
+
+def name_and_unit(case: Case, field: str) -> tuple[str, str]:
+    """Return name and unit of a coordinate; of an unknown one its field."""
+    for coordinate in coordinates(case.scenario, (case.level,)):
+        if coordinate.field == field:
+            return coordinate.name, coordinate.unit
+    return field, ""
+
+
+def _axis(axis: Axis, name: str, unit: str) -> str:
+    def text(value: float) -> str:
+        return f"{value:.{axis.digits}f} {unit}".rstrip()
+
+    passing = either(map(text, axis.passing)) if axis.passing else "no other value"
+    return (
+        f"{name} is {text(axis.value)}; passes at {passing} (tried from {text(axis.low)} to "
+        f"{text(axis.high)}, every {text(axis.step)})"
+    )
+
+
+@lines_of.register
+def vut_check(found: VutCheck) -> list[str]:
+    """Return what is wrong in sentences, and the cost of a step."""
+    problems: Sequence[str] = found.problems or ["nothing wrong"]
+    cost = f"{found.us_per_step_median:.0f} us (median), {found.us_per_step_worst:.0f} us at worst"
+    notes = [f"note: {sentence}" for sentence in found.notes]
+    return [*problems, *notes, f"a step costs {cost}"]
