@@ -10,7 +10,6 @@ import inspect
 import re
 import sys
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -69,67 +68,9 @@ def measures_page() -> str:
     return f"# Measures\n\n{about}\n\n{head}{rows}"
 
 
-NAMED: Final = re.compile(r"^<!-- ([\w.]+) -->$", re.MULTILINE)
-"""A line of docs/reference/python.md that names what the text below it describes."""
-SECTION: Final = re.compile(r"^(Args|Attributes|Returns|Raises|Yields):$")
-
-
-def python_page() -> str:
-    """Return docs/reference/python.md with a description of each function and class it names."""
-    page = (DOCS / "reference/python.md").read_text(encoding="utf-8")
-    # The last one of a section is followed by a heading and perhaps text, which stay.
-    parts = re.split(r"^(?=## )", page, flags=re.MULTILINE)
-    return "".join(_described(part) for part in parts)
-
-
-def _described(part: str) -> str:
-    names = NAMED.findall(part)
-    if not names:
-        return part
-    before = part.partition("<!-- ")[0]
-    return before + "".join(f"<!-- {name} -->\n{_description(name)}\n" for name in names)
-
-
-def _description(path: str) -> str:
-    """Return heading, signature, docstring, and the methods and properties of a class."""
-    module, _, name = path.rpartition(".")
-    one = getattr(import_module(module), name)
-    lines = [f"### {name}", ""]
-    if inspect.isfunction(one):
-        given = inspect.signature(one)
-        bare = [p.replace(annotation=p.empty) for p in given.parameters.values()]
-        shown = given.replace(parameters=bare, return_annotation=given.empty)
-        lines += ["```python", f"{name}{shown}", "```", ""]
-    lines += _docstring(one)
-    for of, member in vars(one).items() if inspect.isclass(one) else ():
-        about = inspect.getdoc(member.fget if isinstance(member, property) else member)
-        shows = isinstance(member, property) or inspect.isfunction(member)
-        if shows and about and not of.startswith("_"):
-            call = "()" if inspect.isfunction(member) else ""
-            lines.append(f"- `.{of}{call}`: {' '.join(about.partition(chr(10) * 2)[0].split())}")
-    return "\n".join(lines).rstrip() + "\n"
-
-
-def _docstring(one: Any) -> list[str]:
-    """Return a docstring in Google style as Markdown; its sections become lists."""
-    lines, section = [], False
-    for line in inspect.cleandoc(one.__doc__ or "").splitlines():
-        if SECTION.match(line):
-            lines += [f"**{line}**", ""]
-        elif section := (section or line.startswith("    ")) and line[:1] in ("", " "):
-            item = line[4:]
-            named, colon, about = item.partition(": ")
-            new = item[:1] != " " and colon
-            lines.append(f"- `{named}`: {about}" if new else f"  {item.strip()}".rstrip())
-        else:
-            lines.append(line)
-    return [*lines, ""]
-
-
 WRITTEN: dict[str, Callable[[], str]] = {
     "reference/cli.md": cli_page,
     "reference/measures.md": measures_page,
-    "reference/python.md": python_page,
 }
 """Pages below docs/ that are written from the code."""
 
