@@ -55,7 +55,7 @@ def some(values: Iterable[Any], *kept: object) -> list[Any]:
 
 @pytest.fixture(autouse=True, scope="module")
 def no_simulation_left() -> Iterator[None]:
-    """Close what `run_cases` keeps open in this process: libsumo holds one simulation at a time."""
+    """Close what `simulate` keeps open in this process: libsumo holds one simulation at a time."""
     yield
     evaluate.close_simulator()
 

@@ -93,7 +93,6 @@ def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = 
 IMPORTERS = ("import_module", "__import__")
 IMPORTED_BY_A_VARIABLE = {
     "merge_sumo": "the room of a public name that is asked for",
-    "merge_sumo.system.workers": "what a worker loads first",
     "merge_sumo.system.spawning": "the function that a new process of this package is to run",
     "merge_sumo.vuts.built_in": "the files of `drivers/`, which may have VUTs",
     "merge_sumo.vuts.python": "the module of a user's VUT",

@@ -20,7 +20,6 @@ import statistics
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
@@ -30,13 +29,12 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.against import FIRST_BATCH, evaluate_both, tell_both
-from merge_sumo.campaigns.campaign import twin_of
-from merge_sumo.campaigns.plan import resolve, resolve_earlier
-from merge_sumo.campaigns.scheduler import Scheduler, groups_here
+from merge_sumo.campaigns.campaign import FIRST_BATCH, twin_of
+from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import radius_for
-from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, evaluate
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
@@ -90,13 +88,14 @@ class Versions:
         self.pair = pair
         settings = pair.settings(1, 0)
         self.new = resolve(settings).with_engine(None)
-        old = resolve_earlier(settings, self.new)
+        old = self.new.earlier
         assert old is not None, "a pair"  # noqa: S101
         self.old = old
         dims = settings.scenario.dimensions(pair.level)
         points = spread_out(truth_cases, len(dims), np.random.default_rng(7))
-        cases = CasesAt(settings.pool, pair.level, points)
-        new, old_failed = (_failed(plan, cases) for plan in (self.new, self.old))
+        cases = settings.pool.cases(points, pair.level)
+        new = _failed(replace(self.new, against=None), cases)
+        old_failed = _failed(self.old, cases)
         self.regressions = points[new & ~old_failed]
         self.shares = {
             "new fails": float(new.mean()),
@@ -117,11 +116,10 @@ class Versions:
         twins = TwinPair(twin_of(settings, self.new), twin_of(settings, self.old))
         sampler = make_sampler(settings.sampler, settings.pool, seed, twins)
         young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
-        scheduler = Scheduler(sampler, cases, first=young, tell=partial(tell_both, sampler))
-        both = partial(evaluate_both, self.new, self.old, THIS_PROCESS)
+        groups: Groups = []
+        SearchLoop(sampler, self.new, cases, first=young).run(groups.extend)
         broke = [
             one.outcome.case
-            for groups in scheduler.run(both, THIS_PROCESS, whole=True)
             for one in chain.from_iterable(groups)
             if one.outcome.failed and one.earlier and _passes(one.earlier)
         ]
@@ -135,7 +133,9 @@ class Versions:
         settings = replace(self.pair.settings(cases, seed), against=None)
         twin = twin_of(settings, self.new)
         sampler = make_sampler(settings.sampler, settings.pool, seed, twin)
-        ran = chain.from_iterable(groups_here(self.new, sampler, cases))
+        groups: Groups = []
+        SearchLoop(sampler, replace(self.new, against=None), cases).run(groups.extend)
+        ran = chain.from_iterable(groups)
         failing = [one.outcome.case for one in ran if one.outcome.failed]
         passes = [
             _passes(episode)
@@ -149,13 +149,13 @@ class Versions:
 
 def _failed(plan: SimulationPlan, cases: Sequence[Case]) -> Any:
     failed = np.zeros(len(cases), dtype=bool)
-    for place, verdict in evaluate(plan, cases, None, _verdicts):
+    for place, verdict in evaluate(plan, cases, None, _has_failed):
         failed[place] = verdict
     return failed
 
 
-def _verdicts(results: Any) -> list[bool]:
-    return [verdict.failed for verdict in results.verdicts()]
+def _has_failed(episode: Episode) -> bool:
+    return episode.outcome.failed
 
 
 def _passes(episode: Episode) -> bool:

@@ -52,7 +52,7 @@ def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
     vut = VutFactory.of(VUT)(world.corridors)
     start = time.perf_counter()
-    trajectories = [trajectory for _, trajectory in rollout(world, pov, vut, cases)]
+    trajectories = rollout(world, pov, vut, cases)
     return time.perf_counter() - start, trajectories
 
 

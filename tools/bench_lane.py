@@ -60,7 +60,7 @@ def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
     """Return what happens in cases of one scenario, in their order."""
     scenario = cases[0].scenario
     world = EquationWorld(pov.corridors, road_for(scenario), scenario)
-    ended = dict(rollout(world, pov, vut, cases))
+    ended = rollout(world, pov, vut, cases)
     return [ended[place] for place in range(len(cases))]
 
 

@@ -38,11 +38,11 @@ from typing import Any
 import numpy as np
 from bench_record import add_record_option, append_record
 
+from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.scheduler import groups_here
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import RADIUS, fmc
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -123,7 +123,9 @@ def search(
     sampler.tell = timed(sampler.tell)  # type: ignore[method-assign]
     found: list[Any] = []
     curve, ended = {}, 0
-    for group in groups_here(plan, sampler, CASES, batch):
+    groups: Groups = []
+    SearchLoop(sampler, plan, CASES, batch=batch).run(groups.extend)
+    for group in groups:
         found += [one.outcome.case for one in group if one.outcome.failed]
         ended += len(group)
         if ended in SHOWN:
@@ -187,7 +189,8 @@ def _failures(
     pool = Pool(levels=(level,), scenario=US23)
     sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
     batch = batch or (None if sampler.predictor else BATCH)
-    groups = groups_here(plan, sampler, cases, batch)
+    groups: Groups = []
+    SearchLoop(sampler, plan, cases, batch=batch).run(groups.extend)
     failed = [one.outcome for group in groups for one in group if one.outcome.failed]
     points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
     return points, np.array([outcome.index for outcome in failed], dtype=np.int64)
@@ -259,7 +262,7 @@ def print_cost_per_case() -> dict[str, dict[int, float]]:
     cases = make_sampler("uniform", pool, 0).ask(sizes[-1])
     order, rng = np.random.default_rng(1).permutation(len(cases)), np.random.default_rng(2)
     outcomes, motions = [], {}
-    for index, result in enumerate(run_cases(plan, [cases[place] for place in order.tolist()])):
+    for index, result in enumerate(simulate(plan, [cases[place] for place in order.tolist()])):
         gap_m = np.nan if result.outcome.measures.dx_m is None else result.outcome.measures.dx_m
         chance = 0.9 if abs(gap_m) < US23.dx_crash_m else 0.1
         told = Prediction.of(gap_m + rng.normal(0.0, 0.5, (2, 4)), chance, chance, chance)

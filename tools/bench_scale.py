@@ -35,7 +35,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -48,19 +48,19 @@ from threadpoolctl import threadpool_limits
 
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
+from merge_sumo.campaigns.loop import SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
-from merge_sumo.campaigns.scheduler import Scheduler
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import fmc, regions
-from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate, run_cases
+from merge_sumo.engine.evaluate import evaluate, simulate
 from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
+from merge_sumo.scenario.case import Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.truth import _margins, ground_truth
-from merge_sumo.system.workers import LocalProcesses, Workers
+from merge_sumo.studies.truth import _margin_of, ground_truth
+from merge_sumo.system.workers import Job, LocalProcesses, Workers
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 
@@ -93,9 +93,10 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def margins_and_memory(results: Episodes) -> list[tuple[Any, ...]]:
-    """Return what `truth` keeps of cases, which process ran them, and how large it is."""
-    return [(margin, os.getpid(), memory_mb()) for margin, _, _ in _margins(results)]
+def margin_and_memory(episode: Episode) -> tuple[float, int, float]:
+    """Return what `truth` keeps of a case, which process ran it, and how large it is."""
+    margin, _, _ = _margin_of(episode)
+    return margin, os.getpid(), memory_mb()
 
 
 def compute(seconds: Sequence[float]) -> list[int]:
@@ -117,7 +118,7 @@ def never(item: Any) -> Any:
 
 def local(count: int) -> Workers:
     """Return worker processes that are never replaced, so that a leak would show."""
-    return Workers(partial(LocalProcesses, count), count)
+    return Workers(LocalProcesses, count)
 
 
 def truth(most: int) -> Iterator[dict[str, float]]:
@@ -126,15 +127,13 @@ def truth(most: int) -> Iterator[dict[str, float]]:
     rng = np.random.default_rng(0)
     with local(1) as workers:
         pool = Pool(levels=(0,), scenario=US23)
-        warm = CasesAt(pool, 0, rng.random((32, 2)))
-        list(evaluate(plan, warm, workers, margins_and_memory))
+        warm = pool.cases(rng.random((32, 2)), 0)
+        list(evaluate(plan, warm, workers, margin_and_memory))
         cases = 100
         while cases <= most:
             points: Any = rng.random((cases, 2))
             start, memory = time.perf_counter(), 0.0
-            for _, (_, _, now) in evaluate(
-                plan, CasesAt(pool, 0, points), workers, margins_and_memory
-            ):
+            for _, (_, _, now) in evaluate(plan, pool.cases(points, 0), workers, margin_and_memory):
                 memory = max(memory, now)
             spent = time.perf_counter() - start
             yield {
@@ -156,8 +155,8 @@ def two_workers() -> dict[str, list[float]]:
         def seconds(workers: Workers) -> float:
             start = time.perf_counter()
             for first in range(0, PAIR_CASES, 500):  # chunks of 250 on two workers
-                some = CasesAt(Pool(levels=(0,), scenario=US23), 0, points[first : first + 500])
-                list(evaluate(plan, some, workers, margins_and_memory))
+                some = Pool(levels=(0,), scenario=US23).cases(points[first : first + 500], 0)
+                list(evaluate(plan, some, workers, margin_and_memory))
             return time.perf_counter() - start
 
         def rate(workers: Workers, count: int) -> float:
@@ -181,10 +180,11 @@ def engines(cases: int, rounds: int) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {"sumo_us": [], "kinematic_us": [], "ratio": []}
 
     def us(name: str, points: Any) -> tuple[float, list[bool]]:
-        run_cases(plans[name], CasesAt(pool, 2, points[:200]))  # SUMO starts
+        simulate(plans[name], pool.cases(points[:200], 2))  # SUMO starts
         start = time.process_time()
-        verdicts = run_cases(plans[name], CasesAt(pool, 2, points)).verdicts()
-        return (time.process_time() - start) / len(points) * 1e6, [one.failed for one in verdicts]
+        episodes = simulate(plans[name], pool.cases(points, 2))
+        spent_us = (time.process_time() - start) / len(points) * 1e6
+        return spent_us, [episode.outcome.failed for episode in episodes]
 
     with threadpool_limits(1):
         for _ in range(rounds):
@@ -286,36 +286,35 @@ def cases_in_flight() -> dict[str, list[float]]:
     }
 
 
-class Served:
-    """Gives what became of cases as it comes from a worker process, with no work done for it."""
+class Served(Workers):
+    """Gives episodes as they come from a worker process, with no work done for them."""
 
     def __init__(self, ran: Sequence[Episode]) -> None:
-        """Serve what became of `MAX_CHUNK` cases."""
+        """Serve the episodes of `MAX_CHUNK` cases."""
+        super().__init__(None, 1)
         self._sent = pickle.dumps(list(ran))
 
-    def chunks(
-        self, chunks: Iterable[Sequence[Case]]
-    ) -> Generator[tuple[int, Sequence[Episode]], None, None]:
-        """Yield (place of the first case, what became of the chunk)."""
-        first = 0
-        for chunk in chunks:
-            yield first, pickle.loads(self._sent)[: len(chunk)]  # noqa: S301 (our own)
-            first += len(chunk)
+    def collect(self, job: Job[Any, Any]) -> list[Any]:
+        """Return episodes for the chunks of a job."""
+        episodes = []
+        for chunk in job.chunks:
+            episodes += pickle.loads(self._sent)[: len(chunk)]  # noqa: S301 (our own)
+        return episodes
 
 
 def parent(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
     plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
     pool = Pool(levels=(0,), scenario=US23)
-    served: Any = Served(run_cases(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
-    scheduler = Scheduler(make_sampler("uniform", pool, 0), cases, batch=BATCH)
+    served = Served(simulate(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
+    sampler = make_sampler("uniform", pool, 0)
+    search = SearchLoop(sampler, plan, cases, workers=served, batch=BATCH)
     with (
         tempfile.TemporaryDirectory() as scratch,
         Journal.create(Path(scratch) / "run", {}) as journal,
     ):
         start = time.perf_counter()
-        for groups in scheduler.run(served.chunks, THIS_PROCESS):
-            journal.append(*groups)
+        search.run(lambda groups: journal.append(*groups))
         return cases / (time.perf_counter() - start)
 
 

@@ -169,7 +169,7 @@ def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
     in_sumo += [result.trajectory for _, result in sorted(evaluate(plan, fresh))] if fresh else []
     largest_m, largest_mps = largest_deviations(plan, in_sumo)
     with HighwayEnvSimulator(plan) as simulator:
-        ran = dict(simulator.run([trajectory.case for trajectory in in_sumo]))
+        ran = simulator.run([trajectory.case for trajectory in in_sumo])
     differences, failures = [], 0
     for place, trajectory in enumerate(in_sumo):
         here, there = (failed(plan, one) for one in (trajectory, ran[place]))

@@ -86,7 +86,7 @@ def play(example: Example) -> Trajectory:
     level = example.case.level
     settings = CampaignSettings(vut=example.vut, levels=(level,), scenario=scenario)
     with Simulator(resolve(settings).for_cases(1)) as ground:
-        ((_, trajectory),) = ground.run([example.case])
+        (trajectory,) = ground.run([example.case])
     return trajectory
 
 

@@ -40,7 +40,6 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.drivers.policies import policies_in
-from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine
 from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError, notice
@@ -92,6 +91,7 @@ from merge_sumo.system.folders import (
 from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.records import check_toml_size, to_plain
 from merge_sumo.system.result import Shown
+from merge_sumo.system.workers import open_workers
 from merge_sumo.verdict.conflict import check_from
 from merge_sumo.vuts.base import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
@@ -359,7 +359,7 @@ def reproduce(config: c.Reproduce) -> Reproduction:
     policies, folder = policies_folder(config.policies, US23), path_of(config.out)
     figures.require_matplotlib()
     folder = folder or dated("reproduce")
-    with evaluation_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
+    with open_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
         make_folder(folder)
         result = reproduction.reproduce(
             scale, policies=policies, workers=workers, on_part=bars.counted

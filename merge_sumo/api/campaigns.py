@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from time import perf_counter
@@ -15,12 +15,11 @@ from merge_sumo.campaigns.again import call_again
 from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import WorkersLostError, notice
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
-from merge_sumo.reports.report import check_report, write_report
+from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import (
     LEVELS,
@@ -37,7 +36,7 @@ from merge_sumo.studies.share import note_shares
 from merge_sumo.system.folders import check_new, link_latest
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.verdict.campaign_verdict import parse_gates
 from merge_sumo.verdict.score import Outcome
 
@@ -67,26 +66,28 @@ def run_and_report(
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
-    def case_ended(outcome: Outcome) -> None:
-        bars.case_ended(outcome)
+    report = RunningReport(folder)
+
+    def on_cases(outcomes: Sequence[Outcome]) -> None:
         if config.on_case is not None:
-            config.on_case(outcome)
+            for outcome in outcomes:
+                config.on_case(outcome)
+        check()
 
     try:
-        with opened(where, plan) as workers, bars:
+        with opened(where, plan) as workers, bars, report:
             begun_s = perf_counter()
             run = run_campaign
             if goes_on:
                 run = partial(resume_campaign, on_before=bars.ran_before, warn=notice)
             done = run(
-                *(settings, plan, folder, case_ended),
+                *(settings, plan, folder, (bars.ended, report.rewrite, on_cases)),
                 workers=workers,
-                check=check,
                 begin=lambda: bars.begin(title),
             )
             result = CampaignRun(done, config.gates)
             took_s = perf_counter() - begun_s
-            _write_findings(result, plan, workers, took_s, bars, check)
+            _write_findings(result, replace(plan, against=None), workers, took_s, bars, check)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)

@@ -14,7 +14,6 @@ from merge_sumo.campaigns.one_case import ONE, case_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.engine.evaluate import evaluation_workers
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
 from merge_sumo.errors import UserError
@@ -26,7 +25,7 @@ from merge_sumo.scenario.scenario import US23, Scenario, level_name
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
 from merge_sumo.system.scratch import ScratchFolder
-from merge_sumo.system.workers import HERE_S, Workers
+from merge_sumo.system.workers import HERE_S, Workers, open_workers
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
 
 
@@ -35,8 +34,8 @@ def opened(where: c.Execution, plan: SimulationPlan, *, at_once: bool = False) -
 
     Where their number is open, processes are started `at_once`, or as soon as they pay.
     """
-    here_s = HERE_S if where.workers is None and not at_once else None
-    return evaluation_workers(plan.workers(where.workers), here_s)
+    here_s = HERE_S if where.workers is None and not at_once else 0.0
+    return open_workers(plan.workers(where.workers), here_s=here_s)
 
 
 @contextmanager

@@ -55,11 +55,13 @@ class Journal:
     Attributes:
         folder: the folder.
         settings: what `campaign.json` holds.
+        earlier: the journal of the earlier version, where the campaign is against one.
     """
 
     def __init__(self, folder: Path, outcomes: io.FileIO, settings: dict[str, Any]) -> None:
         """Take the folder, its open outcomes and settings; use `create` or `reopen`."""
         self.folder, self.settings = folder, settings
+        self.earlier: Self | None = None
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
@@ -114,6 +116,8 @@ class Journal:
         goes into the settings. Raises `UserError` when they cannot be written; what was there
         before stays.
         """
+        if self.earlier is not None:
+            self.earlier.append(*([e.earlier for e in group if e.earlier] for group in groups))
         paths = [batch_file(self.folder, group[0].outcome.batch) for group in groups]
         lines, arrays = zip(*map(_encoded, groups), strict=True)
         try:

@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from merge_sumo.config import COORDINATES
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, level_name
+from merge_sumo.system.workers import open_workers
 from merge_sumo.verdict.episode import Episode
 
 ONE: Final[dict[str, Any]] = {
@@ -66,7 +66,6 @@ def _option(name: str) -> str:
 
 def run_one(plan: SimulationPlan, case: Case) -> Episode:
     """Run one case in SUMO; its outcome is that of the same case in a campaign."""
-    with Simulator(plan.for_cases(1)) as simulator:
-        _, trajectory = next(simulator.run([case]))
-        outcome = plan.criterion.outcome(0, 0, trajectory, centre_lines(plan.road))
-        return Episode(outcome, trajectory)
+    with open_workers(1):  # which closes the simulator
+        (episode,) = simulate(plan.for_cases(1), [case])
+    return episode

@@ -32,21 +32,14 @@ def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPla
     povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
     for level in settings.levels:
         povs.check_level(level)
+    against = None
+    if settings.against is not None:
+        against = VutFactory.of(settings.against, settings.earlier.vut_options(policies))
     return SimulationPlan(
         scenario=settings.scenario,
         road=road_for(settings.scenario),
         vut=vut,
+        against=against,
         povs=povs,
         criterion=settings.criterion,
     )
-
-
-def resolve_earlier(settings: CampaignSettings, plan: SimulationPlan) -> SimulationPlan | None:
-    """Return the plan of the version that a campaign is against; None where it is against none.
-
-    It is the plan of the campaign with another VUT, which is loaded as by `resolve`.
-    """
-    if settings.against is None:
-        return None
-    options = settings.earlier.vut_options(plan.povs.policies)
-    return replace(plan, vut=VutFactory.of(settings.against, options))

@@ -23,8 +23,9 @@ import numpy as np
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import evaluate, evaluate_anew
+from merge_sumo.engine.evaluate import close_simulator, evaluate, simulate
 from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.folders import replace_own
@@ -86,7 +87,7 @@ def repeat(
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
             found.append(repeat_of(again[place], recorded[again[place].index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
-        first, second = (dict(evaluate_anew(plan, cases)) for _ in range(2))
+        first, second = (_simulated_again(plan, cases) for _ in range(2))
         drawn = {
             outcome.index: _difference(first[place].trajectory, second[place].trajectory)
             != (None, None)
@@ -96,6 +97,15 @@ def repeat(
     found.sort(key=lambda one: one.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, found)))
     return found
+
+
+def _simulated_again(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
+    """Run cases in this process, with drivers that drove nothing before."""
+    close_simulator()
+    try:
+        return simulate(plan, cases)
+    finally:
+        close_simulator()
 
 
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Final
@@ -51,29 +51,28 @@ class KinematicSimulator(Simulator):
             world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
             self._open_drivers(plan, world, None, opened)
 
-    def run(
-        self, cases: Sequence[Case], ran_again: set[int] | None = None
-    ) -> Iterator[tuple[int, Trajectory]]:
-        """Run cases; yield (place in `cases`, trajectory).
+    def run(self, cases: Sequence[Case], ran_again: set[int] | None = None) -> list[Trajectory]:
+        """Run cases; return their trajectories in order.
 
         Raises `UserError` where a case ends otherwise in SUMO.
         """
-        ended = dict(rollout(self.world, self.pov, self.vut, cases, ran_again))
+        ended = rollout(self.world, self.pov, self.vut, cases, ran_again)
         close = self._close_calls(ended)
         places = sorted(close | drawn(cases))
         if places and self._sumo is None:
             self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
             self._opened.callback(self._sumo.close)
         again = [cases[place] for place in places]
-        for number, trajectory in self._sumo.run(again) if self._sumo and places else ():
-            place = places[number]
-            if place not in close:
+        in_sumo = self._sumo.run(again) if self._sumo and places else []
+        for place, trajectory in zip(places, in_sumo, strict=True):
+            if place in close:
+                ended[place] = trajectory
+            else:
                 self._compare(ended[place], trajectory)
-            ended[place] = trajectory if place in close else ended[place]
         self.in_sumo = frozenset(places)
-        yield from ended.items()
+        return ended
 
-    def _close_calls(self, ended: Mapping[int, Trajectory]) -> set[int]:
+    def _close_calls(self, ended: Sequence[Trajectory]) -> set[int]:
         """Return the places where a rounding error could turn the verdict or end another step.
 
         For the end the VUT is put forward and back by one, in the last step and the one before; so
@@ -82,8 +81,8 @@ class KinematicSimulator(Simulator):
         if not ended:
             return set()
         criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
-        last = np.concatenate([one.motion[-2:] for one in ended.values()])
-        starts = np.cumsum([0, *(min(2, len(one.motion)) for one in ended.values())])[:-1]
+        last = np.concatenate([one.motion[-2:] for one in ended])
+        starts = np.cumsum([0, *(min(2, len(one.motion)) for one in ended)])[:-1]
         x_m, v_mps = last[..., 0].T, last[..., 1].T
         by_shift = []
         for shift_m in (ROUNDING, -ROUNDING):
@@ -96,7 +95,7 @@ class KinematicSimulator(Simulator):
         unclear = np.logical_or.reduceat(differ, starts)
         return {
             place
-            for (place, one), of_end in zip(ended.items(), unclear.tolist(), strict=True)
+            for place, (one, of_end) in enumerate(zip(ended, unclear.tolist(), strict=True))
             if of_end or criterion.is_close_call(one, ROUNDING, lines)
         }
 

@@ -57,6 +57,10 @@ class SimulationPlan:
     Attributes:
         scenario: the scenario, with its follow-up behind M.
         road: the road on which it takes place.
+        vut: the VUT.
+        povs: the drivers of the mainline.
+        criterion: when a case fails.
+        against: an earlier version of the VUT, with which each case runs, too.
         engine: what moves the vehicles; campaigns take SUMO.
         corridors: the most episodes at a time in SUMO; decides no outcome.
         substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more
@@ -70,6 +74,7 @@ class SimulationPlan:
     vut: VutFactory
     povs: Povs
     criterion: Criterion
+    against: VutFactory | None = None
     engine: Engine = Engine.SUMO
     corridors: int = MAX_CORRIDORS
     substeps: int = 1
@@ -110,6 +115,13 @@ class SimulationPlan:
             "criterion": asdict(self.criterion),
             "versions": dict(self.versions),
         }
+
+    @property
+    def earlier(self) -> SimulationPlan | None:
+        """The plan of the earlier version of the VUT, if the cases run with one."""
+        if self.against is None:
+            return None
+        return replace(self, vut=self.against, against=None)
 
     def at_level(self, level: int) -> SimulationPlan:
         """Return the plan for the cases of a level, which a POV of another level does not meet."""
@@ -169,7 +181,9 @@ class SimulationPlan:
 
     def with_log(self, log: Path) -> SimulationPlan:
         """Return the plan with what a user's drivers print added to a file."""
-        return replace(self, vut=self.vut.with_log(log), povs=self.povs.with_log(log))
+        against = None if self.against is None else self.against.with_log(log)
+        povs = self.povs.with_log(log)
+        return replace(self, vut=self.vut.with_log(log), against=against, povs=povs)
 
     def check_software(self) -> None:
         """Raise `UserError` where the software of this process would give other outcomes."""

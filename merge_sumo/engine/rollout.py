@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -66,10 +66,8 @@ def rollout(
     vut: Driver,
     cases: Iterable[Case],
     ran_again: set[int] | None = None,
-) -> Iterator[tuple[int, Trajectory]]:
-    """Run cases in the world; yield (place in `cases`, trajectory) as the episodes end.
-
-    `pov` drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+) -> list[Trajectory]:
+    """Run cases in the world; return their trajectories in order.
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
@@ -78,8 +76,15 @@ def rollout(
     were running end as SIM_ERROR, SUMO is started again, and the others go on.
 
     `system/blame.py` says whose doing a death is; an error that comes when this process was stopped
-    is nobody's. `ran_again` is told the places of cases that ran again alone, or because of a stop,
-    and were not to blame.
+    is nobody's.
+
+    Args:
+        world: the corridors.
+        pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+        vut: drives the VUT of each corridor.
+        cases: cases of the world's scenario.
+        ran_again: gets the places of cases that ran again alone, or because of a stop, and were
+            not to blame.
     """
     return _Rollout(world, pov, vut, cases, ran_again).run()
 
@@ -131,16 +136,18 @@ class _Rollout:
         self.merging = Merging(corridors, world.scenario) if has_lane else None
         self.ring = RING_ROWS + self.follow_steps
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
+        self.ended: dict[int, Trajectory] = {}
         self.row = 0
         self.now = self.record[:, 0]
         """The row of this step."""
 
-    def run(self) -> Iterator[tuple[int, Trajectory]]:
+    def run(self) -> list[Trajectory]:
         with self.pulse:
-            yield from self.episodes_as_they_end()
+            self.run_all()
         self.ran_again |= self.struck
+        return [trajectory for _, trajectory in sorted(self.ended.items())]
 
-    def episodes_as_they_end(self) -> Iterator[tuple[int, Trajectory]]:
+    def run_all(self) -> None:
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
         while self.next_timeout < NEVER:  # as long as an episode runs
@@ -154,11 +161,11 @@ class _Rollout:
                 merged = None if merging is None else merging.step(world.x_m, world.v_mps)
                 world.command(acceleration, merged)
             except VutLostError as lost:
-                yield from self.begin_anew(lost, paused=self.was_paused())
+                self.begin_anew(lost, paused=self.was_paused())
                 continue
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
-                    yield self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
+                    self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
                 world.restart()
                 self.errors.clear()
                 self.refill(everywhere)
@@ -179,11 +186,9 @@ class _Rollout:
                     corridors = [k for k in corridors if not self.goes_on(k, arrived=arrived[k])]
                 for corridor in corridors:
                     if corridor in self.errors:
-                        yield self.finish(corridor, *self.errors.pop(corridor))
+                        self.finish(corridor, *self.errors.pop(corridor))
                     else:
-                        yield self.finish(
-                            corridor, self.ends_as if arrived[corridor] else End.TIMEOUT
-                        )
+                        self.finish(corridor, self.ends_as if arrived[corridor] else End.TIMEOUT)
                 self.refill(corridors)
 
     def goes_on(self, corridor: int, *, arrived: bool) -> bool:
@@ -221,8 +226,8 @@ class _Rollout:
         episodes = enumerate(self.episodes)
         return {k: e for k, e in episodes if e is not None and self.active[k]}
 
-    def begin_anew(self, lost: VutLostError, *, paused: bool) -> Iterator[tuple[int, Trajectory]]:
-        """Start over what was running; yield the episode that is known to be at fault, if any."""
+    def begin_anew(self, lost: VutLostError, *, paused: bool) -> None:
+        """Start over what was running; end the episode that is known to be at fault, if any."""
         running = self.running()
         alone = len(running) == 1
         end, reason = End.VUT_ERROR, lost.reason
@@ -242,7 +247,7 @@ class _Rollout:
             ):
                 self.ran_again.discard(episode.index)
                 self.struck.clear()
-                yield self.finish(corridor, end, reason)
+                self.finish(corridor, end, reason)
             else:
                 (self.struck if guilty is None else self.ran_again).add(episode.index)
                 self.suspects.append((episode.index, episode.case))
@@ -376,8 +381,8 @@ class _Rollout:
             self.errors.setdefault(corridor, error)
         return np.where(finite, answer, 0.0)
 
-    def finish(self, corridor: int, end: End, error: str | None = None) -> tuple[int, Trajectory]:
-        """Return the record of a corridor's episode; after an error without the last step.
+    def finish(self, corridor: int, end: End, error: str | None = None) -> None:
+        """Keep the record of a corridor's episode; after an error without the last step.
 
         An error behind M ends the follow-up alone: the VUT has merged. After a merge from an
         acceleration lane it is one of the episode, because the time after the merge is judged.
@@ -402,4 +407,5 @@ class _Rollout:
         else:
             motion, after = cut_at(motion, episode.merge_row - episode.first_row)
             end, clipped = self.ends_as, episode.clipped
-        return episode.index, Trajectory(episode.case, motion, end, error, clipped, after, *left)
+        ended = Trajectory(episode.case, motion, end, error, clipped, after, *left)
+        self.ended[episode.index] = ended

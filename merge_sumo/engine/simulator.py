@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from typing import Self
 
@@ -66,10 +66,8 @@ class Simulator:
         opened.callback(self.pov.close)
         self._opened = opened.pop_all()
 
-    def run(
-        self, cases: Sequence[Case], ran_again: set[int] | None = None
-    ) -> Iterator[tuple[int, Trajectory]]:
-        """Run cases; yield (place in `cases`, trajectory) as they end.
+    def run(self, cases: Sequence[Case], ran_again: set[int] | None = None) -> list[Trajectory]:
+        """Run cases; return their trajectories in order.
 
         `ran_again` gets the places of those that ran again: see `rollout`.
         """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Final, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from merge_sumo.reports.report import REPORT, RunningReport
+from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.system.printable import counted, printable
 from merge_sumo.verdict.campaign_verdict import judge
@@ -24,19 +24,19 @@ from merge_sumo.verdict.score import Outcome
 PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
 LINES: Final = 10
-"""Lines that are said of what goes on where there is no terminal to draw on, at most."""
+"""Maximum number of progress lines without a terminal."""
 LINE_S: Final = 1.0
-"""Seconds between two of these lines, at least."""
+"""Minimum time between two of these lines."""
 FRESH_S: Final = 0.25
-"""Seconds for which what a terminal shows may be old."""
+"""Maximum age of a bar on a terminal."""
 FIRST_ANSWER: Final = 100
-"""Cases after which a campaign of more says where failures lie so far."""
+"""Cases after which a campaign of more prints where failures lie so far."""
 SLOW_S: Final = 60.0
-"""Seconds after which a line stands whatever has ended."""
+"""Time after which every new count is printed."""
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
-    """Return a rate as people read it: "7,140 cases/s", "12 cases/s", "3.5 cases/min"."""
+    """Return a readable rate: "7,140 cases/s", "12 cases/s", "3.5 cases/min"."""
     if count <= 0.0 or elapsed_s <= 0.0:
         return f"- {unit}/s"
     rates = [(count / elapsed_s * seconds, name) for seconds, name in PER]
@@ -45,7 +45,7 @@ def rate_text(count: float, elapsed_s: float, unit: str) -> str:
 
 
 def is_watched() -> bool:
-    """Return whether a person sees what this process shows: in a notebook or on a terminal."""
+    """Return whether this process runs in a notebook or on a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return getattr(shell, "kernel", None) is not None or sys.stderr.isatty()
 
@@ -166,7 +166,7 @@ class Counter(Bars):
 
 
 class CampaignBars(Bars):
-    """Bars of a campaign, its careful drivers and its report, which is rewritten as it goes on."""
+    """Bars of a campaign and its careful drivers: `ended` is a callback of the campaign."""
 
     def __init__(
         self,
@@ -179,31 +179,30 @@ class CampaignBars(Bars):
     ) -> None:
         super().__init__(console, shown=shown)
         self._folder, self._cases, self._tolerated = folder, cases, tolerated
-        self._report = RunningReport(folder)
         self._outcomes: list[Outcome] = []
 
     def begin(self, title: str) -> None:
-        """Say what begins, and where its report is: the first case may take long."""
+        """Print what begins, and where its report is: the first case may take long."""
         cases = counted(self._cases, "case")
         self.say(f"{printable(title)}: {cases}, watch {printable(str(self._folder / REPORT))}")
         self.counted("cases", len(self._outcomes), self._cases, "cases")
 
-    def case_ended(self, outcome: Outcome) -> None:
-        """Count a case."""
-        self._outcomes.append(outcome)
+    def ended(self, outcomes: Sequence[Outcome]) -> None:
+        """Count cases."""
+        before = len(self._outcomes)
+        self._outcomes += outcomes
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
-        if len(self._outcomes) == FIRST_ANSWER < self._cases:
+        if before < FIRST_ANSWER <= len(self._outcomes) < self._cases:
             self._say_where()
-        self._report.rewrite()
 
-    def ran_before(self, outcome: Outcome) -> None:
-        """Count a case that ran before a resume: it says nothing of how fast this goes."""
-        self._outcomes.append(outcome)
+    def ran_before(self, outcomes: Sequence[Outcome]) -> None:
+        """Count cases that ran before a resume, which do not count in the rate."""
+        self._outcomes += outcomes
         bar = self._bars.setdefault("cases", _Bar(self._cases, 0.0))
         bar.before, bar.start_s = len(self._outcomes), time.monotonic()
 
     def _say_where(self) -> None:
-        """Say where the failures so far lie, in the largest region of each level."""
+        """Print where the failures so far lie, in the largest region of each level."""
         cases = one_per_case(self._outcomes, self._tolerated)
         self.say(f"so far {judge(self._outcomes, self._tolerated).counts}")
         for level in sorted({outcome.case.level for outcome in cases}):
@@ -213,9 +212,3 @@ class CampaignBars(Bars):
 
     def _found(self) -> str:
         return ", ".join(judge(self._outcomes, self._tolerated).found)
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        """Stop the bars, and the rewriting of a report that nobody will finish."""
-        super().__exit__(kind, error, trace)
-        if error is not None:
-            self._report.stopped()

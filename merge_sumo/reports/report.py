@@ -10,10 +10,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import msgspec
 from markupsafe import Markup
@@ -26,6 +27,7 @@ from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import sections_of, shared
 from merge_sumo.system.folders import check_ours, replace_own
+from merge_sumo.verdict.score import Outcome
 from merge_sumo.verdict.summary import Summary
 
 REPORT: Final = "report.html"
@@ -58,7 +60,7 @@ def _replace(run: Run, html: str) -> None:
 
 
 class RunningReport:
-    """The report of a campaign that runs, rewritten every few seconds for a browser to load again.
+    """The report of a campaign that runs, rewritten every few seconds: a callback of the campaign.
 
     It has no surrogates, which take seconds to learn. It never stops a campaign: where it cannot be
     written, or `report.html` is somebody else's, that is said when the last one is written.
@@ -69,7 +71,7 @@ class RunningReport:
         self._due_s = time.monotonic() + FIRST_S
         self._is_there = False
 
-    def rewrite(self) -> None:
+    def rewrite(self, _: Sequence[Outcome] = ()) -> None:
         """Write the report if its time has come."""
         start_s = time.monotonic()
         if start_s >= self._due_s and (self._folder / OUTCOMES).is_file():
@@ -79,9 +81,12 @@ class RunningReport:
             if not self._is_there:
                 self._due_s = math.inf
 
-    def stopped(self) -> None:
-        """Write what ran into the report of a campaign that was stopped."""
-        if self._is_there:
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Write the cases that ran into the report of a campaign that was stopped."""
+        if error is not None and self._is_there:
             self._write(running=False)
 
     def _write(self, *, running: bool) -> None:

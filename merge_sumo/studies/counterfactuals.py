@@ -28,7 +28,7 @@ from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import follow_mps2
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
-from merge_sumo.engine.evaluate import opened_simulator, workers_or_here
+from merge_sumo.engine.evaluate import opened_simulator
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.rollout import rollout
@@ -41,7 +41,7 @@ from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.sumo.world import World
 from merge_sumo.system.records import Record
 from merge_sumo.system.suggestions import either
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.cause import cause
 from merge_sumo.verdict.criterion import Criterion
@@ -142,17 +142,18 @@ def avoidance(
     plan = plan.with_log(run.folder.resolve() / LOG)
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:
-        on_part(done := 0, len(failing))
+        on_part(0, len(failing))
         few, chunk = (FEW, CHUNK) if plan.povs.own is None else (1, IN_SUMO)
         size = min(chunk, max(few, math.ceil(len(failing) / processes.count)))
-        chunks = (failing[first : first + size] for first in range(0, len(failing), size))
         run_some = partial(run_counterfactuals, plan)
         # Nothing is known of a failure that ended every worker that ran it.
-        with closing(processes.run_chunks(run_some, chunks, lambda _: None)) as results:
-            for _, some in results:
-                avoided += [one for one in some if one is not None]
-                on_part(done := done + len(some), len(failing))
-                check()
+        with closing(processes.run(run_some, failing, lambda _: None, chunk=size)) as results:
+            for place, one in results:
+                if one is not None:
+                    avoided.append(one)
+                if (done := place + 1) % size == 0 or done == len(failing):
+                    on_part(done, len(failing))
+                    check()
     return sorted(avoided, key=lambda one: one.index)
 
 
@@ -273,10 +274,11 @@ class Stage:
 
     def passed(self, cases: Sequence[_Counterfactual]) -> list[bool]:
         """Return whether each case is passed."""
-        passed = [False] * len(cases)
-        for place, trajectory in rollout(self._world, self._povs, self._substitutes, cases):
-            whole = cases[place].from_the_start(trajectory)
-            passed[place] = _passes(self._criterion, whole, self._lines)
+        passed = []
+        trajectories = rollout(self._world, self._povs, self._substitutes, cases)
+        for case, trajectory in zip(cases, trajectories, strict=True):
+            whole = case.from_the_start(trajectory)
+            passed.append(_passes(self._criterion, whole, self._lines))
         return passed
 
 

@@ -22,7 +22,7 @@ from typing import Annotated, Any, Final
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.engine.evaluate import Episodes, evaluate, workers_or_here
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
@@ -32,7 +32,8 @@ from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record, replaced, to_plain
 from merge_sumo.system.result import Result
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import VutSpec
 from merge_sumo.vuts.factory import VutFactory
@@ -344,6 +345,6 @@ def _axis(
     return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def pass_of(results: Episodes) -> list[bool]:
-    """Return of each result whether the case has a verdict and does not fail."""
-    return [verdict.is_tested and not verdict.failed for verdict in results.verdicts()]
+def pass_of(episode: Episode) -> bool:
+    """Return whether a case has a verdict and does not fail."""
+    return episode.outcome.is_tested and not episode.outcome.failed

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from merge_sumo import config
-from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, open_simulators
+from merge_sumo.engine.evaluate import evaluate, open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
@@ -48,6 +48,7 @@ from merge_sumo.system.folders import check_new_file, write_new
 from merge_sumo.system.records import Record, to_json
 from merge_sumo.system.result import Result
 from merge_sumo.verdict.chance import clopper_pearson
+from merge_sumo.verdict.episode import Episode
 
 DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
 STREAM: Final = 7
@@ -211,7 +212,7 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
     counted, in_sumo = [], 0
     missed: list[dict[str, float]] = []
     for one, chances in zip(cells, drawn, strict=True):
-        at = CasesAt(study.settings.pool, one.level, stated.points(one.level, chances))
+        at = study.settings.pool.cases(stated.points(one.level, chances), one.level)
         failed, judged = np.zeros((2, len(at)), dtype=bool)
         for place, (fails, has_verdict, by_sumo) in evaluate(plan, at, study.workers, _judged):
             failed[place], judged[place] = fails, has_verdict
@@ -288,12 +289,9 @@ def draw(
     return [drawn[place] for place in range(len(cells))]
 
 
-def _judged(results: Episodes) -> list[tuple[bool, bool, bool]]:
-    """Return of each case whether it failed, had a verdict, and ran in SUMO."""
-    return [
-        (verdict.failed, verdict.margin is not None, place in results.in_sumo)
-        for place, verdict in enumerate(results.verdicts())
-    ]
+def _judged(episode: Episode) -> tuple[bool, bool, bool]:
+    """Return whether a case failed, had a verdict, and ran in SUMO."""
+    return episode.outcome.failed, episode.outcome.margin is not None, episode.in_sumo
 
 
 def _named(case: Case) -> dict[str, float]:

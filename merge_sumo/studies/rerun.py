@@ -9,7 +9,7 @@ from typing import Final
 from merge_sumo.campaigns.again import campaign_in, command
 from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.evaluate import evaluate, open_simulators, workers_or_here
+from merge_sumo.engine.evaluate import evaluate, open_simulators
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
@@ -29,7 +29,7 @@ from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.version import Version
 from merge_sumo.system.folders import free
 from merge_sumo.system.printable import counted
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.spec import waits_for_client

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from merge_sumo import config
-from merge_sumo.campaigns.scheduler import groups_here
+from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import covered, fmc
-from merge_sumo.engine.evaluate import workers_or_here
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError, notice
 from merge_sumo.road.centre_lines import centre_lines
@@ -36,7 +35,7 @@ from merge_sumo.studies.truth import (
 )
 from merge_sumo.system.records import to_plain
 from merge_sumo.system.result import Result
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.twin.twin import Twin
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.in_memory import is_here
@@ -101,7 +100,9 @@ def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
         twin = Twin(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
         sampler, ran = make_sampler(task.name, pool, task.seed, twin), SamplerRun([], [])
         batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-        for group in groups_here(plan, sampler, task.cases, batch):
+        groups: Groups = []
+        SearchLoop(sampler, plan, task.cases, batch=batch).run(groups.extend)
+        for group in groups:
             ran.outcomes.extend(episode.outcome for episode in group)
             ran.fmc.append(sum(fmc(ran.failures(level)) for level in task.levels))
         found.append(ran)

@@ -17,14 +17,15 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, workers_or_here
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Pool
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record
-from merge_sumo.system.workers import Workers
+from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.verdict.chance import clopper_pearson
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.vuts.process import LOG
 
 CASES: Final = 2000
@@ -162,12 +163,11 @@ def share_at(
     points = rng.random((cases, len(plan.scenario.dimensions(level))))
     pool = Pool(levels=(level,), scenario=plan.scenario)
     chosen = plan.for_verdicts().with_engine(None)
-    ran = [ended for _, ended in evaluate(chosen, CasesAt(pool, level, points), workers, ends_of)]
+    ran = [ended for _, ended in evaluate(chosen, pool.cases(points, level), workers, end_of)]
     failures, errors = (sum(of) for of in zip(*ran, strict=True))
     return LevelShare(level, cases, failures, errors)
 
 
-def ends_of(results: Episodes) -> list[tuple[bool, bool]]:
-    """Return of each result whether the case fails, and whether it ended as an error."""
-    errors = (trajectory.end.is_error for trajectory in results.trajectories)
-    return [(one.failed, error) for one, error in zip(results.verdicts(), errors, strict=True)]
+def end_of(episode: Episode) -> tuple[bool, bool]:
+    """Return whether a case fails, and whether it ended as an error."""
+    return episode.outcome.failed, episode.trajectory.end.is_error

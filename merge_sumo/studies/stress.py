@@ -17,7 +17,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import failures
-from merge_sumo.engine.evaluate import Episodes, evaluate
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
@@ -26,6 +26,7 @@ from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.study_file import StudyFile
 from merge_sumo.system.records import Record
 from merge_sumo.system.result import Result
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import CaseVerdict, Outcome
 
 LISTED: Final = 10
@@ -243,6 +244,11 @@ def stress(study: RunStudy) -> StressResult:
     return found
 
 
+def verdict_of(episode: Episode) -> CaseVerdict:
+    """Return the verdict on a case."""
+    return episode.outcome.verdict
+
+
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     """Run all cases with a change; one that cannot be is skipped with its reason."""
     flips: list[Flips] = []
@@ -254,7 +260,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
             if one.case is not None:
                 cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
             found: dict[int, CaseVerdict] = {}
-            for place, verdict in evaluate(plan, cases, study.workers, keep=Episodes.verdicts):
+            for place, verdict in evaluate(plan, cases, study.workers, verdict_of):
                 found[place] = verdict
                 study.on_cases(1)
             flips.append(flips_of(tested, found))

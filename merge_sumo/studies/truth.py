@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from merge_sumo.coverage.fmc import fmc, growth_bound, has_neighbour, regions
-from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray, Pool
@@ -29,6 +29,7 @@ from merge_sumo.system.result import Result
 from merge_sumo.system.trust import CACHE, check_private
 from merge_sumo.system.workers import Workers
 from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.episode import Episode
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
@@ -190,8 +191,8 @@ def _run(
     """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
     margins, in_sumo = np.full(len(points), np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
-    cases = CasesAt(Pool(levels=(level,), scenario=plan.scenario), level, points)
-    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margins):
+    cases = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
+    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margin_of):
         margins[place] = margin
         in_sumo += by_sumo
         files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}
@@ -274,13 +275,11 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
     return Truth(points, margin, int(in_sumo))
 
 
-def _margins(results: Episodes) -> list[tuple[float, bool, Files]]:
-    """Return of each case the margin, NaN without a verdict, whether SUMO ran it, and the files."""
-    files = results.files | results.pov_files
-    return [
-        (np.nan if verdict.margin is None else verdict.margin, place in results.in_sumo, files)
-        for place, verdict in enumerate(results.verdicts())
-    ]
+def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
+    """Return the margin, NaN without a verdict, whether SUMO ran the case, and the loaded files."""
+    margin = episode.outcome.margin
+    files = episode.files | episode.pov_files
+    return np.nan if margin is None else margin, episode.in_sumo, files
 
 
 @dataclass(frozen=True, repr=False)

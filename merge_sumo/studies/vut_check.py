@@ -66,16 +66,16 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
     from_stand = replace(cases[0], v_vut0_mps=0.0)
     with Simulator(plan) as ground:
         timed = ground.vut = _Timed(ground.vut)
-        first = _run(ground, cases)
+        first = ground.run(cases)
         problems, differing = _errors(cases, first), list[_Difference]()
         if not problems:
-            backwards = _run(ground, cases[::-1])[::-1]
+            backwards = ground.run(cases[::-1])[::-1]
             differing += _differences("the same cases in another order", first, backwards)
-            alone = [_run(ground, [case])[0] for case in cases]
+            alone = [ground.run([case])[0] for case in cases]
             differing += _differences("each case alone", first, alone)
             for corridor in range(ground.world.corridors):
                 ground.vut.begin(corridor, from_stand)
-            differing += _differences("a reset too many", first, _run(ground, cases))
+            differing += _differences("a reset too many", first, ground.run(cases))
         outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
         vain = Counter(command for one in first for command in one.in_vain)
         headline = [*filter(None, [mostly_clipped(outcomes)])]
@@ -83,7 +83,7 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
         problems += _from_stand(ground, from_stand)
         notes += _not_numbers(ground, cases[0])
         if not problems and not differing:
-            after = _run(ground, cases[:1])
+            after = ground.run(cases[:1])
             differing += _differences("a state that is no number", first[:1], after)
     if differing:
         problems += [
@@ -118,10 +118,6 @@ class _Timed(DriverWrapper):
         spent = perf_counter() - start
         self.us_per_step.append(spent * 1e6 / max(int(scene.active.sum()), 1))
         return answer
-
-
-def _run(ground: Simulator, cases: Sequence[Case]) -> list[Trajectory]:
-    return [t for _, t in sorted(ground.run(cases), key=lambda pair: pair[0])]
 
 
 def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
@@ -165,7 +161,7 @@ def _why(plan: SimulationPlan, difference: _Difference) -> str:
     motions = []
     for _ in range(2):
         with Simulator(plan.for_cases(1)) as ground:
-            motions.append(_run(ground, [difference.case])[0].motion)
+            motions.append(ground.run([difference.case])[0].motion)
     if not np.array_equal(motions[0], motions[1]):
         return (
             "It draws random numbers, reads a clock, or keeps something outside of its process: as "
@@ -179,7 +175,7 @@ def _why(plan: SimulationPlan, difference: _Difference) -> str:
 
 
 def _from_stand(ground: Simulator, from_stand: Case) -> list[str]:
-    (trajectory,) = _run(ground, [from_stand])
+    (trajectory,) = ground.run([from_stand])
     if trajectory.end.is_error:
         return [
             f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "

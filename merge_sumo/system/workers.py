@@ -1,12 +1,11 @@
-"""Workers: this process, worker processes, or a cluster.
+"""Workers: this process, worker processes, or a Dask cluster.
 
-What is above submits chunks of its items to a standard `concurrent.futures.Executor` and never
-sees which one. A worker that dies takes nothing with it: its chunks run again.
+A chunk of items is submitted to a `concurrent.futures.Executor`, and its results are collected.
+Where a worker dies, its items run again with nothing else in their worker.
 """
 
 from __future__ import annotations
 
-import atexit
 import logging
 import math
 import multiprocessing
@@ -19,85 +18,151 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    InvalidStateError,
-    wait,
-)
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
 from concurrent.futures.process import ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass
-from importlib import import_module
-from multiprocessing.synchronize import Semaphore
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any, Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError, WorkersLostError, notice
-from merge_sumo.system.blame import Blame
-from merge_sumo.system.limits import check_threads
 from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.system.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK: Final = 500
 """Items that a worker takes at a time; what bounds its memory."""
-RECYCLE_AFTER: Final = 200
-"""Chunks after which a worker process is replaced by a new one: a VUT may leak memory."""
-POOL_THREADS: Final = 4
-"""Threads and processes that a pool takes, besides its workers."""
-WORKER_THREADS: Final = 4
-"""Those of a worker and of the process of a VUT, besides one for each core in NumPy."""
 DASK_TIMEOUT_S: Final = 30.0
 HERE_S: Final = 3.0
-"""Seconds of work in this process before worker processes are started, where they may be: about
-what starting them takes on a busy machine, so that work takes at most twice the least time."""
+"""Seconds of work in this process before worker processes are started by default. Starting them
+takes about as long on a busy machine, so that work takes at most twice the least time."""
 TRIED: Final = 8
-"""Items of a chunk in this process before it is known how long they take."""
+"""Items of the first chunk in this process, where it is not known how long they take."""
+CHUNKS_AHEAD: Final = 16
+"""Chunks for each worker that `Workers.run` submits before it collects the first."""
+
+LOST: Final = "lost the connection to the Dask workers; check the cluster"
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 
-class Workers(AbstractContextManager["Workers"]):
-    """Runs functions on chunks of items through an executor; to be closed, or used in `with`.
+@dataclass(slots=True)
+class Job(Generic[T, R]):
+    """Chunks that were submitted together.
 
-    A chunk whose worker dies runs again, alone and then item by item, so that the one item that
-    ends its worker each time is found; only that one is given up, when `system/blame.py` says so.
+    Attributes:
+        function: gives a result for each item of a chunk.
+        chunks: the chunks.
+        lost: gives the result of an item that ended its worker each time.
+        futures: of the chunks, in their order; fewer where chunks wait for this process.
+        retried: places of items that ran again, because a worker had died.
+    """
+
+    function: Callable[[Sequence[T]], Sequence[R]]
+    chunks: Sequence[Sequence[T]]
+    lost: Callable[[T], R]
+    futures: list[Future[Sequence[R]]]
+    retried: set[int] = field(default_factory=set)
+
+
+class Workers(AbstractContextManager["Workers"]):
+    """Runs functions on chunks of items; to be closed, or used in `with`.
+
+    Example:
+        with open_workers(2) as workers:
+            job = workers.submit(simulate, chunks, lost)
+            results = workers.collect(job)
+
+    Attributes:
+        count: number of workers.
     """
 
     def __init__(
         self,
-        open_executor: Callable[[], Executor],
+        open_executor: Callable[[int], Executor] | None,
         count: int,
         *,
         died: tuple[type[Exception], ...] = (BrokenExecutor,),
         gone: tuple[type[Exception], ...] = (CancelledError,),
-        recycle_after: int | None = None,
-        on_close: Callable[[], None] | None = None,
-        here_s: float | None = None,
+        here_s: float = 0.0,
+        on_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """Open an executor with `count` workers.
+        """Open an executor.
 
-        `died` is what a future raises when its worker is dead, `gone` what it raises when all of
-        them are out of reach. The executor is closed and opened anew after a death, and after
-        `recycle_after` chunks per worker. With `here_s` it is opened only when work in this process
-        has taken so many seconds.
+        Args:
+            open_executor: opens an executor of a number of workers; None for this process.
+            count: number of workers.
+            died: what a future raises when its worker is dead.
+            gone: what a future raises when no worker can be reached.
+            here_s: seconds of work in this process before the executor is opened.
+            on_close: called when the executor is closed.
         """
         self.count = count
-        self._open = open_executor
-        self._here_s, self._here_items = here_s, 0
-        """Seconds that this process goes on for, and items that it has begun; None for no more."""
-        self._limit_s = here_s or 0.0
+        self._open, self._on_close = open_executor, on_close
         self._died, self._gone = died, gone
-        self._recycle_after = recycle_after
-        self._on_close = on_close
-        self._executor = open_executor() if here_s is None else InProcess()
-        self._submitted = 0
-        self._broken = False
-        self._left: list[Future[Any]] = []
+        self._here_s, self._worked_s, self._worked = here_s, 0.0, 0
+        self._executor: Executor | None = None
+        self._go_on_in_workers()
+
+    @property
+    def here(self) -> bool:
+        """True as long as the work is done in this process."""
+        return self._executor is None
+
+    def chunk_size(self, items: int) -> int:
+        """Return the number of items that a worker takes at a time."""
+        share = math.ceil(items / self.count)
+        if self._open is not None and self._executor is None:
+            # The number for which there is time in this process.
+            left_s = self._here_s - self._worked_s
+            most = int(self._worked * left_s / self._worked_s) if self._worked_s else TRIED
+            share = min(items, max(most, TRIED))
+        return max(1, min(MAX_CHUNK, share))
+
+    def submit(
+        self,
+        function: Callable[[Sequence[T]], Sequence[R]],
+        chunks: Iterable[Sequence[T]],
+        lost: Callable[[T], R],
+    ) -> Job[T, R]:
+        """Submit chunks of items. In this process they run when they are collected.
+
+        Args:
+            function: gives a result for each item of a chunk; it is found by its name in other
+                processes, and may run twice.
+            chunks: the chunks.
+            lost: gives the result of an item that ends its worker whenever it runs.
+        """
+        job = Job(function, list(chunks), lost, [])
+        self._start(job)
+        return job
+
+    def collect(self, job: Job[T, R]) -> list[R]:
+        """Return the results of all items of a job, in their order.
+
+        Raises:
+            WorkersLostError: if no worker can be reached.
+            Exception: what the function raises.
+        """
+        results: list[R] = []
+        for number, chunk in enumerate(job.chunks):
+            if self._executor is None:
+                start_s = time.perf_counter()
+                results += job.function(chunk)
+                self._worked_s += time.perf_counter() - start_s
+                self._worked += len(chunk)
+                job.futures.append(Future())
+                self._go_on_in_workers()
+                continue
+            self._start(job)
+            try:
+                results += job.futures[number].result()
+            except self._died:
+                job.retried |= set(range(len(results), len(results) + len(chunk)))
+                results += self._retry(job, chunk)
+            except self._gone as error:  # nothing is cancelled whose result is collected
+                raise WorkersLostError(LOST) from error
+        return results
 
     def run(
         self,
@@ -107,155 +172,70 @@ class Workers(AbstractContextManager["Workers"]):
         *,
         chunk: int | None = None,
     ) -> Generator[tuple[int, R], None, None]:
-        """Yield (place in `items`, result) as chunks of `chunk` items, or `chunk_size`, end.
+        """Yield (place in `items`, result) in order.
 
-        `function` gives one result for each item of a chunk, is found by its name in other
-        processes, and may run twice; what it raises, this raises, and `WorkersLostError` when the
-        executor goes away. `lost` gives the result of an item that is to blame for the deaths of
-        its workers.
+        Args:
+            function: as of `submit`.
+            items: the items.
+            lost: as of `submit`.
+            chunk: items that a worker takes at a time; by default `chunk_size`.
         """
-        chunks = cut(items, chunk or self.chunk_size(len(items)))
-        for first, results in self.run_chunks(function, chunks, lost):
-            yield from enumerate(results, start=first)
+        jobs: deque[tuple[int, Job[T, R]]] = deque()
+        first = 0
+        while jobs or first < len(items):
+            ahead = 1 if self.here else CHUNKS_AHEAD * self.count
+            while first < len(items) and len(jobs) < ahead:
+                end = first + (chunk or self.chunk_size(len(items) - first))
+                jobs.append((first, self.submit(function, [items[first:end]], lost)))
+                first = end
+            place, job = jobs.popleft()
+            yield from enumerate(self.collect(job), start=place)
 
-    @property
-    def here(self) -> bool:
-        """True as long as the work is done in this process."""
-        return isinstance(self._executor, InProcess)
+    def _go_on_in_workers(self) -> None:
+        """Open the executor when work in this process has taken its time."""
+        if self._open is not None and self._worked_s >= self._here_s:
+            self._executor = self._open(self.count)
 
-    def chunk_size(self, items: int) -> int:
-        """Return the number of items that a worker takes at a time."""
-        share = math.ceil(items / self.count)
-        if self._here_s is not None:
-            # As many as there is time for here.
-            item_s = (self._limit_s - self._here_s) / max(self._here_items, 1)
-            most = int(self._here_s / item_s) if self._here_items and item_s > 0.0 else TRIED
-            share = min(items, max(most, TRIED))
-        return max(1, min(MAX_CHUNK, share))
+    def _start(self, job: Job[Any, Any]) -> None:
+        """Give the executor, if it is open, the chunks of a job that wait."""
+        if self._executor is None or self._open is None:
+            return
+        for chunk in job.chunks[len(job.futures) :]:
+            try:
+                future = self._executor.submit(job.function, chunk)
+            except self._died:  # earlier
+                self._executor.shutdown()
+                self._executor = self._open(self.count)
+                future = self._executor.submit(job.function, chunk)
+            except self._gone as error:
+                raise WorkersLostError(LOST) from error
+            job.futures.append(future)
 
-    def run_chunks(
-        self,
-        function: Callable[[Sequence[T]], Sequence[R]],
-        chunks: Iterable[Sequence[T]],
-        lost: Callable[[T], R],
-        *,
-        ran_again: Callable[[R], R] | None = None,
-    ) -> Generator[tuple[int, Sequence[R]], None, None]:
-        """Yield (place of the first item, results) as chunks end; raise as `run` does.
-
-        A chunk is only taken from `chunks` when a worker may want it, and after an empty one the
-        next only when a chunk has ended. `ran_again` marks the results of items that ran again
-        because a worker had died.
-        """
-        fresh, blame = _in_a_row(chunks), Blame[int]()
-        suspects: deque[_Chunk[T]] = deque()
-        running: dict[Future[Sequence[R]], _Chunk[T]] = {}
+    def _retry(self, job: Job[T, R], items: Sequence[T]) -> list[R]:
+        """Run items with nothing else in their worker; halve them where it dies."""
+        assert self._open is not None, "this process outlives its cases"  # noqa: S101
         try:
-            while True:
-                # Suspects run one at a time, so that a death is theirs.
-                most, alone = (1, not running) if suspects else (2 * self.count, False)
-                while len(running) < most and self._ready(running):
-                    next_chunk = suspects.popleft() if suspects else next(fresh, None)
-                    if next_chunk is None or not next_chunk.items:
-                        break
-                    running[self._submit(function, next_chunk.items)] = next_chunk
-                if not running:
-                    return
-                done = wait(running, return_when=FIRST_COMPLETED).done
-                for future in [one for one in running if one in done]:
-                    ended = running.pop(future)
-                    try:
-                        results = future.result()
-                    except self._died:
-                        self._broken = True
-                        if ended.died(blame, alone, suspects):
-                            yield ended.first, [lost(ended.items[0])]
-                    except self._gone as error:  # we cancel only what nobody waits for
-                        raise WorkersLostError(
-                            "the workers went away: look after the cluster"
-                        ) from error
-                    else:
-                        again = ran_again if ended.struck else None
-                        yield ended.first, [again(r) for r in results] if again else results
-        finally:
-            self._left = [future for future in running if not future.cancel()]
+            with self._open(1) as executor:
+                return list(executor.submit(job.function, items).result())
+        except self._gone as error:
+            raise WorkersLostError(LOST) from error
+        except self._died:
+            if len(items) == 1:
+                return [job.lost(items[0])]
+        half = len(items) // 2
+        return self._retry(job, items[:half]) + self._retry(job, items[half:])
 
-    def _ready(self, running: dict[Future[Any], Any]) -> bool:
-        """Return whether the executor takes work; reopen it where that is due and possible."""
-        most = math.inf if self._recycle_after is None else self._recycle_after * self.count
-        if self._here_s is not None:
-            stays = self._here_s > 0.0
-        else:
-            stays = self._submitted < most and not self._broken
-        if stays:
-            return True
-        if running:
-            return False
-        self._executor.shutdown(wait=True)
-        self._executor = self._open()
-        self._submitted, self._broken, self._here_s = 0, False, None
-        return True
-
-    def _submit(self, function: Callable[[Sequence[T]], R], items: Sequence[T]) -> Future[R]:
-        self._submitted += 1
-        start_s = time.perf_counter()
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Close the executor; where the program is to stop at once, end the workers."""
         try:
-            return self._executor.submit(function, items)
-        except (*self._died, *self._gone) as error:
-            # It broke between two submissions: as if it had broken a moment later.
-            future: Future[R] = Future()
-            future.set_exception(error)
-            return future
+            if isinstance(self._executor, LocalProcesses):
+                self._executor.end(at_once=kind is not None and not issubclass(kind, Exception))
+            elif self._executor is not None:
+                self._executor.shutdown(wait=kind is None)
+            else:
+                end_worker()
         finally:
-            if self._here_s is not None:
-                self._here_s -= time.perf_counter() - start_s
-                self._here_items += len(items)
-
-    def __exit__(self, *exception: Any) -> None:
-        """Close the executor; only where work was left behind does it hear of an exception."""
-        left_behind = any(not future.done() for future in self._left)
-        try:
-            self._executor.__exit__(*(exception if left_behind else (None, None, None)))
-        finally:
-            if self._on_close is not None:
-                self._on_close()
-
-
-@dataclass(slots=True)
-class _Chunk(Generic[T]):
-    """Items that go to a worker together, and whether a worker has died of them or beside them."""
-
-    first: int
-    items: Sequence[T]
-    struck: bool = False
-
-    def died(self, blame: Blame[int], alone: bool, suspects: deque[_Chunk[T]]) -> bool:
-        """Take note of a death: return whether it is the one item's doing, else try again.
-
-        A chunk that ended its worker alone is tried item by item.
-        """
-        self.struck = True
-        if len(self.items) > 1 and alone:
-            for place in range(len(self.items)):
-                item = self.items[place : place + 1]
-                suspects.append(_Chunk(self.first + place, item, struck=True))
-            return False
-        guilty = len(self.items) == 1 and blame.died(self.first, alone=alone)
-        if not guilty:
-            suspects.append(self)
-        return guilty
-
-
-def cut(items: Sequence[T], size: int) -> Iterator[Sequence[T]]:
-    """Yield items in chunks of a size."""
-    return (items[first : first + size] for first in range(0, len(items), size))
-
-
-def _in_a_row(chunks: Iterable[Sequence[T]]) -> Iterator[_Chunk[T]]:
-    first = 0
-    for items in chunks:
-        yield _Chunk(first, items)
-        first += len(items)
+            self._on_close()
 
 
 AnyWorkers = int | str | None
@@ -263,50 +243,36 @@ AnyWorkers = int | str | None
 
 
 def workers_or_cores(workers: int | None) -> int:
-    """Return the number of workers: as asked, or one for each core."""
+    """Return the number of workers: the given one, or one for each core."""
     if workers is not None and (not isinstance(workers, Integral) or workers < 1):
         raise UserError(f"`workers` is {workers!r}: it must be a whole number, 1 or more")
     return workers or os.cpu_count() or 1
 
 
-def open_workers(
-    workers: AnyWorkers = None,
-    *,
-    preload: str | None = None,
-    here_s: float | None = None,
-    apart: bool = False,
-) -> Workers:
+def open_workers(workers: AnyWorkers = None, *, here_s: float = 0.0) -> Workers:
     """Return the workers of the cluster at an address, or else local ones.
 
-    One local worker is this process itself, unless it is to be `apart`; more are processes of their
-    own, which import the module `preload` as they start. None is one a core. With `here_s` they are
-    started only when work in this process has taken so many seconds, and where the system lets
-    them.
+    One local worker is this process; more are processes of their own.
+
+    Args:
+        workers: a number, an address, or None for one a core.
+        here_s: seconds of work in this process before local processes are started.
     """
     if isinstance(workers, str):
         return dask_workers(workers)
     count = workers_or_cores(workers)
-    if is_daemonic() and (count > 1 or apart):
+    if count > 1 and is_daemonic():
         notice(
             "note: the cases run in this process, as a daemonic process, such as a worker of "
             "multiprocessing.Pool, starts no others"
         )
-        count, apart = 1, False
-    if count == 1 and not apart:
-        return Workers(InProcess, 1)
-    threads = POOL_THREADS + count * ((os.cpu_count() or 1) + WORKER_THREADS)
-    if here_s is None:
-        check_threads(threads)
+        count = 1
+    return Workers(None if count == 1 else LocalProcesses, count, here_s=here_s)
 
-    def processes() -> Executor:
-        if here_s is not None:
-            try:
-                check_threads(threads)
-            except UserError:
-                return InProcess()
-        return LocalProcesses(count, preload)
 
-    return Workers(processes, count, recycle_after=RECYCLE_AFTER, here_s=here_s)
+def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
+    """Give workers, which stay open, or this process as the only one."""
+    return open_workers(1) if workers is None else nullcontext(workers)
 
 
 def is_daemonic() -> bool:
@@ -320,7 +286,7 @@ DASK_LOGGERS: Final = ("distributed", "distributed.client", "tornado.application
 
 @contextmanager
 def _quiet(names: Sequence[str]) -> Iterator[None]:
-    """Log nothing: what matters to a person is said in a sentence."""
+    """Log nothing: what matters to a user is a sentence of ours."""
     loggers = list(map(logging.getLogger, names))
     before = [logger.level for logger in loggers]
     for logger in loggers:
@@ -357,7 +323,7 @@ def dask_workers(address: str) -> Workers:
         if count == 0:
             raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
         return Workers(
-            lambda: client.get_executor(pure=False),
+            lambda _: client.get_executor(pure=False),
             count,
             died=(KilledWorker,),
             gone=(CancelledError, ClosedClientError),
@@ -365,76 +331,34 @@ def dask_workers(address: str) -> Workers:
         )
 
 
-class InProcess(Executor):
-    """An executor of one worker: the process that calls it."""
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Run at once; the future is done."""
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:  # a future holds whatever was raised
-            future.set_exception(error)
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let go what the worker kept."""
-        end_worker()
-
-
 class LocalProcesses(ProcessPoolExecutor):
     """Worker processes that leave Ctrl-C to their parent and do not outlive it.
 
-    They are spawned, because libsumo's simulation must not be forked. No more of them import their
-    modules at a time than there are cores: the first ones work while others wait for that.
+    They are spawned, because libsumo's simulation must not be forked.
     """
 
-    def __init__(self, workers: int, preload: str | None = None) -> None:
-        """Start them; RuntimeError where this process may start none."""
-        if is_daemonic():
-            raise RuntimeError("a daemonic process starts no others")
-        spawn = multiprocessing.get_context("spawn")
+    def __init__(self, workers: int) -> None:
+        """Start them."""
+        # A worker that is killed leaves its temporary files behind.
+        self._scratch = ScratchFolder()
         with without_cwd():  # its locks have a process of their own
-            cores = spawn.Semaphore(os.cpu_count() or 1)
-            # A worker that is killed leaves its temporary files behind.
-            self._scratch = ScratchFolder()
-            given = cores, preload, self._scratch.name
-            super().__init__(workers, spawn, _begin_worker, given)
-        self.submit(int)  # with the first task they start
-
-    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Submit; workers that are started here, now or later, never see SIGINT."""
+            spawn = multiprocessing.get_context("spawn")
+            super().__init__(workers, spawn, _begin_worker, (self._scratch.name,))
         with _sigint_blocked(), without_main(), without_cwd():
-            future = super().submit(fn, *args, **kwargs)
+            self.submit(int)  # with the first task they start
 
-        def fail(exception: BaseException | None) -> None:
-            # The thread that ends a broken pool would die of a future that was cancelled.
-            with suppress(InvalidStateError):
-                Future.set_exception(future, exception)
-
-        future.set_exception = fail  # type: ignore[method-assign]
-        return future
-
-    def __exit__(self, *exception: Any) -> bool | None:
-        """Wait for the workers; when the program is to end at once, end them too."""
-        if exception[0] is not None and not issubclass(exception[0], Exception):
-            self._kill()
-        return super().__exit__(*exception)
+    def end(self, *, at_once: bool) -> None:
+        """Wait for what runs, or end the workers `at_once`."""
+        if at_once:
+            for process in list((self._processes or {}).values()):
+                process.kill()
+        self.shutdown(cancel_futures=True)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """Let the workers end; remove what they have left."""
         super().shutdown(wait, cancel_futures=cancel_futures)
         if wait:
             self._scratch.cleanup()
-
-    def _kill(self) -> None:
-        for process in list((self._processes or {}).values()):
-            process.kill()
-        # Before 3.11.5 and 3.12, Python waits for ever to write what no worker reads any more:
-        # https://github.com/python/cpython/issues/94777
-        queue: Any = getattr(self, "_call_queue", None)
-        if queue is not None:
-            queue._reader.close()
 
 
 _endings: list[Callable[[], None]] = []
@@ -444,31 +368,28 @@ def when_worker_ends(ending: Callable[[], None]) -> None:
     """Have something called when the work of this process as a worker is over."""
     if ending not in _endings:
         _endings.append(ending)
-    atexit.unregister(end_worker)  # not to be registered twice
-    atexit.register(end_worker)
 
 
 def end_worker() -> None:
-    """Let go what this process kept from one chunk to the next."""
+    """Release what this process kept from one chunk to the next."""
     while _endings:
         _endings.pop()()
 
 
-def _begin_worker(cores: Semaphore, preload: str | None, scratch: str) -> None:
-    """Set up a worker process, when one of the cores is free for that."""
+# Processes of multiprocessing end without atexit; in others this is one.
+multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
+
+
+def _begin_worker(scratch: str) -> None:
+    """Set up a worker process."""
     tempfile.tempdir = os.environ["TMPDIR"] = scratch
     forget_safe_path()
     leave_signals_to_parent()
-    # Processes of multiprocessing end without atexit.
-    multiprocessing.util.Finalize(None, end_worker, exitpriority=100)
-    with cores:
-        from threadpoolctl import threadpool_limits
+    import numpy as np  # noqa: F401 (its libraries are limited as they are loaded)
+    from threadpoolctl import threadpool_limits
 
-        for module in filter(None, ("numpy", preload)):
-            import_module(module)
-        # As many threads as workers keep all cores busy. A library that is loaded later has no
-        # limit.
-        threadpool_limits(1)
+    # As many threads as workers keep all cores busy. A library that is loaded later has no limit.
+    threadpool_limits(1)
 
 
 def leave_signals_to_parent() -> None:

@@ -220,7 +220,7 @@ def assert_sees_late(factory: VutFactory) -> None:
         scenario=late, road=road, vut=factory, povs=povs, criterion=Criterion(), corridors=1
     )
     with Simulator(plan) as simulator:
-        (_, ran) = next(simulator.run([case]))
+        (ran,) = simulator.run([case])
     assert ran.error is None
     seen = shifted(ran.motion, LATE_STEPS)
     told = tuple(map(tuple, seen[0, :, :2].tolist()))

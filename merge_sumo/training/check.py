@@ -80,8 +80,7 @@ def play(
         for make in (make_pov, make_vut)
     )
     with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
-        played = dict(rollout(world, pov, vut, cases))
-    return [played[index] for index in sorted(played)]
+        return rollout(world, pov, vut, cases)
 
 
 def check_policy(

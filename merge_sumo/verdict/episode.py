@@ -22,6 +22,7 @@ class Episode:
         files: those of the user's that the VUT had loaded by then, with their hashes.
         pov_files: those that a POV of the user's own had loaded.
         again: whether it ran again, because a process had died or had been stopped.
+        in_sumo: whether SUMO ran it; the engine of the plan may be another.
         earlier: the same case by the earlier version, where a campaign is against one.
     """
 
@@ -30,6 +31,7 @@ class Episode:
     files: Files = field(default_factory=dict)
     pov_files: Files = field(default_factory=dict)
     again: bool = False
+    in_sumo: bool = True
     earlier: Episode | None = None
 
     def at(self, index: int, batch: int, prediction: Prediction | None = None) -> Episode:

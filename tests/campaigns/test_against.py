@@ -98,14 +98,14 @@ class TestBytes:
     def test_are_the_same_after_a_stop_between_the_two_versions(self, whole):
         left = 2
 
-        def stop() -> None:
+        def stop(_) -> None:
             nonlocal left
             left -= 1
             if not left:
                 raise Stopped(signal.SIGINT)
 
         with pytest.raises(Stopped):
-            run_campaign(settings(), Path("run"), check=stop)
+            run_campaign(settings(), Path("run"), callbacks=[stop])
         ran = len(Run(Path("run")).outcomes)
         # The batch of the old version is written first: here the new one's was not.
         kept = (Path("run") / OUTCOMES).read_bytes().splitlines(keepends=True)[:5]

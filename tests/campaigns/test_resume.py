@@ -33,12 +33,12 @@ def settings(sampler: str = "annealing", **changes) -> CampaignSettings:
 
 
 class StopAfter:
-    """A check that stops a campaign after some batches."""
+    """A callback that stops a campaign after some batches."""
 
     def __init__(self, batches: int) -> None:
         self.left = batches
 
-    def __call__(self) -> None:
+    def __call__(self, _) -> None:
         self.left -= 1
         if self.left == 0:
             raise Stopped(signal.SIGINT)
@@ -46,7 +46,7 @@ class StopAfter:
 
 def stopped_after(batches: int, folder: Path, sampler: str = "annealing") -> Path:
     with pytest.raises(Stopped):
-        run_campaign(settings(sampler), folder, check=StopAfter(batches))
+        run_campaign(settings(sampler), folder, callbacks=[StopAfter(batches)])
     return folder
 
 
@@ -115,11 +115,11 @@ class TestWhatDiffers:
     @pytest.mark.parametrize(
         ("given", "name"),
         [
-            ({"seed": 3}, "seed differs: .* run with 2, now it is 3; make it the same, or begin"),
+            ({"seed": 3}, "seed differs: .* run with 2, now it is 3; make it the same, or start"),
             ({"vut": "design2"}, "vut differs"),
             ({"levels": (1,)}, "levels differs"),
             ({"sampler": "gpr"}, "sampler differs"),
-            ({"cases": 24}, "cases differs: .* with 28, now it is 24; give 28 or more, or begin"),
+            ({"cases": 24}, "cases differs: .* with 28, now it is 24; give 28 or more, or start"),
             ({"batch": 4}, "batch differs"),
         ],
     )

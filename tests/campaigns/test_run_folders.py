@@ -134,7 +134,7 @@ class TestAChangedController:
         before = (mine / "run" / OUTCOMES).read_bytes()
         (mine / file).write_text((mine / file).read_text() + "# changed\n")
         said = command_line("campaign", "--resume", "run", "--vut", SPEC, "--cases", 12, "-q")
-        assert_refused(said, f"vut_files.{file} differs", "or begin a new campaign")
+        assert_refused(said, f"vut_files.{file} differs", "or start a new campaign")
         assert (mine / "run" / OUTCOMES).read_bytes() == before
         _, _, err = command_line("run", "--case", "run", 0, "--vut", SPEC)
         assert f"note: {file} is not as it was in run" in err

@@ -57,8 +57,7 @@ def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors, scenario=US23) as world:
         driver = VutFactory.of(vut)(corridors)
-        got = dict(rollout(world, PovLibrary(corridors, POVS), driver, cases))
-    trajectories = [got[index] for index in range(len(cases))]
+        trajectories = rollout(world, PovLibrary(corridors, POVS), driver, cases)
     return [measure(t) for t in trajectories], trajectories
 
 
@@ -198,7 +197,7 @@ class TestALimitOfBraking:
         with World(corridors, scenario=US23) as world:
             pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
             vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
-            (_, found), *_ = rollout(world, pov, vut, [case])
+            (found,) = rollout(world, pov, vut, [case])
         assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
         assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
 
@@ -213,7 +212,7 @@ class TestTheLibraryOfPeople:
         cases = uniform_cases(level, 300, seed=4)
         with World(32, scenario=US23) as world:
             pov, vut = PovLibrary(32, self.POVS), VutFactory.of("design2")(32)
-            found = [measure(t) for _, t in rollout(world, pov, vut, cases)]
+            found = [measure(t) for t in rollout(world, pov, vut, cases)]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0
 

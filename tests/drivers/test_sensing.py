@@ -190,7 +190,7 @@ def test_zeros_of_a_range_give_the_same_bits(vut):
     motions = []
     for case in cases:
         with Simulator(plan_for(vut, scenario=case.scenario)) as simulator:
-            ((_, ran),) = simulator.run([case])
+            (ran,) = simulator.run([case])
             motions.append(ran.motion)
     assert np.array_equal(motions[0], motions[1])
 

@@ -77,7 +77,7 @@ def run(vut, scenario):
     cases = [replace(case, scenario=scenario) for case in CASES]
     factory = VutFactory.of(vut, VutOptions(in_process=True))
     with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
-        return dict(ground.run(cases))
+        return ground.run(cases)
 
 
 class TestSeverity:

@@ -10,7 +10,7 @@ from plans import POVS, key_of, plan_for
 
 from merge_sumo.drivers.levelk import MANY_ROWS, features
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.evaluate import CasesAt, Episodes, evaluate, run_cases
+from merge_sumo.engine.evaluate import evaluate, simulate
 from merge_sumo.engine.kinematic_simulator import CHECKED_SHARE, drawn
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import Engine, SimulationPlan
@@ -21,6 +21,7 @@ from merge_sumo.scenario.case import Case, MergeCase, Pool, from_unit
 from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
 from merge_sumo.studies.truth import ground_truth, known_truth
 from merge_sumo.verdict.criterion import Criterion
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.vuts.base import VutOptions
 
 
@@ -29,16 +30,18 @@ def uniform(count: int, level: int, scenario: Scenario = US23) -> list[Case]:
     return from_unit(points, level, scenario=scenario)
 
 
-def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[Episodes, Episodes]:
+def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[list[Episode], list[Episode]]:
     """Return the results of SUMO and of the kinematic engine."""
-    return run_cases(plan, cases), run_cases(plan.with_engine("kinematic"), cases)
+    return simulate(plan, cases), simulate(plan.with_engine("kinematic"), cases)
 
 
-def assert_alike(sumo: Episodes, kinematic: Episodes) -> None:
-    for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
-        assert one.end is other.end
-        np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
-    for verdict, ours in zip(sumo.verdicts(), kinematic.verdicts(), strict=True):
+def assert_alike(sumo: list[Episode], kinematic: list[Episode]) -> None:
+    for one, other in zip(sumo, kinematic, strict=True):
+        assert one.trajectory.end is other.trajectory.end
+        np.testing.assert_allclose(
+            one.trajectory.motion, other.trajectory.motion, rtol=0.0, atol=1e-9
+        )
+        verdict, ours = one.outcome.verdict, other.outcome.verdict
         assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
         assert verdict.margin == pytest.approx(ours.margin, abs=1e-9)
 
@@ -58,11 +61,7 @@ class TestACase:
         plan = plan_for("design2", scenario=scenario, criterion=Criterion(fail_when))
         sumo, kinematic = by_both(plan, uniform(200, 1, scenario))
         assert_alike(sumo, kinematic)
-        assert any(verdict.failed for verdict in sumo.verdicts())
-
-    def test_has_the_verdict_of_its_outcome(self):
-        results = run_cases(plan_for("design1"), uniform(200, 0))
-        assert results.verdicts() == [one.outcome.verdict for one in results]
+        assert any(one.outcome.failed for one in sumo)
 
 
 class TestACloseCall:
@@ -70,21 +69,24 @@ class TestACloseCall:
         """The front bumpers are 6 m apart at M, to rounding errors."""
         plan = plan_for("level0")
         case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-        (found,) = run_cases(plan, [case])
+        (found,) = simulate(plan, [case])
         assert found.outcome.measures.dx_m is not None
         x_m = case.x_pov0_m + US23.dx_crash_m - found.outcome.measures.dx_m
         cases: list[Case] = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
         sumo, kinematic = by_both(plan, cases)
-        assert len(kinematic.in_sumo) == len(cases)
-        assert {verdict.failed for verdict in sumo.verdicts()} == {True, False}
-        for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
-            assert one.motion.tobytes() == other.motion.tobytes()
+        assert all(one.in_sumo for one in kinematic)
+        assert {one.outcome.failed for one in sumo} == {
+            True,
+            False,
+        }
+        for one, other in zip(sumo, kinematic, strict=True):
+            assert one.trajectory.motion.tobytes() == other.trajectory.motion.tobytes()
 
     def test_is_one_of_the_step_in_which_the_episode_ends(self):
         scenario = replace(US23, x_vut0_m=-180.0, v_vut0_mps=20.0, level0_v_mps=20.0)
         cases = uniform(20, 0, scenario)
         sumo, kinematic = by_both(plan_for("level0", scenario=scenario), cases)
-        assert len(kinematic.in_sumo) == len(cases)
+        assert all(one.in_sumo for one in kinematic)
         assert_alike(sumo, kinematic)
 
 
@@ -105,7 +107,7 @@ class TestTheCheck:
 
         monkeypatch.setattr(EquationWorld, "command", drift)
         with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose `engine` sumo"):
-            run_cases(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
+            simulate(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
 
 
 class TestThePlan:
@@ -152,13 +154,13 @@ class TestATruth:
         assert sum(counted) == 100
 
 
-def in_sumo(results: Episodes) -> list[bool]:
-    return [place in results.in_sumo for place in range(len(results))]
+def in_sumo(episode: Episode) -> bool:
+    return episode.in_sumo
 
 
 def test_cases_are_evaluated_in_their_order():
     points = np.random.default_rng(0).random((700, 2))
-    cases = CasesAt(Pool(levels=(0,), scenario=US23), 0, points)
+    cases = Pool(levels=(0,), scenario=US23).cases(points, 0)
     plan = plan_for("design1").with_engine("kinematic")
     found = dict(evaluate(plan, cases))
     assert sorted(found) == list(range(700))

@@ -12,7 +12,7 @@ from test_kinematic_simulator import uniform
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
 from merge_sumo.drivers.lane import Merging
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import FloatArray, MergeCase
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, MergeScenario
@@ -88,8 +88,9 @@ class TestSumo:
     def test_moves_as_the_equations(self, scenario, vut):
         road, level = named_scenario(scenario), 1
         plan, cases = plan_for(vut, scenario=road), uniform(60, level, road)
-        sumo, kinematic = run_cases(plan, cases), run_cases(plan.with_engine("kinematic"), cases)
-        for one, other in zip(sumo.trajectories, kinematic.trajectories, strict=True):
+        sumo, kinematic = simulate(plan, cases), simulate(plan.with_engine("kinematic"), cases)
+        for ours, theirs in zip(sumo, kinematic, strict=True):
+            one, other = ours.trajectory, theirs.trajectory
             assert one.end is other.end is End.MERGED
             np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
             assert one.after is not None
@@ -109,8 +110,8 @@ class TestSumo:
             lanes.extend(zip(world.x_m[VUT, active], (wants == merged)[active], strict=True))
 
         monkeypatch.setattr(World, "command", noted)
-        results = run_cases(plan_for(late, scenario=road), uniform(60, 0, road))
-        places = [one.motion[-1, VUT, 0] for one in results.trajectories]
+        results = simulate(plan_for(late, scenario=road), uniform(60, 0, road))
+        places = [one.motion[-1, VUT, 0] for one in [one.trajectory for one in results]]
         assert min(places) < -65.0
         assert max(places) >= 130.0
         at_end = [agrees for x_m, agrees in lanes if not 125.0 < x_m < 131.0]
@@ -135,7 +136,7 @@ class TestAControllerThatRaisesAfterItsMerge:
         cases = uniform(20, 0, road)
         raising = plan_for(f"{tmp_path / 'raises.py'}:Raises", scenario=road)
         calm = plan_for("level0", scenario=road).with_engine("kinematic")
-        return (run_cases(plan, cases).trajectories for plan in (raising, calm))
+        return ([one.trajectory for one in simulate(plan, cases)] for plan in (raising, calm))
 
     def test_is_driven_for_where_it_only_accelerates(self, tmp_path):
         answer = "min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)"

@@ -16,7 +16,7 @@ from plans import plan_for
 
 from merge_sumo.drivers.levelk import actions_mps2, features
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine import evaluate
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import as_merge
@@ -182,8 +182,9 @@ def test_an_episode_is_that_of_the_definition(name, level, tmp_path):
     spec = f"{tmp_path / 'gap.py'}:Gap" if name == "gap" else name
     points = np.random.default_rng([24, level]).random((150, len(ROAD.dimensions(level))))
     cases: list[Case] = from_unit(points, level, scenario=ROAD)
-    results = run_cases(plan_for(spec, scenario=ROAD, criterion=Criterion("unsafe")), cases)
-    for case, result, verdict in zip(cases, results, results.verdicts(), strict=True):
+    results = evaluate.simulate(plan_for(spec, scenario=ROAD, criterion=Criterion("unsafe")), cases)
+    for case, result in zip(cases, results, strict=True):
+        verdict = result.outcome.verdict
         assert isinstance(case, MergeCase)
         place, least_m, braking = simulate(case, VUTS[name]())
         measures = result.outcome.measures

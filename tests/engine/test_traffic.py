@@ -33,8 +33,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
     factory = VutFactory.of(vut, VutOptions(**options))
     with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
-        ran = dict(ground.run(cases))
-    return [ran[place] for place in range(len(cases))]
+        return ground.run(cases)
 
 
 class TestThePool:

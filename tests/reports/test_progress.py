@@ -13,7 +13,7 @@ from lxml import html
 from rich.console import Console
 
 from merge_sumo.reports.progress import CampaignBars, rate_text
-from merge_sumo.reports.report import EVERY_S, FIRST_S, REPORT
+from merge_sumo.reports.report import EVERY_S, FIRST_S, REPORT, RunningReport
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def said(run, tmp_path, clock, **how) -> str:
         bars.begin("a [b]")
         for outcome in run.outcomes:
             clock[0] += 0.5
-            bars.case_ended(outcome)
+            bars.ended([outcome])
         for done in range(41):
             clock[0] += 0.5
             bars.counted("careful drivers", done, 40, "failures")
@@ -82,7 +82,7 @@ def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated
     for draw, measures in enumerate((fails.measures, passes, fails.measures, fails.measures)):
         clock[0] += 10.0
         case = replace(fails.case, draw=draw)
-        bars.case_ended(replace(fails, index=draw, case=case, measures=measures, margin=None))
+        bars.ended([replace(fails, index=draw, case=case, measures=measures, margin=None)])
     found = [line.split("  ")[1] for line in out.getvalue().splitlines()]
     unsure = "0 failures, 1 undecided"
     assert found == [unsure, "0 failures", unsure, unsure], "half of the runs is not more"
@@ -105,40 +105,40 @@ def test_a_rate_is_readable(count, elapsed_s, text):
 class TestTheReportOfACampaignThatRuns:
     @pytest.fixture
     def own(self, tmp_path, clock):
-        """Return a campaign with its own folder, and bars that have had time to write a report."""
+        """Return a campaign with its own folder, and a report whose time has come."""
         run = write_run(tmp_path / "a <b>", per_level=20, cases=90)
-        bars, _ = bars_for(run.folder, shown=False)
-        bars.case_ended(run.outcomes[0])
+        report = RunningReport(run.folder)
+        report.rewrite(run.outcomes[:1])
         assert not (run.folder / REPORT).exists(), "a short campaign goes without"
         clock[0] += FIRST_S
-        return run, bars
+        return run, report
 
     def test_is_the_report_without_surrogates_and_is_loaded_again(self, own, clock):
-        run, bars = own
-        bars.case_ended(run.outcomes[1])
+        run, report = own
+        report.rewrite()
         root = html.parse(run.folder / REPORT).getroot()
         assert root.xpath("//meta[@http-equiv='refresh']/@content") == [str(EVERY_S)]
         assert "This campaign runs, 90 cases in all" in root.text_content()
         failing = [o for o in run.outcomes if o.failed]
         assert root.xpath("//tr[@class='all']//b/text()") == ["60", str(len(failing))]
         before = (run.folder / REPORT).read_bytes()
-        bars.case_ended(run.outcomes[2])
+        report.rewrite()
         assert (run.folder / REPORT).read_bytes() == before, "it is not written for each case"
 
     def test_of_one_that_was_stopped_is_loaded_no_more_and_says_how_to_go_on(self, own):
-        run, bars = own
-        bars.case_ended(run.outcomes[1])
-        with pytest.raises(KeyboardInterrupt), bars:
+        run, report = own
+        report.rewrite()
+        with pytest.raises(KeyboardInterrupt), report:
             raise KeyboardInterrupt
         page = html.parse(run.folder / REPORT).getroot()
         assert page.xpath("//meta[@http-equiv='refresh']") == []
         assert f"merge-sumo campaign --resume '{run.folder}'" in page.text_content()
 
     def test_is_left_away_where_something_else_is_in_its_place(self, own, clock, tmp_path):
-        run, bars = own
+        run, report = own
         (other := tmp_path / "other.html").write_text("mine")
         (run.folder / REPORT).symlink_to(other)
-        for outcome in run.outcomes:
+        for _ in run.outcomes:
             clock[0] += EVERY_S
-            bars.case_ended(outcome)
+            report.rewrite()
         assert (run.folder / REPORT).read_text() == other.read_text() == "mine"

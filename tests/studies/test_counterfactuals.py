@@ -19,7 +19,7 @@ from merge_sumo.campaigns.settings import CampaignSettings, controllers, setting
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
-from merge_sumo.engine.evaluate import opened_simulator, run_cases
+from merge_sumo.engine.evaluate import opened_simulator, simulate
 from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
@@ -130,8 +130,9 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
     passing: list[list[str]] = [[] for _ in failing]
     for name in REFERENCES:
         by_name = plan_for(name, scenario=road, criterion=plan.criterion)
-        results = run_cases(by_name.with_engine("kinematic"), [o.case for o in failing])
-        for names, result, verdict in zip(passing, results, results.verdicts(), strict=True):
+        results = simulate(by_name.with_engine("kinematic"), [o.case for o in failing])
+        for names, result in zip(passing, results, strict=True):
+            verdict = result.outcome.verdict
             can_brake = brake_after_mps2(result.trajectory) <= 4.0
             if can_brake and verdict.is_tested and not verdict.failed:
                 names.append(name)

@@ -15,7 +15,7 @@ from plans import plan_for
 
 import merge_sumo as ms
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.errors import UserError
 from merge_sumo.reports.text import changes
 from merge_sumo.road.scenario_file import named_scenario
@@ -46,7 +46,8 @@ def uniform(vut, folder, cases, **keywords: Any):
 
 
 def passes(plan, case):
-    (verdict,) = run_cases(plan, [case]).verdicts()
+    (episode,) = simulate(plan, [case])
+    verdict = episode.outcome.verdict
     return verdict.is_tested and not verdict.failed
 
 

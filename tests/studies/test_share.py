@@ -12,10 +12,10 @@ from campaigning import campaign_settings, run_campaign
 
 from merge_sumo import api
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, evaluate
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.errors import UserError
 from merge_sumo.studies import share
-from merge_sumo.studies.share import SHARES, LevelShare, ends_of, share_at, stream
+from merge_sumo.studies.share import SHARES, LevelShare, end_of, share_at, stream
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     plan = resolve(campaign_settings(vut="design1")).with_engine(None)
     points = np.random.default_rng(99).random((20_000, 2))
     pool = campaign_settings(vut="design1").pool
-    many = evaluate(plan, CasesAt(pool, 0, points), THIS_PROCESS, ends_of)
+    many = evaluate(plan, pool.cases(points, 0), None, end_of)
     known = sum(fails for _, (fails, _) in many) / len(points)
     low, high = level.interval
     assert low < known < high
@@ -92,7 +92,7 @@ def test_of_a_controller_of_ones_own_is_measured_too():
         assert one.cases >= 200
         assert one.cases % 200 == 0
         rng = stream(4, level)
-        rounds = [share_at(plan, level, 200, rng, THIS_PROCESS) for _ in range(one.cases // 200)]
+        rounds = [share_at(plan, level, 200, rng, None) for _ in range(one.cases // 200)]
         assert one.failures == sum(found.failures for found in rounds)
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
@@ -130,7 +130,7 @@ def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
     for took_s, rounds in ((0.0, 1), (19.9, 1), (20.0, 2), (49.0, 4)):
         told.clear()
         share.note_shares(
-            run, resolve(settings), THIS_PROCESS, took_s, on_part=lambda *part: told.append(part)
+            run, resolve(settings), None, took_s, on_part=lambda *part: told.append(part)
         )
         expected = tuple(LevelShare(level, 200 * rounds, rounds) for level in (0, 1))
         assert SHARES.read(run.folder).levels == expected

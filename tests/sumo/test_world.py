@@ -14,7 +14,7 @@ from merge_sumo.engine.povs import PovLibrary
 from merge_sumo.engine.rollout import rollout
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23
-from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import SimulationError, World
 from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.factory import VutFactory
@@ -49,11 +49,7 @@ class RandomDriver(Driver):
 
 
 def run_all(world, pov, vut, cases):
-    trajectories: list[Trajectory] = [None] * len(cases)
-    for index, trajectory in rollout(world, pov, vut, cases):
-        assert trajectories[index] is None
-        trajectories[index] = trajectory
-    return trajectories
+    return rollout(world, pov, vut, cases)
 
 
 def assert_eq4(trajectory):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.verdict.score import Outcome
 
 
 def campaign_settings(**settings: Any) -> CampaignSettings:
@@ -18,8 +19,19 @@ def campaign_settings(**settings: Any) -> CampaignSettings:
     return CampaignSettings(**{"levels": (0,), "scenario": US23, **settings})
 
 
-def run_campaign(settings: CampaignSettings, folder: Path, **other: Any) -> Run:
-    return campaign.run_campaign(settings, resolve(settings), folder, **other)
+def run_campaign(
+    settings: CampaignSettings,
+    folder: Path,
+    *,
+    on_case: Callable[[Outcome], None] = lambda _: None,
+    **other: Any,
+) -> Run:
+    def on_cases(outcomes: Sequence[Outcome]) -> None:
+        for outcome in outcomes:
+            on_case(outcome)
+
+    callbacks = (on_cases, *other.pop("callbacks", ()))
+    return campaign.run_campaign(settings, resolve(settings), folder, callbacks, **other)
 
 
 def resume_campaign(folder: Path, given: Mapping[str, object] | None = None, **other: Any) -> Run:

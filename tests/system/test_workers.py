@@ -22,15 +22,12 @@ from processes import wait_for
 
 from merge_sumo import api
 from merge_sumo.campaigns.run import OUTCOMES
-from merge_sumo.engine.evaluate import _lost, run_cases
+from merge_sumo.engine.evaluate import lost, simulate
 from merge_sumo.errors import Notice, UserError, WorkersLostError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.workers import (
-    InProcess,
-    LocalProcesses,
-    Workers,
     dask_workers,
     open_workers,
 )
@@ -74,7 +71,7 @@ def killed_always_at(deadly: set[int], items):
 def run_but_die_at(plan, deadly, cases):
     if any(case.x_pov0_m in deadly for case in cases):
         os.kill(os.getpid(), signal.SIGKILL)
-    return run_cases(plan, cases)
+    return simulate(plan, cases)
 
 
 def no_loss(item):
@@ -137,22 +134,15 @@ class TestAWorkerThatDies:
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
         work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-        ran = dict(two.run(work, cases, lambda case: _lost(plan, case)[0], chunk=1))
+        ran = dict(two.run(work, cases, partial(lost, plan), chunk=1))
         ends = [ran[place].outcome.measures.end for place in range(4)]
         assert ends[2] is End.SIM_ERROR
-        assert "worker process died 2 times" in ran[2].outcome.measures.error
+        assert "worker process died twice" in ran[2].outcome.measures.error
         assert ran[2].outcome.measures.score is None
         assert End.SIM_ERROR not in ends[:2] + ends[3:]
 
 
 class TestLocalProcesses:
-    @pytest.mark.slow
-    def test_are_replaced_after_a_number_of_chunks(self):
-        with Workers(lambda: LocalProcesses(1), 1, recycle_after=2) as workers:
-            found = dict(workers.run(process_ids, range(6), no_loss, chunk=1))
-        assert len(set(found.values())) == 3
-        assert os.getpid() not in found.values()
-
     @pytest.mark.slow
     def test_do_not_hear_ctrl_c(self, two):
         ids = set(dict(two.run(process_ids, range(8), no_loss, chunk=1)).values())
@@ -260,11 +250,6 @@ class TestADaemonicProcess:
         texts = [(one.folder / OUTCOMES).read_bytes() for one in (alone, run)]
         assert texts[0] == texts[1]
 
-    def test_searches_alone_on_workers_of_others(self, daemonic, tmp_path):
-        settings = campaign_settings(vut="design2", levels=(0, 1), cases=20, seed=1)
-        run = run_campaign(settings, tmp_path / "run", workers=Workers(InProcess, 2))
-        assert len(run.outcomes) == 20
-
     def test_trains_nothing(self, daemonic, tmp_path):
         helix = pytest.importorskip("merge_sumo.training.helix", exc_type=ImportError)
         with pytest.raises(UserError, match="train outside of it"):
@@ -286,8 +271,8 @@ class TestADaskCluster:
         assert process.returncode == 2, err
         *before, last = err.splitlines()
         assert last == (
-            "merge-sumo: the workers went away: look after the cluster; go on with: merge-sumo "
-            f"campaign --resume run --gate 'fmc>0.5' --workers {address}"
+            "merge-sumo: lost the connection to the Dask workers; check the cluster; "
+            f"go on with: merge-sumo campaign --resume run --gate 'fmc>0.5' --workers {address}"
         )
         assert all(line.startswith(("design1 v level 0", "cases: ", "so far")) for line in before)
 

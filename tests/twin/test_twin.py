@@ -12,7 +12,7 @@ from plans import POVS, plan_for
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.engine.povs import Povs
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
@@ -37,7 +37,7 @@ SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 def ran(vut: str, level: int, points, scenario=US23, povs=None):
     plan = plan_for(vut, scenario=scenario, povs=povs, corridors=16)
     pool = Pool(levels=(level,), scenario=scenario)
-    done = run_cases(plan, pool.cases(points, level))
+    done = simulate(plan, pool.cases(points, level))
     return [
         Outcome(index, index // 10, one.trajectory.case, one.outcome.measures)
         for index, one in enumerate(done)
@@ -100,7 +100,7 @@ class TestGames:
         criterion, pool, road = Criterion(text), Pool(levels=(0,), scenario=US23), road_for(US23)
         points = np.random.default_rng(5).random((24, 2))
         plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
-        done = run_cases(plan, pool.cases(points, 0))
+        done = simulate(plan, pool.cases(points, 0))
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
         found = TwinRollout(pool, POVS, criterion, lines).play(

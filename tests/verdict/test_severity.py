@@ -13,7 +13,7 @@ import pytest
 from plans import plan_for
 from shapely import Polygon
 
-from merge_sumo.engine.evaluate import run_cases
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
@@ -90,7 +90,7 @@ def test_agrees_with_polygons_and_steps(scenario, vut):
     count = 200
     cases = make_sampler("uniform", Pool(levels=LEVELS, scenario=found), 5).ask(count)
     told: Counter[str] = Counter()
-    for ran in run_cases(plan, cases):
+    for ran in simulate(plan, cases):
         measures = ran.outcome.measures
         assert (measures.impact_speed_mps is None) == (measures.severity != "contact")
         shared_m2 = overlap_before_m(plan.road, ran.trajectory)

@@ -22,7 +22,7 @@ from problems import named_problems
 from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Bars
 from merge_sumo.system.folders import check_ours, replace_own
-from merge_sumo.system.workers import open_workers
+from merge_sumo.system.workers import LocalProcesses, Workers, workers_or_cores
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if folder.exists() and not (folder / contest.SEARCHES).is_dir():
         raise UserError(f"{folder} is no folder of searches: name a new one")
     check_ours(folder / contest.PAGE)
-    with open_workers(given.workers, preload="contest", apart=True) as workers, Bars() as bars:
+    with Workers(LocalProcesses, workers_or_cores(given.workers)) as workers, Bars() as bars:
         result = contest.benchmark(given.samplers, settings, folder, workers, on_step=bars.counted)
     record = json.dumps(result.to_record(), indent=1, allow_nan=False)
     replace_own(folder / contest.RECORD, f"{record}\n".encode())

@@ -11,7 +11,7 @@ import json
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from importlib.metadata import version
@@ -37,7 +37,7 @@ from problems import (
     shipped_truth,
 )
 
-from merge_sumo.campaigns.scheduler import groups_here
+from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.coverage.fmc import fmc
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
@@ -189,11 +189,16 @@ def _run_search(task: Task) -> Found:
     problem, plan = _problem(task.problem)
     truth = shipped_truth(problem)
     watch, failures, ran, fault = Watch(task.limit_s), list[list[float]](), 0, None
+
+    def note(groups: Groups) -> None:
+        nonlocal ran
+        for group in groups:
+            ran += len(group)
+            failures.extend(_row(one.outcome) for one in group if one.outcome.failed)
+
     try:
         with watch.deadline:
-            for outcomes in _outcomes(task, problem, plan, watch):
-                ran += len(outcomes)
-                failures += [_row(outcome) for outcome in outcomes if outcome.failed]
+            _search(task, problem, plan, watch, note)
     except SamplerFaultError as error:
         fault = str(error)
     return Found(
@@ -207,10 +212,14 @@ def _run_search(task: Task) -> Found:
     )
 
 
-def _outcomes(
-    task: Task, problem: Problem, plan: SimulationPlan, watch: Watch
-) -> Iterator[list[Outcome]]:
-    """Run a search; yield the outcomes of each batch."""
+def _search(
+    task: Task,
+    problem: Problem,
+    plan: SimulationPlan,
+    watch: Watch,
+    on_groups: Callable[[Groups], None],
+) -> None:
+    """Run a search."""
     pool, seed = problem.settings().pool, task.seed
 
     def make() -> Any:
@@ -221,8 +230,7 @@ def _outcomes(
         return sampler(pool, seed, predictor)
 
     sampler = WatchedSampler(make, pool, seed, watch)
-    for group in groups_here(plan, sampler, task.cases):
-        yield [episode.outcome for episode in group]
+    SearchLoop(sampler, plan, task.cases).run(on_groups)
 
 
 def _row(outcome: Outcome) -> list[float]:

@@ -25,7 +25,8 @@ from scipy.spatial import cKDTree
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.coverage.fmc import fmc, growth_bound, radius_for
-from merge_sumo.engine.evaluate import THIS_PROCESS, CasesAt, Episodes, evaluate
+from merge_sumo.engine.evaluate import simulate
+from merge_sumo.engine.kinematic_simulator import CHUNK
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
@@ -334,15 +335,12 @@ def _margins_at(
     problem: Problem, plan: SimulationPlan, level: int, points: FloatArray
 ) -> FloatArray:
     """Return the margin of the cases at points, (n, d), of a level, (n,); NaN without a verdict."""
-    margin = np.full(len(points), np.nan)
-    cases = CasesAt(Pool(levels=problem.levels, scenario=plan.scenario), level, points)
-    for place, value in evaluate(plan, cases, THIS_PROCESS, _verdicts):
-        margin[place] = value
-    return margin
-
-
-def _verdicts(results: Episodes) -> list[float]:
-    return [np.nan if one.margin is None else one.margin for one in results.verdicts()]
+    cases = Pool(levels=problem.levels, scenario=plan.scenario).cases(points, level)
+    margins: list[float | None] = []
+    for first in range(0, len(cases), CHUNK):
+        episodes = simulate(plan, cases[first : first + CHUNK])
+        margins += [episode.outcome.margin for episode in episodes]
+    return np.array(margins, dtype=np.float64)  # None becomes NaN
 
 
 def make_truth(problem: Problem, folder: Path, cases: int | None = None) -> KnownTruth:

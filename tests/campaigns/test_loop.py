@@ -1,4 +1,4 @@
-"""The loop of a search: workers, the time of a case and a stop decide nothing."""
+"""The loop of a campaign: workers and a stop decide nothing."""
 
 # mypy: no-strict-optional
 
@@ -8,20 +8,20 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from campaigning import campaign_settings, resume_campaign, run_campaign
+from plans import plan_for
 
 from merge_sumo.campaigns.journal import to_line
+from merge_sumo.campaigns.loop import AGE, GROUPS, SearchLoop
 from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, read_settings
-from merge_sumo.campaigns.scheduler import AGE, GROUPS, Scheduler
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.system.workers import InProcess, Workers, open_workers
+from merge_sumo.system.workers import Job, Workers, open_workers
 from merge_sumo.testing.contracts import episode
 from merge_sumo.verdict.criterion import PAPER_CRITERION
 from merge_sumo.verdict.episode import Episode
@@ -36,33 +36,30 @@ def played(case) -> Episode:
     return Episode(PAPER_CRITERION.outcome(0, 0, trajectory), trajectory)
 
 
-def ending_in(order: np.random.Generator):
-    """Return an evaluator without SUMO, where any of the chunks that run may end next."""
+class Played(Workers):
+    """Workers that play their cases without SUMO."""
 
-    def evaluate(chunks):
-        running, first = [], 0
-        while True:
-            chunk = next(chunks, None)
-            if chunk:
-                running.append((first, chunk))
-                first += len(chunk)
-            if not running:
-                return
-            if not chunk or order.random() < 0.3:
-                place, cases = running.pop(int(order.integers(len(running))))
-                yield place, [played(case) for case in cases]
+    def __init__(self, count: int) -> None:
+        super().__init__(None, count)
+        self.count = count
 
-    return evaluate
+    def collect(self, job: Job[Any, Any]) -> list[Any]:
+        return [played(case) for chunk in job.chunks for case in chunk]
 
 
-def searched(sampler, order: int = 0, workers: int = 1, cases: int = 70, **how: Any) -> list[bytes]:
-    """Return the lines of a search whose cases end in an order of their own."""
-    scheduler = Scheduler(sampler, cases, **how)
-    run = scheduler.run(
-        ending_in(np.random.default_rng(order)), Workers(InProcess, workers), whole=workers == 1
-    )
-    groups = [group for together in run for group in together]
-    return [to_line(one.outcome).encode() for group in groups for one in group]
+PLAN = plan_for("design1")
+
+
+def found(sampler, cases: int = 70, *, workers: int = 1, **how: Any) -> list[Episode]:
+    """Return the episodes of a search."""
+    groups: list[list[Episode]] = []
+    SearchLoop(sampler, PLAN, cases, workers=Played(workers), **how).run(groups.extend)
+    return [one for group in groups for one in group]
+
+
+def lines(episodes: list[Episode]) -> list[str]:
+    """Return the lines of a search."""
+    return [to_line(one.outcome) for one in episodes]
 
 
 class Asked(UniformSampler):
@@ -86,20 +83,18 @@ class Asked(UniformSampler):
 class TestRoom:
     """(cases of a group, cases told before, cases pending)"""
 
-    def asked(self, cases: int, *, order: int = 0, size: int = 40, **how: Any) -> list:
+    def asked(self, cases: int, *, size: int = 40, **how: Any) -> list:
         sampler = Asked()
         sampler.size = size
-        searched(sampler, order, cases=cases, **how)
+        found(sampler, cases, **how)
         return sampler.asked
 
-    @pytest.mark.parametrize("order", range(3))
-    def test_in_batches_is_for_one_group(self, order):
-        assert self.asked(5, batch=2, order=order) == [(2, 0, 0), (2, 2, 0), (1, 4, 0)]
-        assert self.asked(7, size=3, first=2, order=order) == [(2, 0, 0), (3, 2, 0), (2, 5, 0)]
+    def test_in_batches_is_for_one_group(self):
+        assert self.asked(5, batch=2) == [(2, 0, 0), (2, 2, 0), (1, 4, 0)]
+        assert self.asked(7, size=3, first=2) == [(2, 0, 0), (3, 2, 0), (2, 5, 0)]
 
-    @pytest.mark.parametrize("order", range(3))
-    def test_in_flight_is_for_n_cases(self, order):
-        asked = self.asked(6, in_flight=3, order=order)
+    def test_in_flight_is_for_n_cases(self):
+        asked = self.asked(6, in_flight=3)
         assert asked == [(1, 0, 0), (1, 0, 1), (1, 0, 2), (1, 1, 2), (1, 2, 2), (1, 3, 2)]
 
     def test_in_flight_of_one_is_for_one_case(self):
@@ -115,9 +110,9 @@ class TestRoom:
             assert not told or pending + n > most - most // GROUPS
         assert {n for n, *_ in asked if n > 1} > {2, 24 // GROUPS}
 
-    def test_has_no_end_where_outcomes_decide_nothing(self, monkeypatch):
+    def test_is_for_several_groups_where_outcomes_decide_nothing(self, monkeypatch):
         monkeypatch.setattr(Asked, "learns", False)
-        assert self.asked(5, batch=2) == [(2, 0, 0), (2, 0, 0), (1, 0, 0)]
+        assert self.asked(5, batch=2) == [(2, 0, 0), (2, 0, 2), (1, 0, 4)]
 
     def test_is_for_one_group_where_outcomes_may_end_the_search(self, monkeypatch):
         monkeypatch.setattr(Asked, "learns", False)
@@ -127,22 +122,15 @@ class TestRoom:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LEARNING)
-def test_a_search_depends_neither_on_the_order_of_ends_nor_on_workers_nor_on_a_stop(name):
-    def of(order: int, workers: int, history: list[Episode]) -> list[bytes]:
-        sampler = make_sampler(name, POOL, 3)
-        return searched(sampler, order, workers, cases=36, in_flight=20, history=history)
+def test_a_search_depends_neither_on_workers_nor_on_a_stop(name):
+    def of(**how: Any) -> list[Episode]:
+        return found(make_sampler(name, POOL, 3), 36, in_flight=20, **how)
 
-    kept: list[Episode] = []
-    run = Scheduler(make_sampler(name, POOL, 3), 36, in_flight=20).run(
-        ending_in(np.random.default_rng(0)), Workers(InProcess, 36)
-    )
-    for groups in run:
-        kept += [one for group in groups for one in group]
-    expected = [to_line(one.outcome).encode() for one in kept]
+    kept = of()
     assert [one.outcome.index for one in kept] == list(range(36))
-    assert of(1, 3, []) == of(2, 1, []) == expected
+    assert lines(of(workers=3)) == lines(kept)
     for end in ends_of_groups([one.outcome for one in kept])[1::12]:
-        assert of(end, 2, kept[:end]) == expected[end:]
+        assert lines(of(workers=2, history=kept[:end])) == lines(kept[end:])
 
 
 def ends_of_groups(outcomes) -> list[int]:
