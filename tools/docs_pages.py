@@ -102,7 +102,7 @@ def criteria_table() -> str:
 
 def formats_table() -> str:
     """Return the registered formats of export as a table."""
-    from merge_sumo.reports.formats import FORMATS
+    from merge_sumo.reports.exports import FORMATS
 
     rows = [f"| `{name}` | {one.about} |" for name, one in FORMATS.items()]
     return "\n".join(("| `--format` | written |", "|---|---|", *rows))

@@ -46,8 +46,6 @@ from merge_sumo.errors import UserError, notice
 from merge_sumo.reports import exports, figures
 from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
-from merge_sumo.reports.export_format import EXPORTS
-from merge_sumo.reports.formats import FORMATS
 from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.reproduction_page import write_reproduction
@@ -219,11 +217,14 @@ def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comp
 @verb(c.Export)
 def export(config: c.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
-    loaded, export_format = campaign_of(config.run).run, FORMATS[config.file_format]
+    if config.file_format not in exports.FORMATS:
+        known = ", ".join(exports.FORMATS)
+        raise UserError(f"there is no format {config.file_format!r}: choose one of {known}")
+    loaded, export_format = campaign_of(config.run).run, exports.FORMATS[config.file_format]
     indices = config.indices
     wanted = [indices] if isinstance(indices, int) else list(indices or ())
     if config.out is None:
-        below = dict.fromkeys((SCENARIOS, EXPORTS, export_format.below))
+        below = dict.fromkeys((SCENARIOS, exports.EXPORTS, export_format.below))
         check_own(*(loaded.folder / name for name in below))
     target = loaded.folder / export_format.below if config.out is None else Path(config.out)
     if export_format.write_table is not None:

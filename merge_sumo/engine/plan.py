@@ -16,7 +16,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.scenario import OWN, Scenario, lane_of
 from merge_sumo.system.workers import AnyWorkers
-from merge_sumo.verdict.criteria import CRITERIA
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.measures import MEASURES
 from merge_sumo.vuts.factory import VutFactory
@@ -39,7 +38,7 @@ def versions() -> dict[str, str]:
 
     Packages that bring measures or criteria are among it: records and verdicts depend on them.
     """
-    extensions = sorted({*MEASURES.packages, *CRITERIA.packages})
+    extensions = MEASURES.packages
     packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn", *extensions)
     return {"python": platform.python_version()} | {name: _installed(name) for name in packages}
 

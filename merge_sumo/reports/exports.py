@@ -10,6 +10,7 @@ import importlib
 import io
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -20,7 +21,6 @@ from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.reports.cases_toml import write_cases
-from merge_sumo.reports.export_format import ExportFormat
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
@@ -30,6 +30,7 @@ from merge_sumo.system.folders import check_new, check_place, make_place, new_fi
 from merge_sumo.verdict.bodies import WIDTH_M
 from merge_sumo.verdict.merge import merged_rows
 
+EXPORTS: Final = "exports"
 TABLE: Final = "trajectories"
 SEVERITY: Final = "severity"
 """Column with one of our words."""
@@ -259,13 +260,33 @@ def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
     return xosc.Vehicle(who, xosc.VehicleCategory.car, box, front, rear, 70.0, *limits)
 
 
-SUMO: Final = ExportFormat(
-    about="folders that sumo-gui replays", write_case=export_case, below=SCENARIOS
-)
-OPENSCENARIO: Final = ExportFormat(
-    about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
-)
-CSV: Final = ExportFormat(about="one table of motion", write_table=write_table)
-CASES: Final = ExportFormat(
-    about="one file to commit: at most 40 cases, or those named", write_table=write_cases
-)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExportFormat:
+    """A format of cases; one of the two functions writes it.
+
+    Attributes:
+        about: what is written, in a sentence without its full stop.
+        write_case: writes the case of an index into a new folder, and returns the file to open.
+        write_table: writes cases into a new file of a folder, and returns its path.
+        below: folder in that of the campaign, where no other is named.
+    """
+
+    about: str
+    write_case: WriteCase | None = None
+    write_table: Callable[[Run, Sequence[int], Path], Path] | None = None
+    below: str = EXPORTS
+
+
+FORMATS: Final = {
+    "sumo": ExportFormat(
+        about="folders that sumo-gui replays", write_case=export_case, below=SCENARIOS
+    ),
+    "openscenario": ExportFormat(
+        about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
+    ),
+    "csv": ExportFormat(about="one table of motion", write_table=write_table),
+    "cases": ExportFormat(
+        about="one file to commit: at most 40 cases, or those named", write_table=write_cases
+    ),
+}
+"""Formats by the name that follows `--format`."""

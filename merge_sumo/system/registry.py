@@ -1,4 +1,4 @@
-"""Registries: named objects of this package, and of installed packages by entry points.
+"""Registries of samplers, controllers and measures, of this package and by entry points.
 
 A registry names what it holds without importing it: names of this package stand in the registry,
 names of others in the metadata of installed packages. An object is imported when it is asked for.
@@ -27,36 +27,31 @@ OURS: Final = "merge-sumo"
 class Registry(Mapping[str, T], Generic[T]):
     """Objects of one kind by name: those of this package in their order, then installed ones.
 
-    It is read like a dictionary, but an unknown name, a name that two packages bring, and an
-    object that cannot be loaded or is of another kind raise `UserError`.
+    It is read like a dictionary. An unknown name, a name that stands twice, and an object that
+    cannot be loaded or is of another kind raise `UserError`.
+
+    Args:
+        group: group of entry points, as `merge_sumo.samplers`.
+        noun: what it holds, in the singular.
+        ours: objects of this package by name, or `module:attribute` for an import when needed.
+        accepts: whether a loaded object is of the kind.
+        contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
     """
 
     def __init__(
         self,
         group: str,
         noun: str,
-        ours: Mapping[str, str | T] | None = None,
+        ours: Mapping[str, str | T],
         *,
-        accepts: Callable[[object], bool] = lambda _: True,
-        contract: str = "",
+        accepts: Callable[[object], bool],
+        contract: str,
     ) -> None:
-        """Make a registry.
-
-        Args:
-            group: group of entry points, as `merge_sumo.samplers`.
-            noun: what it holds, in the singular.
-            ours: objects of this package by name, or `module:attribute` for an import when needed.
-            accepts: whether a loaded object is of the kind.
-            contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
-        """
         self.group, self.noun = group, noun
         self._accepts, self._contract = accepts, contract
-        self._ours = {
-            name: EntryPoint(name, item, group) if isinstance(item, str) else item
-            for name, item in (ours or {}).items()
-        }
-        self._objects: dict[tuple[str, str], T] = {}
-        self._registered: dict[str, T] = {}
+        self._ours: dict[str, EntryPoint | T] = {}
+        for name, item in ours.items():
+            self._ours[name] = EntryPoint(name, item, group) if isinstance(item, str) else item
 
     def register(self, name: str, item: T) -> T:
         """Add an object in this process; `UserError` where the name is taken.
@@ -65,7 +60,7 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         if name in self:
             raise UserError(f"the {self.noun} {name!r} is registered already: choose another name")
-        self._registered[name] = self._checked(name, item, "this process")
+        self._ours[name] = self._checked(name, item, "this process")
         return item
 
     @property
@@ -79,25 +74,23 @@ class Registry(Mapping[str, T], Generic[T]):
         return sorted({package for found in entries_of(self.group).values() for package in found})
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*self._ours, *self._registered, *entries_of(self.group))))
+        return iter(dict.fromkeys((*self._ours, *entries_of(self.group))))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        return name in self._ours or name in self._registered or name in entries_of(self.group)
+        return name in self._ours or name in entries_of(self.group)
 
     def __getitem__(self, name: str) -> T:
         bringers: dict[str, EntryPoint | T] = dict(entries_of(self.group).get(name, {}))
         if name in self._ours:
             bringers[OURS] = self._ours[name]
-        if len(bringers) + (name in self._registered) > 1:
+        if len(bringers) > 1:
             packages = " and ".join(sorted(bringers))
             raise UserError(
                 f"{packages} bring a {self.noun} {name!r}: uninstall all but one of them"
             )
-        if name in self._registered:
-            return self._registered[name]
         if not bringers:
             raise UserError(
                 f"there is no {self.noun} {name!r}: {meant(name, self)}choose one of "
@@ -106,12 +99,6 @@ class Registry(Mapping[str, T], Generic[T]):
         ((package, entry),) = bringers.items()
         if not isinstance(entry, EntryPoint):
             return entry
-        key = name, entry.value
-        if key not in self._objects:
-            self._objects[key] = self._loaded(entry, package)
-        return self._objects[key]
-
-    def _loaded(self, entry: EntryPoint, package: str) -> T:
         try:
             item = entry.load()
         except (Exception, SystemExit) as error:
@@ -119,7 +106,7 @@ class Registry(Mapping[str, T], Generic[T]):
                 f"the {self.noun} {entry.name!r} of {package} cannot be loaded from "
                 f"{entry.value}: {type(error).__name__}: {error}"
             ) from error
-        return self._checked(entry.name, item, package)
+        return self._checked(name, item, package)
 
     def _checked(self, name: str, item: T, package: str) -> T:
         if not self._accepts(item):

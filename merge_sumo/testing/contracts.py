@@ -11,9 +11,6 @@ A contract needs no pytest to be imported, and no SUMO unless it says so.
 
 from __future__ import annotations
 
-import json
-import math
-import tempfile
 from contextlib import closing
 from dataclasses import replace
 from functools import cache
@@ -29,33 +26,22 @@ from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import Povs
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.errors import UserError
-from merge_sumo.reports.export_format import ExportFormat
-from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
-from merge_sumo.scenario.case import Case, FloatArray, MergeCase, Pool, ToldCase, from_unit
+from merge_sumo.scenario.case import Case, FloatArray, MergeCase, Pool, ToldCase
 from merge_sumo.scenario.imperfection import Sensing
-from merge_sumo.scenario.kinds import SCENARIO_KINDS, scenario_of_record
 from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.world import World
 from merge_sumo.system.scratch import ScratchFolder
-from merge_sumo.verdict.criteria import NamedCriterion
 from merge_sumo.verdict.criterion import Criterion
 from merge_sumo.verdict.measures import Measure
-from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.factory import VutFactory
 
 __all__ = [
-    "CriterionContract",
-    "ExportContract",
     "MeasureContract",
-    "ReportSectionContract",
     "SamplerContract",
-    "ScenarioKindContract",
     "VutContract",
     "assert_sees_late",
     "episode",
@@ -113,21 +99,6 @@ class MeasureContract:
         assert np.array_equal(before, trajectory.motion)
 
 
-class CriterionContract:
-    """What a campaign relies on in a named criterion.
-
-    Attributes:
-        criterion: the criterion under test.
-    """
-
-    criterion: NamedCriterion
-
-    def test_some_cases_fail_and_others_do_not(self) -> None:
-        """`check` refuses a condition that no case meets, or every one."""
-        Criterion(self.criterion.condition).check(US23)
-        assert self.criterion.about
-
-
 _kept: Final[list[ScratchFolder]] = []
 """Folders that stay until the process ends."""
 
@@ -140,67 +111,6 @@ def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
     folder = Path(scratch.name) / "run"
     keywords: dict[str, Any] = {"level": 0, "sampler": "uniform", "cases": 20, "seed": 1}
     return api.campaign(vut, out=folder, scenario=scenario, progress=False, **keywords).run
-
-
-class ScenarioKindContract:
-    """What a campaign relies on in a kind of scenario, which is registered.
-
-    Attributes:
-        scenario_kind: the subclass of `Scenario` under test.
-        vut: what drives in it.
-    """
-
-    scenario_kind: type[Any]
-    vut: str = "level0"
-
-    def test_is_read_back_from_its_record(self) -> None:
-        """The record of a run names the kind."""
-        scenario = self.scenario_kind()
-        assert SCENARIO_KINDS[self.scenario_kind.kind] is self.scenario_kind
-        assert scenario_of_record(json.loads(json.dumps(scenario.to_record()))) == scenario
-
-    def test_has_coordinates_with_names(self) -> None:
-        """Maps and tables show them, and a case has a field for each."""
-        scenario = self.scenario_kind()
-        for level in scenario.levels:
-            middle = np.full((1, len(scenario.dimensions(level))), 0.5)
-            (case,) = from_unit(middle, level, scenario=scenario)
-            assert len(case.starts()) == scenario.vehicles
-            for dimension in scenario.dimensions(level):
-                assert dimension.field in scenario.notation
-                assert dimension.low < getattr(case, dimension.field) < dimension.high
-
-    def test_refuses_cases_that_make_no_scenario(self) -> None:
-        """A coordinate that is no number is a `UserError`."""
-        scenario = self.scenario_kind()
-        for name in {dimension.field for dimension in scenario.dimensions(0)}:
-            middle = {d.field: (d.low + d.high) / 2.0 for d in scenario.dimensions(0)}
-            try:
-                scenario.case_type(level=0, scenario=scenario, **{**middle, name: math.nan})
-            except UserError:
-                continue
-            raise AssertionError(f"{name} of NaN is accepted")
-
-    def test_says_of_every_corridor_whether_its_episode_has_ended(self) -> None:
-        """The engine asks for all K at once."""
-        scenario = self.scenario_kind()
-        ended = scenario.has_ended(*np.zeros((2, scenario.vehicles, 3)))
-        assert ended.shape == (3,)
-        assert ended.dtype == np.bool_
-
-    def test_runs_in_sumo(self) -> None:
-        """No case ends in an error, and some are tested."""
-        run = campaign_of(self.vut, self.scenario_kind())
-        ends = [outcome.measures.end for outcome in run.outcomes]
-        assert not [end for end in ends if end.is_error]
-        assert [end for end in ends if end.is_tested]
-
-    def test_outcomes_are_read_back_from_their_records(self) -> None:
-        """A line of `outcomes.jsonl` says everything."""
-        scenario = self.scenario_kind()
-        for outcome in campaign_of(self.vut, scenario).outcomes:
-            line = json.dumps(outcome.to_record())
-            assert Outcome.from_json(line, scenario) == outcome
 
 
 LATE_STEPS: Final = 2
@@ -285,69 +195,3 @@ class VutContract:
         first, second = (VutFactory.of(self.vut) for _ in range(2))
         assert first == second
         assert first.files == second.files
-
-
-class ExportContract:
-    """What `merge-sumo export` relies on in a format.
-
-    Attributes:
-        export_format: the format under test.
-    """
-
-    export_format: ExportFormat
-
-    def written(self, folder: Path) -> Path:
-        """Return the path that the format says it has written below a folder."""
-        run, export_format = campaign_of(), self.export_format
-        if export_format.write_table is not None:
-            return export_format.write_table(run, [0, 3], folder)
-        assert export_format.write_case is not None
-        return export_format.write_case(run, 3, folder, road_of())
-
-    def test_writes_below_the_folder_that_it_is_told(self) -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            path = self.written(Path(scratch) / "new")
-            assert path.is_relative_to(Path(scratch) / "new")
-            assert path.stat().st_size
-
-    def test_writes_the_same_bytes_again(self) -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            paths = [self.written(Path(scratch) / name) for name in ("a", "b")]
-            assert paths[0].read_bytes() == paths[1].read_bytes()
-
-    def test_replaces_nothing(self) -> None:
-        with tempfile.TemporaryDirectory() as scratch:
-            path = self.written(Path(scratch) / "new")
-            path.write_bytes(b"of somebody else")
-            try:
-                self.written(Path(scratch) / "new")
-            except UserError:
-                assert path.read_bytes() == b"of somebody else"
-            else:
-                raise AssertionError("another file in its place is a UserError")
-
-
-class ReportSectionContract:
-    """What the page relies on in a section.
-
-    Attributes:
-        section: the section under test.
-    """
-
-    section: ReportSection
-
-    def html(self) -> str:
-        """Return the section of a campaign; "" where it is left out."""
-        return self.section.html(ReportModel(campaign_of()))
-
-    def test_is_one_section_or_nothing(self) -> None:
-        html = self.html().strip()
-        assert not html or html.count("<section") == html.count("</section>") == 1
-
-    def test_loads_and_runs_nothing(self) -> None:
-        """The policy of the page would stop it."""
-        html = self.html().lower()
-        assert not [word for word in ("<script", "<style", " src=", "javascript:") if word in html]
-
-    def test_is_the_same_again(self) -> None:
-        assert self.html() == self.html()

@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-from merge_sumo.system.registry import Registry
-
 PAPER: Final = "paper"
 
 
@@ -18,22 +16,16 @@ class NamedCriterion:
     about: str  # what fails, in a phrase
 
 
-CRITERIA: Final[Registry[NamedCriterion]] = Registry(
-    "merge_sumo.criteria",
-    "criterion",
-    {
-        PAPER: NamedCriterion(
-            "score < -500",
-            "the front bumpers are within 6 m as the VUT reaches M: a contact or a conflict",
-        ),
-        "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
-        "unsafe": NamedCriterion(
-            "clearance_m <= 0 or brake_after_mps2 > 3",
-            "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "
-            "No. 79 lets a lane change demand of others",
-        ),
-    },
-    accepts=lambda item: isinstance(item, NamedCriterion),
-    contract="a merge_sumo.verdict.criteria.NamedCriterion",
-)
-"""Criteria by the name that a person writes after `fail_when`."""
+CRITERIA: Final = {
+    PAPER: NamedCriterion(
+        "score < -500",
+        "the front bumpers are within 6 m as the VUT reaches M: a contact or a conflict",
+    ),
+    "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
+    "unsafe": NamedCriterion(
+        "clearance_m <= 0 or brake_after_mps2 > 3",
+        "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "
+        "No. 79 lets a lane change demand of others",
+    ),
+}
+"""Criteria by the name that follows `fail_when`."""

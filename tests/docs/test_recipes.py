@@ -78,19 +78,7 @@ RECIPES = {
             '<h2 id="thanks">Thanks</h2><p>{{ vut }} drove {{ run.outcomes | length }} cases.</p>'
             "</section>\n"
         },
-        more={"reports/report_sections.py": {'"about"]': '"thanks", '}},
-    ),
-    "a kind of scenario": Recipe(
-        new={
-            "scenario/leader.py": (ROOT / "tests/plugin/merge_sumo_braking.py")
-            .read_text(encoding="utf-8")
-            .replace('= "braking"', '= "leader"')
-        },
-        more={
-            "scenario/kinds.py": {
-                'MergeScenario.kind: "': '"leader": "merge_sumo.scenario.leader:BrakingScenario", '
-            }
-        },
+        more={"reports/report_sections.py": {'    "about",\n': '    "thanks",\n'}},
     ),
     "an option of `campaign` that reaches the engine": Recipe(
         more={
@@ -148,7 +136,6 @@ def ran(folder: Path, *words: str) -> str:
         ("a sampler", 2),
         ("a built-in VUT with two parameters", 1),
         ("a section of the report", 2),
-        ("a kind of scenario", 2),
         ("an option of `campaign` that reaches the engine", 2),
     ],
 )
@@ -173,9 +160,3 @@ def test_a_campaign_has_what_the_recipes_add(copied):
     assert (settings["sampler"], settings["scenario"]["late_m"]) == ("corner", 50.0)
     page = (copied / "run/report.html").read_text(encoding="utf-8")
     assert "drove 8 cases." in page
-
-
-@pytest.mark.slow
-def test_a_scenario_file_names_the_new_kind(copied):
-    (copied / "brakes.toml").write_text('kind = "leader"\nname = "brakes"\n', encoding="utf-8")
-    assert "lane of all vehicles" in ran(copied, "scenario", "check", "brakes.toml")

@@ -2,28 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
-from merge_sumo.reports.export_format import ExportFormat
-from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.report_sections import ReportSection
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import POV, VUT
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.system.folders import check_new, make_place, new_file
 from merge_sumo.verdict.bodies import CentreLines
-from merge_sumo.verdict.criteria import NamedCriterion
 from merge_sumo.verdict.measures import Measure
 from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
 
@@ -58,7 +48,6 @@ CLOSEST = Measure(
     worse="low",
     of=closest_m,
 )
-NEAR = NamedCriterion("closest_m < 4", "front bumpers within 4 m at any time")
 
 
 class ConstantDriver(Driver):
@@ -92,35 +81,4 @@ CONSTANT = VutKind(
     what="one acceleration in every step",
     example="--vut constant:0.5",
     prepare=constant_vut,
-)
-
-
-def write_endings(run: Run, indices: Sequence[int], folder: Path) -> Path:
-    """Write how cases ended as lines of JSON; return the path of the file."""
-    path = folder / "endings.jsonl"
-    check_new(path)
-    make_place(folder)
-    with new_file(path) as file:
-        for index in indices:
-            ending = {"case": index, "end": run.outcome(index).measures.end.value}
-            file.write(f"{json.dumps(ending)}\n".encode())
-    return path
-
-
-ENDINGS = ExportFormat(about="lines of JSON with the end of each case", write_table=write_endings)
-
-
-def closest_words(model: ReportModel) -> dict[str, Any] | None:
-    """Return the closest approach of a campaign; None where it was not measured."""
-    values = [outcome.measures.value("closest_m") for outcome in model.run.outcomes]
-    known = [value for value in values if value is not None]
-    return {"closest": min(known)} if known else None
-
-
-CLOSEST_APPROACH = ReportSection(
-    template=(
-        '<section aria-labelledby="closest"><h2 id="closest">Closest approach</h2>\n'
-        '<p>{{ vut }} came as near as {{ "%.1f" | format(closest) }} m to the POV.</p></section>'
-    ),
-    words=closest_words,
 )

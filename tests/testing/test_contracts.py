@@ -7,10 +7,7 @@ from build_fmu import build_fmu, compiler
 from conftest import require, some
 from networks import constant_network
 
-from merge_sumo.reports.formats import FORMATS
-from merge_sumo.reports.report_sections import SECTIONS
-from merge_sumo.testing import CriterionContract, ExportContract, ReportSectionContract, VutContract
-from merge_sumo.verdict.criteria import CRITERIA
+from merge_sumo.testing import VutContract
 
 VUTS = (
     "level0",
@@ -56,24 +53,6 @@ def spec_of(tmp_path_factory):
         return name
 
     return spec
-
-
-class TestEveryCriterion(CriterionContract):
-    @pytest.fixture(autouse=True, params=list(CRITERIA))
-    def _subject(self, request):
-        self.criterion = CRITERIA[request.param]
-
-
-class TestEveryFormat(ExportContract):
-    @pytest.fixture(autouse=True, params=list(FORMATS))
-    def _subject(self, request):
-        self.export_format = FORMATS[request.param]
-
-
-class TestEverySection(ReportSectionContract):
-    @pytest.fixture(autouse=True, params=list(SECTIONS))
-    def _subject(self, request):
-        self.section = SECTIONS[request.param]
 
 
 class TestVuts(VutContract):
