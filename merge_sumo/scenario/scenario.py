@@ -158,7 +158,7 @@ V_VUT0_MPS: Final = 18.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scenario:
-    """What every kind of scenario has; a kind is a subclass, registered in `SCENARIO_KINDS`.
+    """What every scenario has; `MergeScenario` is the merge.
 
     A kind says what its cases are (`case_type`, `notation`, `case_fields`), which roads they need
     (`pov_edges`, `vut_edges`), when an episode ends (`has_ended`) and what is measured of it
@@ -193,7 +193,7 @@ class Scenario:
     """
 
     kind: ClassVar[str]
-    """Name of the kind in `SCENARIO_KINDS`."""
+    """Name of the class in a record."""
     case_type: ClassVar[type[Any]]
     """The `Case` of the kind."""
     measures: ClassVar[Callable[..., Any] | None]
