@@ -5,7 +5,6 @@ The trajectories of a group go first, so that every outcome on disk has its traj
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -20,7 +19,6 @@ import numpy as np
 
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.run import (
-    CHECKSUM,
     FILES,
     IN_VAIN,
     OUTCOMES,
@@ -29,7 +27,6 @@ from merge_sumo.campaigns.run import (
     TRAJECTORIES,
     Run,
     batch_file,
-    settings_sha256,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.signals import to_record
@@ -182,14 +179,12 @@ def _encoded(group: Sequence[Episode]) -> tuple[bytes, bytes]:
         index=np.array([o.index for o in outcomes]),
         rows=np.array([len(motion) for motion in motions]),
         motion=np.concatenate([motion.reshape(len(motion), -1) for motion in motions]),
-        lines_sha256=hashlib.sha256(lines).hexdigest(),
     )
     return lines, arrays.getvalue()
 
 
 def _settings_text(settings: dict[str, Any]) -> bytes:
-    record = {**settings, CHECKSUM: settings_sha256(settings)}
-    return to_json(record, indent=2)
+    return to_json(settings, indent=2)
 
 
 def _lock(outcomes: io.FileIO, folder: Path) -> None:

@@ -1,26 +1,19 @@
 """The folder of a campaign, as any process reads it; `Journal` (`journal.py`) writes it.
 
-campaign.json             every resolved setting, versions, hashes, and the hash of itself
+campaign.json             every resolved setting, versions, hashes of net and controllers
 outcomes.jsonl            one line per case, in order, synced after every batch
-trajectories/00007.npz    the motion of every case of a batch, and the hash of its lines
+trajectories/00007.npz    the motion of every case of a batch
 
 against/                  the same of the earlier version, where a campaign is against one
-
-A bit that flips on a disk or in a copy shows in the hashes, and in arrays in the checksums of the
-zip archive. Folders of older versions, without hashes, are read as they are.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
 from collections import Counter
 from collections.abc import Container, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -37,7 +30,8 @@ from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
-from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
+from merge_sumo.system.folders import regular
 from merge_sumo.system.printable import counted, printable, quoted
 from merge_sumo.system.records import Record, convert, decode, read_indexed
 from merge_sumo.verdict.chance import one_per_case
@@ -63,7 +57,7 @@ TALLIES: Final = (RAN_AGAIN, IN_VAIN)
 FILES: Final = ("vut_files", "pov_files")
 """Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
 CHECKSUM: Final = "sha256"
-"""Key of `campaign.json`: the hash of all other keys with their values."""
+"""Key of `campaign.json` of earlier versions, which is not read."""
 FARTHEST: Final = 1e9
 """No position, speed or acceleration of ours, in m, m/s and m/s2, is as large."""
 
@@ -153,7 +147,6 @@ class Run:
                     f"case {outcome.index} in {folder / OUTCOMES} is not judged by the criterion "
                     f"that {SETTINGS} names, {self.criterion.text}"
                 )
-        _check_lines(folder, text, self.outcomes)
 
     @property
     def levels(self) -> list[int]:
@@ -349,12 +342,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
         raise _no_campaign(folder, error) from error
     except UserError as error:
         raise UserError(f"{path} is no campaign's: {error}") from error
-    written = settings.pop(CHECKSUM, None)
-    if written is not None and written != settings_sha256(settings):
-        raise UserError(
-            f"{path} is not as it was written: take it from a copy; if it was you who changed it, "
-            f'remove its "{CHECKSUM}"'
-        )
+    settings.pop(CHECKSUM, None)
     return settings
 
 
@@ -387,12 +375,8 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
     other line that is not the outcome of its place is an error that names the line.
     """
     outcomes: list[Outcome] = []
-    torn = not text.endswith(b"\n") and bool(text)
-    for number, line in enumerate(io.BytesIO(text), start=1):
-        if not line.endswith(b"\n"):
-            if _is_whole(line[:-1]):
-                raise UserError(f"line {number} of {name} does not end as it was written")
-            break
+    *lines, rest = text.split(b"\n")
+    for number, line in enumerate(lines, start=1):
         try:
             outcome = Outcome.from_json(line, scenario)
             if outcome.index != number - 1:
@@ -402,7 +386,7 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
                 f"line {number} of {name} is not the outcome of case {number - 1}: {error}"
             ) from error
         outcomes.append(outcome)
-    return outcomes, torn
+    return outcomes, bool(rest)
 
 
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
@@ -448,15 +432,6 @@ def _no_campaign(folder: Path, error: OSError) -> UserError:
     return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
 
 
-def _is_whole(line: bytes) -> bool:
-    """Return whether bytes are a line: of one that was being written, no part is."""
-    try:
-        decode(line)
-    except UserError:
-        return False
-    return True
-
-
 def _motion_by_case(
     vehicles: int, index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
 ) -> dict[int, FloatArray]:
@@ -480,31 +455,3 @@ def _signals_by_case(
         raise ValueError(f"the signals are {text.dtype} of shape {text.shape}")
     runs = decode(text.tobytes(), dict[str, SignalRuns])
     return {int(index): from_runs(of, len(motion[int(index)])) for index, of in runs.items()}
-
-
-def _check_lines(folder: Path, text: bytes, outcomes: list[Outcome]) -> None:
-    """Raise `UserError` where the lines of a batch are not those that were written with it.
-
-    Where the batch's file is gone or spoilt there is nothing to hold them against.
-    """
-    lines = list(io.BytesIO(text))
-    for batch, group in groupby(outcomes, key=lambda outcome: outcome.batch):
-        indices = [outcome.index for outcome in group]
-        first, end = indices[0], indices[-1] + 1
-        path = batch_file(folder, batch)
-        try:
-            written = read_arrays(path, "index", "lines_sha256")
-        except UNREADABLE_NPZ:
-            continue
-        stopped = end == len(outcomes) and len(indices) < written["index"].size
-        of_batch = hashlib.sha256(b"".join(lines[first:end])).hexdigest()
-        if not stopped and of_batch != str(written["lines_sha256"]):
-            raise UserError(
-                f"lines {first + 1} to {end} of {folder / OUTCOMES} are not those that were "
-                f"written with {path.name}: take both files from a copy, or run the campaign again"
-            )
-
-
-def settings_sha256(settings: dict[str, Any]) -> str:
-    """Return the hash of settings: what `CHECKSUM` says of them."""
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
-import stat
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final
@@ -16,6 +14,7 @@ from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDri
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.system.folders import read_limited
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.records import Record, convert, decode
 from merge_sumo.system.resources import resource
@@ -71,7 +70,7 @@ def policies_in(folder: str | Path) -> Path:
             return shipped
         if (Path(folder) / MANIFEST).is_file():
             return Path(folder).resolve()
-        what = "has no manifest" if Path(folder).is_dir() else "is no folder"
+        what = "has no manifest" if Path(folder).is_dir() else "is not a folder"
     except (OSError, ValueError, RuntimeError) as error:
         what = f"cannot be read ({getattr(error, 'strerror', None) or error})"
     raise UserError(
@@ -95,7 +94,7 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
     if not path.is_file():
         return {}
     try:
-        networks = decode(_content(path), _Manifest).networks
+        networks = decode(read_limited(path, MOST_BYTES), _Manifest).networks
         known = {name: networks[name] for name in NETWORKS if name in networks}
         for entry in known.values():
             convert(entry.get("sha256"), str)
@@ -139,21 +138,10 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
         raise UserError(f"there is no policy {name!r}{how_to_train(folder)}")
     path = folder / f"{name}.safetensors"
     try:
-        content = _content(path)
+        content = read_limited(path, MOST_BYTES)
     except OSError as error:
         raise UserError(f"cannot read the policy {path}: {error.strerror}") from error
     return _parse(content, str(path), str(entry.get("sha256")), name)
-
-
-def _content(path: Path) -> bytes:
-    """Return the bytes of a file; OSError where it is none, or too large."""
-    found = path.stat()
-    if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "it is no file", str(path))
-    if found.st_size > MOST_BYTES:
-        told = f"it has {found.st_size:,} bytes, and at most {MOST_BYTES:,} are read"
-        raise OSError(errno.EFBIG, told, str(path))
-    return path.read_bytes()
 
 
 def how_to_train(folder: Path) -> str:

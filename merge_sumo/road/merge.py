@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
 from merge_sumo.system.resources import resource
 
@@ -40,7 +40,7 @@ def road_of(
     Raises `UserError` when the file is no plain file, is no SUMO net, or has no such merge.
     """
     path = net or default_net_path()
-    content = received.read_net(path)
+    content = read_xml(path, "the net")
     edges = tuple(mainline), tuple(ramp)
     key = (path, hashlib.sha256(content).hexdigest(), *edges, room_after_m, lane_m)
     if key not in _found:

@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Final
 
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.road import allowed, received
+from merge_sumo.road.xml_input import NET_TAGS, parse_xml, read_xml
 from merge_sumo.system.suggestions import meant
 
 VEHICLE_CLASS: Final = "passenger"
@@ -28,6 +28,8 @@ JUNCTION_TYPES: Final = (
     *("right_before_left", "left_before_right", "traffic_light", "traffic_light_unregulated"),
     *("traffic_light_right_on_red", "rail_signal", "rail_crossing"),
 )
+FARTHEST_M: Final = 2e7
+"""Largest coordinate and length in a net: half way round the earth, in metres of UTM."""
 MAP_OPTIONS: Final = {"osm": "--osm-files", "OpenDRIVE": "--opendrive-files"}
 """Options by which netconvert reads a map, by the root of its file."""
 
@@ -73,7 +75,7 @@ class Link:
 
 
 class NetFile:
-    """The lanes and connections of a net, as far as `allowed.ROAD_NET` lists them.
+    """The lanes and connections of a net.
 
     Raises `UserError` when the file cannot be read, is no SUMO net, or has a wrong value.
     """
@@ -81,14 +83,14 @@ class NetFile:
     def __init__(self, path: Path, content: bytes | None = None) -> None:
         """Read the file at `path`, or take its unpacked content."""
         self.path = path
-        self.content = received.read_net(path) if content is None else content
-        try:
-            self._root = allowed.road_net(self.content, path)
-        except received.OtherRootError as error:
-            option = MAP_OPTIONS.get(error.tag)
-            made = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
-            how = made if option else ""
-            raise UserError(f"{path} is no SUMO net: it does not begin with <net>{how}") from error
+        self.content = read_xml(path, "the net") if content is None else content
+        self._root = parse_xml(self.content, f"the net {path}", NET_TAGS)
+        if self._root.tag != "net":
+            option = MAP_OPTIONS.get(self._root.tag)
+            how = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
+            raise UserError(
+                f"{path} is no SUMO net: it does not begin with <net>{how if option else ''}"
+            )
         self._edges = {str(edge.get("id")): edge for edge in self._root.iterfind("edge")}
         self._known: dict[str, Lane] = {}
 
@@ -97,10 +99,15 @@ class NetFile:
         """Hash of the unpacked bytes: a packed net is the same road."""
         return hashlib.sha256(self.content).hexdigest()
 
+    @property
+    def edges(self) -> list[str]:
+        """Ids of the edges, those inside of junctions left out, in order."""
+        return sorted(name for name in self._edges if not name.startswith(":"))
+
     def lanes(self, edge: str) -> tuple[Lane, ...]:
         """Return the lanes of an edge on which cars may drive; `UserError` when there is none."""
         if edge not in self._edges or edge.startswith(":"):
-            named = sorted(name for name in self._edges if not name.startswith(":"))
+            named = self.edges
             few = f"it has {', '.join(named)}" if named and len(named) <= SHOWN_EDGES else ""
             hint = f"{meant(edge, named, ALIKE_EDGES)}{few}".strip()
             hint = f": {hint}" if hint else ""
@@ -270,8 +277,8 @@ def _lane(lane: etree._Element) -> Lane:
     name = str(lane.get("id"))
     numbers = float(lane.get("length", "")), float(lane.get("speed", ""))
     shape = tuple(_point(text) for text in lane.get("shape", "").split())
-    if not all(map(math.isfinite, [*numbers, *(n for point in shape for n in point)])):
-        raise ValueError("not finite")
+    if not all(abs(number) <= FARTHEST_M for number in chain(numbers, *shape)):
+        raise ValueError(f"not within {FARTHEST_M:g}")
     return Lane(
         id=name,
         edge=name.rpartition("_")[0],

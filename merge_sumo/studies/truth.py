@@ -20,8 +20,8 @@ from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.scenario import OWN, Scenario, level_name
-from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays, regular
-from merge_sumo.system.folders import check_own, check_place, make_place, replace_own
+from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
+from merge_sumo.system.folders import check_own, check_place, make_place, regular, replace_own
 from merge_sumo.system.hashing import Files, changed
 from merge_sumo.system.records import decode
 from merge_sumo.system.resources import cache_folder

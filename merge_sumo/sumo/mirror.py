@@ -15,8 +15,8 @@ import msgspec
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.road import allowed, received
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.road.xml_input import harmless_net, to_bytes
 from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
@@ -57,8 +57,7 @@ def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
     Raises:
         UserError: if the net cannot be read.
     """
-    net = allowed.road_net(received.read_net(road.path), road.path)
-    (folder / NET).write_bytes(received.serialize(net))
+    (folder / NET).write_bytes(to_bytes(harmless_net(road.path)))
     (folder / TYPES).write_bytes(_types(road, scenario))
     (folder / ROAD).write_bytes(msgspec.json.encode(road, enc_hook=str))
 

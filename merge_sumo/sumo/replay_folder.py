@@ -18,14 +18,14 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.road import received
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.colours import rgb
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, level_name
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 from merge_sumo.system.folders import write_folder
@@ -46,6 +46,8 @@ LABELS: Final = "labels.add.xml"
 RECORD: Final = "episode.fcd.xml"
 VIEW: Final = "view.settings.xml"
 CASE: Final = "case.json"
+SCENARIO: Final = "scenario"
+"""Key of the scenario in that file, beside those of the outcome."""
 SPEED_LIMIT_MPS: Final = 200.0
 """Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
 
@@ -116,12 +118,20 @@ class Road:
 def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder and return the path of its configuration.
 
-    Raises `UserError` when something else is there or it cannot be written (`write_folder`).
+    Args:
+        folder: the new folder.
+        road: the road of the scenario.
+        outcome: the outcome of the case.
+        trajectory: its motion.
+
+    Raises:
+        UserError: something else is there, or it cannot be written.
     """
     written = _road(road, folder)
-    record, lines = _fcd(written.corridor, trajectory), lines_of(outcome, trajectory)
-    case = to_json(outcome.to_record(), indent=2)
-    write_folder(folder, {CASE: case, **files_of(written, _types(trajectory), record, lines)})
+    scenario = outcome.case.scenario.to_record() | {"net": None}
+    case = to_json({SCENARIO: scenario, **outcome.to_record()}, indent=2)
+    record = motion_record(written.corridor, trajectory)
+    write_folder(folder, {CASE: case, **files_of(written, outcome, trajectory, record)})
     return folder / CONFIG
 
 
@@ -132,62 +142,66 @@ def _road(road: Corridor, folder: Path) -> Road:
         return Road(shipped.path.read_bytes(), shipped, NET)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     content = hosted_net(fast, 1, lane_goes_on=True)
-    _, lane_end_m = fast.lane_m or (0.0, 0.0)
-    found = corridor_of_hosted(content, folder / HOSTED_NET, lane_end_m)
-    return Road(content, found, HOSTED_NET)
-
-
-def corridor_of_shipped(content: bytes, path: Path) -> Corridor:
-    """Find the corridor in a net with the edges of the shipped one; `UserError` if it has none."""
-    return find_corridor(NetFile(path, content), MAINLINE_EDGES, RAMP_EDGES)
+    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET, fast.lane_m), HOSTED_NET)
 
 
 def _fast(path: LanePath) -> LanePath:
     return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
 
 
-def corridor_of_hosted(content: bytes, path: Path, lane_end_m: float = 0.0) -> Corridor:
-    """Find the corridor in the net of a folder; `UserError` when it has none.
+def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Corridor:
+    """Find the corridor in the net of a folder.
 
-    An acceleration lane ends at the coordinate `lane_end_m`.
+    Args:
+        content: the net.
+        path: its file, for messages.
+        lane_m: begin and end of the acceleration lane of its scenario.
+
+    Raises:
+        UserError: the net has no such corridor.
     """
-    edges = re.findall(rb'<edge [^>]*\bid="((main|ramp|out)([0-9]{1,4})\.0)"', content)
-    main, ramp, out = (
-        [name.decode() for name, of, _ in sorted(edges, key=lambda e: int(e[2])) if of == kind]
-        for kind in (b"main", b"ramp", b"out")
-    )
-    # Without a ramp both vehicles drive on one path, beside which the net has nothing.
-    is_one_path = len(main + out) == len(re.findall(rb'<edge [^>]*\bid="[^:"]', content))
-    has_lane = re.search(rb'<edge [^>]*\bid="%b"' % re.escape(LANE_EDGE).encode(), content)
-    lane = [LANE_EDGE] if has_lane else []
-    paths = main + lane + out, (main if is_one_path else ramp) + lane + out
+    net = NetFile(path, content)
+    numbered: dict[str, dict[int, str]] = {"main": {}, "ramp": {}, "out": {}}
+    for name in net.edges:
+        if found := re.fullmatch(r"(main|ramp|out)([0-9]{1,4})[.]0", name):
+            numbered[found[1]][int(found[2])] = name
+    main, ramp, out = ([names[n] for n in sorted(names)] for names in numbered.values())
+    # Without a ramp both vehicles drive on one path, and the net has nothing else.
+    is_one_path = len(main) + len(out) == len(net.edges)
+    lane = [] if lane_m is None else [LANE_EDGE]
     return find_corridor(
-        NetFile(path, content),
-        *paths,
+        net,
+        main + lane + out,
+        (main if is_one_path else ramp) + lane + out,
         room_after_m=0.0,
         edge_at_m=out[0] if out else None,
-        lane_m=(lane_end_m, lane_end_m) if lane else None,
+        lane_m=lane_m and (lane_m[1], lane_m[1]),
     )
 
 
 def files_of(
-    road: Road, types: etree._Element, record: etree._Element, lines: Sequence[str]
+    road: Road, outcome: Outcome, trajectory: Trajectory, record: etree._Element
 ) -> dict[str, bytes]:
-    """Return all that SUMO reads, the configuration last.
+    """Return what SUMO reads of an episode by the names of the files, the configuration last.
 
     Args:
-        road: the road that is driven on.
-        types: vehicle types of the cars.
-        record: positions and speeds of the cars.
-        lines: texts above the road, without which there are no labels.
+        road: the road of the folder.
+        outcome: the outcome of the case.
+        trajectory: its motion.
+        record: what SUMO plays of that (`motion_record`).
     """
-    picture, given = _picture(road, record), {TYPES: types}
-    if lines:
-        given[LABELS] = _labels(lines, [str(vtype.get("id")) for vtype in types], picture)
-    view = view_settings(picture.viewport, borders=picture.borders)
-    config = _config(road, [*given], len(record))
-    roots = {**given, RECORD: record, VIEW: view, CONFIG: config}
-    return {road.file: road.net} | {name: received.serialize(r) for name, r in roots.items()}
+    picture = _picture(road, record)
+    roots = {
+        TYPES: _types(trajectory),
+        LABELS: _labels(outcome, trajectory, picture),
+        RECORD: record,
+        VIEW: view_settings(picture.viewport, borders=picture.borders),
+        CONFIG: _config(road, len(record)),
+    }
+    files = {road.file: road.net}
+    for name, root in roots.items():
+        files[name] = to_bytes(root)
+    return files
 
 
 def _types(trajectory: Trajectory) -> etree._Element:
@@ -214,7 +228,8 @@ def _types(trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def _fcd(road: Corridor, trajectory: Trajectory) -> etree._Element:
+def motion_record(road: Corridor, trajectory: Trajectory) -> etree._Element:
+    """Return the motion as SUMO's floating car data, with the last row held."""
     root = etree.Element("fcd-export")
     rows = [*zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True)]
     rows += [rows[-1]] * HOLD_STEPS
@@ -307,10 +322,10 @@ def _box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
     return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
 
 
-def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Element:
+def _config(road: Road, timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     sections = {
-        "input": {"net-file": road.file, "additional-files": ",".join(additional)},
+        "input": {"net-file": road.file, "additional-files": f"{TYPES},{LABELS}"},
         "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
         "processing": {
             "collision.action": "none",
@@ -337,16 +352,13 @@ def _config(road: Road, additional: Sequence[str], timesteps: int) -> etree._Ele
     return root
 
 
-def lines_of(outcome: Outcome, trajectory: Trajectory) -> list[str]:
-    """Return what is written above the road: the case and its cause."""
+def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree._Element:
+    """Return the case, its cause and a legend of the cars as an additional file."""
     words = cause(outcome, trajectory).removesuffix(".")
     if outcome.measures.end.is_error:
-        words = words.partition(":")[0]  # A message may hold what labels may not.
-    return [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
-
-
-def _labels(lines: Sequence[str], cars: Sequence[str], picture: Picture) -> etree._Element:
-    """Return lines, and a legend of the cars, as an additional file."""
+        words = words.partition(":")[0]  # a message may hold anything
+    lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
+    cars = VEHICLES[: outcome.case.scenario.vehicles]
     root = etree.Element("additional")
     for number, (line, height) in enumerate(zip(lines, LINES, strict=False)):
         at = picture.x_m, picture.y_m + height * picture.height_m

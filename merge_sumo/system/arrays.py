@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import io
 import struct
 import tokenize
@@ -13,6 +12,8 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from merge_sumo.system.folders import regular
 
 UNREADABLE_NPZ: Final = (
     *(OSError, EOFError, ValueError, TypeError, KeyError, IndexError, AttributeError),
@@ -32,10 +33,3 @@ def read_arrays(file: Path | io.BytesIO, *names: str) -> dict[str, NDArray[Any]]
         if any(member.compress_type != zipfile.ZIP_STORED for member in data.zip.infolist()):
             raise ValueError("it is compressed")
         return {name: data[name] for name in names or data.files}
-
-
-def regular(path: Path) -> Path:
-    """Return the path of what is to be read; OSError where it is a pipe or a device."""
-    if path.exists() and not path.is_file():
-        raise OSError(errno.EINVAL, "it is no file", str(path))
-    return path

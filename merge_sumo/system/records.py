@@ -36,7 +36,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.arrays import regular
+from merge_sumo.system.folders import read_limited, regular
 from merge_sumo.system.suggestions import meant
 
 T = TypeVar("T")
@@ -52,6 +52,8 @@ WORDS: Final[dict[Any, str]] = {
     tuple[str, ...]: "a list of texts",
 }
 """Types of fields in words; another type is a table of names and values."""
+MAX_RECORD_BYTES: Final = 1 << 28
+"""A larger JSON file is not read."""
 MAX_TOML_BYTES: Final = 1 << 20
 """A larger file is not read, and so not written: some 6,000 cases."""
 _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
@@ -89,7 +91,7 @@ def read_record(path: Path, kind: type[T]) -> T | None:
     Raises `UserError` for a file that is not as it was written.
     """
     try:
-        known: T = decode(regular(path).read_bytes(), kind)
+        known: T = decode(read_limited(path, MAX_RECORD_BYTES), kind)
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -99,14 +101,15 @@ def read_record(path: Path, kind: type[T]) -> T | None:
     return known
 
 
-def convert(record: object, kind: type[T]) -> T:
+def convert(record: object, kind: type[T], *, strict: bool = True) -> T:
     """Return plain values, as JSON and TOML have them, as a value of a type.
 
-    Raises `RecordError` for other values, and for names that a dataclass does not have.
+    Where not `strict`, texts may stand for numbers, as in XML. Raises `RecordError` for other
+    values, and for names that a dataclass does not have.
     """
     _check_names(record, kind)
     try:
-        return msgspec.convert(record, kind)
+        return msgspec.convert(record, kind, strict=strict)
     except msgspec.ValidationError as error:
         raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
@@ -176,7 +179,7 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     """
     try:
         if not path.is_file():
-            raise UserError(f"cannot read the {what} {path}: it is no file")
+            raise UserError(f"cannot read the {what} {path}: it is not a file")
         if (size := path.stat().st_size) > MAX_TOML_BYTES:
             raise UserError(f"cannot read the {what} {path}: {_too_large(size)}")
         text = path.read_text(encoding="utf-8")

@@ -17,7 +17,7 @@ from calling import contents
 from campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import CHECKSUM, OUTCOMES, SETTINGS, TRAJECTORIES, Run
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.system import interrupt
@@ -154,9 +154,8 @@ class TestWhatDiffers:
 
 
 def edit(folder: Path, where: tuple[str, ...], value) -> None:
-    """Change a value of campaign.json, as a person may who removes its checksum."""
+    """Change a value of campaign.json, as a user may."""
     record = json.loads((folder / SETTINGS).read_text())
-    del record[CHECKSUM]
     inner = record
     for key in where[:-1]:
         inner = inner[key]

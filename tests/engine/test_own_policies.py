@@ -144,9 +144,9 @@ class TestAFolder:
         [
             ("gone", ""),
             ("another", ""),
-            ("a pipe", "it is no file"),
-            ("a folder", "it is no file"),
-            ("a giant", f"it has {MOST_BYTES + 1:,} bytes, and at most {MOST_BYTES:,} are read"),
+            ("a pipe", "it is not a file"),
+            ("a folder", "it is not a file"),
+            ("a giant", f"it is larger than {MOST_BYTES // 2**20} MiB"),
         ],
     )
     def test_whose_networks_are_not_those_of_its_manifest_leaves_nothing(

@@ -21,9 +21,9 @@ from lxml import etree
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
-from merge_sumo.road import received
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.xml_input import MAX_BYTES
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -216,13 +216,13 @@ def replaced(old: str, new: str):
 FAR_EDGES = "".join(
     f'<edge id="x{n}" from="a{n}" to="b{n}"><lane id="x{n}_0" index="0" speed="9" length="9" '
     f'shape="0,{n} 9,{n}"/></edge>'
-    for n in range(received.MAX_ELEMENTS // 4)
+    for n in range(1250)
 )
 FAR_JUNCTIONS = "".join(
     f'<junction id="a{n}" type="dead_end" x="0" y="{n}" incLanes="" intLanes="" shape="0,0 0,1"/>'
     f'<junction id="b{n}" type="dead_end" x="9" y="{n}" incLanes="x{n}_0" intLanes="" '
     'shape="0,0 0,1"/>'
-    for n in range(received.MAX_ELEMENTS // 4)
+    for n in range(1250)
 )
 ODD = {
     "packed": packed,
@@ -278,7 +278,7 @@ class TestRoadOf:
         ("content", "said"),
         [
             (
-                gzip.compress(b"<net>" + b" " * received.MAX_NET_BYTES, mtime=0),
+                gzip.compress(b"<net>" + b" " * MAX_BYTES, mtime=0),
                 "unpacked it is larger than",
             ),
             (
@@ -318,5 +318,5 @@ class TestRoadOf:
 
     def test_opens_nothing_that_is_no_plain_file(self, tmp_path):
         os.mkfifo(tmp_path / "fifo")
-        with pytest.raises(UserError, match="no plain file"):
+        with pytest.raises(UserError, match="it is not a file"):
             road_of(tmp_path / "fifo", ["a", "b"], ["c", "b"])

@@ -369,7 +369,7 @@ def test_no_file_is_written_over_and_what_is_none_is_refused(file, command_line,
     assert_refused(command_line("rerun", file), "its index is there twice")
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
-    assert_refused(command_line("rerun", tmp_path / "pipe"), "it is no file")
+    assert_refused(command_line("rerun", tmp_path / "pipe"), "it is not a file")
     assert_refused(command_line("rerun", tmp_path / "noise.toml"), "is no text in UTF-8")
 
 

@@ -1,0 +1,136 @@
+"""XML files of others, read as data: without entities and document types, and within limits.
+
+SUMO's files can name other files, devices and addresses, and SUMO reads and writes all of them. So
+SUMO gets no file that was received: replays and campaigns write their own net from what is read
+here, and where SUMO has to have the whole net it gets `harmless_net`.
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import re
+import zlib
+from pathlib import Path
+from typing import Final
+
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.system.folders import read_limited
+
+MAX_BYTES: Final = 2**28
+"""Of a file, unpacked: the net of a city has 50 MB."""
+MAX_ELEMENTS: Final = 4_000_000
+"""Of a file: the net of a city has 500,000."""
+GZIP: Final = b"\x1f\x8b"
+"""First bytes of a gzip file."""
+NET_TAGS: Final = frozenset(
+    {
+        *("net", "location", "edge", "lane", "junction", "request", "connection", "roundabout"),
+        *("tlLogic", "phase"),
+    }
+)
+"""Elements of a net that describe the road. None of them names a file but a projection."""
+RECORD_TAGS: Final = frozenset(("fcd-export", "timestep", "vehicle"))
+PROJECTION: Final = re.compile(
+    r"[!.-]|(\+(no_defs|south|(proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
+    r"|x_0|y_0|type|towgs84)=[\w.,-]{1,80})( |$))+",
+    re.ASCII,
+)
+"""Projections that name no file."""
+
+
+def read_xml(path: Path, what: str) -> bytes:
+    """Return the bytes of an XML file, unpacked where it is packed by gzip.
+
+    Every command and every kind of controller reads nets here, so all take the same ones.
+
+    Args:
+        path: the file.
+        what: what messages call it.
+
+    Raises:
+        UserError: it is not a regular file, cannot be unpacked, or is larger than `MAX_BYTES`.
+    """
+    try:
+        content = read_limited(path, MAX_BYTES)
+        if content.startswith(GZIP):
+            with gzip.open(io.BytesIO(content)) as packed:
+                content = packed.read(MAX_BYTES + 1)
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise UserError(f"cannot unpack {what} {path} ({error}): copy or pack it again") from error
+    except OSError as error:
+        raise UserError(f"cannot read {what} {path}: {error.strerror}") from error
+    if len(content) > MAX_BYTES:
+        size = f"{MAX_BYTES // 2**20} MiB"
+        raise UserError(f"cannot read {what} {path}: unpacked it is larger than {size}")
+    return content
+
+
+def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element:
+    """Return the elements of an XML file that have one of the tags, as a tree.
+
+    Args:
+        content: the file.
+        name: what messages call it.
+        tags: the elements that are kept, with the root's.
+
+    Raises:
+        UserError: it is not UTF-8 or XML, or it has entities, a document type, or more elements
+            than `MAX_ELEMENTS`.
+    """
+    try:
+        content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{name} is not readable XML: save it as UTF-8") from error
+    if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
+        raise UserError(f"{name} declares a document type or an entity: remove the declaration")
+    elements = etree.iterparse(
+        io.BytesIO(content),
+        # Another encoding, as the file may declare, could hide what is looked for above.
+        encoding="utf-8",
+        remove_comments=True,
+        remove_pis=True,
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        huge_tree=False,
+    )
+    try:
+        for number, (_, element) in enumerate(elements, start=1):
+            if number > MAX_ELEMENTS:
+                raise UserError(f"{name} has more than {MAX_ELEMENTS} elements")
+            if element.tag not in tags:
+                element.clear()
+    except etree.XMLSyntaxError as error:
+        reason = str(error.msg).encode("ascii", "backslashreplace").decode()
+        raise UserError(f"{name} is not readable XML: {reason:.200}") from error
+    root: etree._Element = elements.root
+    for element in [element for element in root.iter() if element.tag not in tags]:
+        parent = element.getparent()
+        if parent is not None:
+            parent.remove(element)
+    return root
+
+
+def harmless_net(path: Path) -> etree._Element:
+    """Return the road of a net file, without what could name a file or an address.
+
+    Raises:
+        UserError: it cannot be read.
+    """
+    root = parse_xml(read_xml(path, "the net"), f"the net {path}", NET_TAGS)
+    for name in map(str, root.keys()):
+        if name.startswith("{"):
+            del root.attrib[name]  # the place of a schema
+    for location in root.iterfind("location"):
+        if not PROJECTION.fullmatch(location.get("projParameter", "!")):
+            location.set("projParameter", "!")
+    return root
+
+
+def to_bytes(root: etree._Element) -> bytes:
+    """Return a tree as an XML file."""
+    etree.indent(root, space="    ")
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
