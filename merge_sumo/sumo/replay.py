@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
-from lxml import etree
 from msgspec import Meta
 
 from merge_sumo.errors import UserError, notice
@@ -119,7 +118,7 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
         ended = run_program("sumo", arguments, stage)
         if ended.code != 0:
             raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
-        replayed = _rows(etree.parse(stage / REPLAYED).getroot(), "SUMO's replay")
+        replayed = _record(stage / REPLAYED, f"SUMO's replay of {folder}")
     recorded = {at: row for at, row in episode.rows.items() if at.step >= first}
     fault = _difference(recorded, replayed) or _broken_motion(episode)
     diverged_at_s, detail = fault or (None, "")
@@ -156,7 +155,7 @@ def open_gui(folder: Path, from_s: float | None = None) -> int:
 Place = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
 
 
-class Recorded(Record, frozen=True, forbid_unknown_fields=False):
+class RecordedMotion(Record, frozen=True, forbid_unknown_fields=False):
     """The motion of a vehicle at a step, as SUMO's floating car data has it."""
 
     id: Literal["pov", "vut", "ahead", "behind"]
@@ -174,7 +173,7 @@ class At(NamedTuple):
     who: str
 
 
-class _Place(NamedTuple):
+class _Position(NamedTuple):
     path: LanePath
     x_m: float
     """Lane coordinate on it."""
@@ -197,7 +196,7 @@ class _Episode:
     road: Road
     outcome: Outcome
     trajectory: Trajectory
-    rows: Mapping[At, tuple[Recorded, _Place]]
+    rows: Mapping[At, tuple[RecordedMotion, _Position]]
 
 
 def _read(folder: Path) -> _Episode:
@@ -249,19 +248,19 @@ def _road(path: Path, outcome: Outcome) -> Road:
     return Road(hosted_net(corridor, 1, lane_goes_on=True), corridor, HOSTED_NET)
 
 
-def _placed(path: Path, road: Road, outcome: Outcome) -> dict[At, tuple[Recorded, _Place]]:
+def _placed(path: Path, road: Road, outcome: Outcome) -> dict[At, tuple[RecordedMotion, _Position]]:
     """Return the rows of a record with their places on the paths.
 
     The VUT has the lanes of the ramp, and that of the mainline beside an acceleration lane.
     """
     name = f"the record {path}"
-    root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
-    if not MIN_TIMESTEPS <= len(root) <= MAX_TIMESTEPS:
-        raise UserError(f"{name} must have from {MIN_TIMESTEPS} to {MAX_TIMESTEPS} timesteps")
-    rows = _rows(root, name)
+    rows = _record(path, name)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
-    if rows.keys() != {At(step, who) for step in range(len(root)) for who in cars}:
-        raise UserError(f"{name} must have {', '.join(cars)} every {DT_S:g} s")
+    steps = max(len(rows) // len(cars), MIN_TIMESTEPS)
+    if rows.keys() != {At(step, who) for step in range(steps) for who in cars}:
+        raise UserError(
+            f"{name} must have {', '.join(cars)} every {DT_S:g} s, in {MIN_TIMESTEPS} or more rows"
+        )
     main, ramp = (
         {piece.lane: (path, piece.start_m) for piece in path.pieces}
         for path in (road.corridor.mainline, road.corridor.ramp)
@@ -272,13 +271,16 @@ def _placed(path: Path, road: Road, outcome: Outcome) -> dict[At, tuple[Recorded
         if row.lane not in lanes:
             raise UserError(f"{name} has {at.who} on lane {row.lane:.40}, which is not on its path")
         of, start_m = lanes[row.lane]
-        placed[at] = row, _Place(of, start_m + row.pos)
+        placed[at] = row, _Position(of, start_m + row.pos)
     return placed
 
 
-def _rows(root: etree._Element, name: str) -> dict[At, Recorded]:
+def _record(path: Path, name: str) -> dict[At, RecordedMotion]:
     """Return the rows of floating car data; `UserError` where one has a wrong value."""
-    rows: dict[At, Recorded] = {}
+    root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
+    if not len(root) <= MAX_TIMESTEPS:
+        raise UserError(f"{name} has {len(root)} timesteps, and at most {MAX_TIMESTEPS} are read")
+    rows: dict[At, RecordedMotion] = {}
     for timestep in root:
         try:
             time_s = float(timestep.get("time", ""))
@@ -289,7 +291,7 @@ def _rows(root: etree._Element, name: str) -> dict[At, Recorded]:
             raise UserError(f"{name} has a timestep at {time_s:g} s: there is one every {DT_S:g} s")
         for vehicle in timestep:
             try:
-                row = convert(dict(vehicle.items()), Recorded, strict=False)
+                row = convert(dict(vehicle.items()), RecordedMotion, strict=False)
             except UserError as error:
                 raise UserError(f"{name}, at {step * DT_S:.1f} s: {error}") from error
             if At(step, row.id) in rows:
@@ -321,7 +323,7 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
 
 
 def _difference(
-    recorded: Mapping[At, tuple[Recorded, _Place]], replayed: Mapping[At, Recorded]
+    recorded: Mapping[At, tuple[RecordedMotion, _Position]], replayed: Mapping[At, RecordedMotion]
 ) -> tuple[float, str] | None:
     """Return when and in what a replay first differs from the record, or None."""
     for at, (row, place) in recorded.items():

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import errno
-import os
-import threading
 from contextlib import suppress
 from typing import Final
 
@@ -12,10 +10,6 @@ from merge_sumo.errors import UserError
 
 ADDRESS_SPACE_GIB: Final = 2.0
 """Below this SUMO, or the libraries of linear algebra, end the process without a word."""
-OWN_THREADS: Final = 6
-"""Of the command itself: a bar that is drawn, what a program prints, the cases that run ahead."""
-MOST_TRIED: Final = 512
-"""More threads are not tried: that would take longer than a person may notice."""
 EXHAUSTED: Final = {
     errno.EMFILE: "too many files are open: raise the limit (`ulimit -n`)",
     errno.ENFILE: "too many files are open in the whole system: close some of its programs",
@@ -31,11 +25,7 @@ EXHAUSTED: Final = {
 
 
 def check_limits() -> None:
-    """Raise `UserError` where this process may not have the threads or the memory that it takes.
-
-    OpenBLAS starts a thread for each core when NumPy is imported, and ends the process where that
-    fails.
-    """
+    """Raise `UserError` where this process may not have the memory that it takes."""
     with suppress(ImportError):  # Windows
         import resource
 
@@ -45,28 +35,6 @@ def check_limits() -> None:
                 f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: it takes "
                 f"{ADDRESS_SPACE_GIB:g} GiB or more"
             )
-    check_threads((os.cpu_count() or 1) + OWN_THREADS)
-
-
-def check_threads(count: int) -> None:
-    """Raise `UserError` where the system does not let this user have so many more threads.
-
-    Processes count as threads. What multiprocessing starts waits for ever where one of its threads
-    cannot be started, so that this has to be known before.
-    """
-    end = threading.Event()
-    started: list[threading.Thread] = []
-    try:
-        for _ in range(min(count, MOST_TRIED)):
-            thread = threading.Thread(target=end.wait, daemon=True)
-            thread.start()
-            started.append(thread)
-    except RuntimeError as error:
-        raise UserError(EXHAUSTED[errno.EAGAIN]) from error
-    finally:
-        end.set()
-        for thread in started:
-            thread.join()
 
 
 def lower_limits(**most: int) -> None:

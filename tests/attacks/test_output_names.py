@@ -20,8 +20,7 @@ from writers import INTO_FOLDERS, PLACES, WRITERS
 
 import merge_sumo as ms
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path
@@ -32,18 +31,15 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.workers import Workers
 from merge_sumo.training import helix
 
-NAMELESS = ["", ".", "./..", "theirs/..", "missing/../.."]
+NAMELESS = ["", ".", "theirs/..", "/", "/.."]
 BELOW = ["file/new", "dangling/new", "loop/new", "pipe/new"]
 TOO_LONG = ["é" * 128, "/".join(["d" * 200] * 30)]
 NOT_SAYABLE = ["nul\0byte", "half\ud800"]
 """Only Python can say these."""
 ODD = [
-    *("x" * 255, "é" * 127, " ", "a b", " lead", "trail ", "a%b", "%41", "100%s", "${HOME}"),
-    *("$HOME", "$(id)", "`id`", ";ls", "a&b", "|", ">x", "<x>", "*", "?", "[a]", "{a,b}", "a:b"),
-    *("a=b", "#a", "!a", "~", "~root", "-", "--", "-rf", "--help", "a'b", 'a"b', "a\\b", "\\"),
-    *("\n", "a\nb", "\r", "\t", "\x1b[31mred", "\x07", "\x7f", "日本", "é", "e\u0301", "\u202eabc"),
-    *("\u200b", "\xa0", "😀", "...", ". .", ".hidden", "..a", "a..", os.fsdecode(b"\xff\xfe")),
-    *("new/sub", "new/deep/er", "./new3", "theirs/new4", "missing/../new8", "campaign.json"),
+    *("x" * 255, "é" * 127, " ", " lead", "a%41", "${HOME}", "$(id)", "`id`", ";ls", ">x", "*"),
+    *("a:b", "-", "-rf", "--help", "a'b", "a\\b", "\n", "\x1b[31mred", "\x7f", "日本", "\u202eabc"),
+    *("...", ".hidden", os.fsdecode(b"\xff\xfe"), "new/sub", "missing/../new8", "campaign.json"),
 ]
 
 
@@ -138,7 +134,7 @@ def test_a_file_has_a_name_by_which_others_know_what_it_is(world, no_cases, comm
     assert tree(world) == before
 
 
-@pytest.mark.parametrize("name", some(ODD, "a b", "$(id)", "-rf", "\x1b[31mred", "日本", "new/sub"))
+@pytest.mark.parametrize("name", some(ODD, "$(id)", "-rf", "\x1b[31mred", "日本", "new/sub"))
 def test_an_odd_name_is_a_name(world, command_line, name):
     before = tree(world)
     code, _, err = command_line("export", "run", 0, f"--out={name}")
@@ -157,12 +153,6 @@ def test_a_name_that_no_file_can_have_is_refused(world, no_cases, name):
         ms.campaign("design1", level=0, cases=2, sampler="uniform", out=name)
     assert printable(str(refused.value))
     assert tree(world) == before
-
-
-@pytest.mark.parametrize("name", ["/", "//", "///", "/.", "/..", "/../.."])
-def test_a_name_of_the_root_is_refused_by_its_looks(name):
-    with pytest.raises(UserError, match="write the name of what is to be made"):
-        folders.check_new(Path(name))
 
 
 FILES = {"first": b"12345", "empty": b"", "last": b"67"}
@@ -202,10 +192,11 @@ class TestAFolderOfFiles:
     @pytest.mark.parametrize(
         "make",
         [
-            *(PLACES[name] for name in ("a dangling link", "a file", "a folder")),
-            lambda out: (out.mkdir(), (out / "first").mkdir()),
-            lambda out: (out.mkdir(), (out / "first").write_text("124")),
-            lambda out: (out.mkdir(), (out / "first").write_text("123456")),
+            *(
+                PLACES[name]
+                for name in ("a dangling link", "a file", "a folder", "an empty folder")
+            ),
+            lambda out: (out.mkdir(), (out / "first").write_text("12345")),
             lambda out: (out.mkdir(), (out / "first").symlink_to("../ours")),
         ],
     )
@@ -306,13 +297,6 @@ class TestAReceivedFolder:
             resume_campaign(received)
         assert tree(received.parent) == before
 
-    def test_with_a_link_that_waits_for_new_settings_writes_nowhere_else(self, received):
-        (received / f".{SETTINGS}").symlink_to("../theirs/thesis")
-        with Journal.reopen(received)[0] as journal:
-            journal.rewrite_settings(settings := {**Run(received).record, "cases": 70})
-        assert (received.parent / "theirs" / "thesis").read_text() == "theirs"
-        assert read_settings(received) == settings
-
     @pytest.mark.parametrize("kind", THEIRS)
     @pytest.mark.parametrize("name", OURS)
     def test_keeps_what_is_somebodys_in_every_place(self, received, no_cases, name, kind):
@@ -338,16 +322,6 @@ class TestAReceivedFolder:
         OURS[name](received)
         assert (received / name).read_bytes() == first
 
-    def test_keeps_a_folder_of_somebodys_in_the_place_of_a_scenario(self, received):
-        worst, second, *_ = failures(Run(received).outcomes)
-        shutil.rmtree(received / SCENARIOS)
-        theirs = received / SCENARIOS / case_name(worst.index)
-        theirs.parent.mkdir()
-        PLACES["a folder"](theirs)
-        resume_campaign(received)
-        assert {path.name: path.read_text() for path in theirs.iterdir()} == {"notes": "theirs"}
-        assert (received / SCENARIOS / case_name(second.index) / "replay.sumocfg").is_file()
-
 
 class TestAFolderOfPolicies:
     @pytest.mark.parametrize(
@@ -367,19 +341,6 @@ class TestAFolderOfPolicies:
             helix.train_library(tmp_path, ("pov1",), scenario=US23)
         assert tree(tmp_path) == before
 
-    def test_that_was_begun_is_gone_on_with(self, tmp_path, monkeypatch):
-        asked: list[Path] = []
-
-        def train(folder: Path, *_: object) -> list:
-            asked.append(folder)
-            return []
-
-        monkeypatch.setattr(helix, "_train_in_parallel", train)
-        for _ in range(2):
-            helix.train_library(tmp_path / "new", ("pov1",), scenario=US23)
-            (tmp_path / "new" / "pov1.training.jsonl").write_text("{}\n")
-        assert asked == [tmp_path / "new"] * 4, "two levels, twice"
-
 
 def test_a_name_in_a_command_is_read_by_a_shell_as_it_is():
     names = [name for name in ODD if name.isprintable() or "\x1b" in name]
@@ -398,32 +359,22 @@ class TestTheLinkToTheNewestRun:
             (tmp_path / "runs" / name).mkdir(parents=True)
         return Path("runs")
 
-    def test_is_made_and_moves_on_to_newer_ones_only(self, runs):
+    def test_moves_on_to_newer_dated_runs_only(self, runs):
+        for name in ("mine", "c-20260101-000009"):
+            folders.link_latest(runs / name)
+            assert not os.path.lexists(runs / "latest")
         for newest in ("a-20260101-000000", "b-20260101-000001"):
             folders.link_latest(runs / newest)
             assert str((runs / "latest").readlink()) == newest
         folders.link_latest(runs / "a-20260101-000000")
         assert str((runs / "latest").readlink()) == "b-20260101-000001"
-        assert len(list(runs.iterdir())) == 4, "nothing of ours is left beside it"
+        assert len(list(runs.iterdir())) == 4, "nothing else is left"
 
     @pytest.mark.parametrize(
-        "make",
-        [
-            *(PLACES[name] for name in ("a folder", "a file")),
-            lambda path: path.symlink_to("mine"),
-            lambda path: path.symlink_to("../elsewhere"),
-            lambda path: path.symlink_to("a-20260101-000000/x"),
-        ],
+        "make", [PLACES["a folder"], PLACES["a file"], lambda path: path.symlink_to("mine")]
     )
-    def test_does_not_take_the_place_of_somebody_elses(self, runs, make):
+    def test_does_not_take_the_place_of_something_else(self, runs, make):
         make(runs / "latest")
         before = tree(runs)
         folders.link_latest(runs / "b-20260101-000001")
         assert tree(runs) == before
-
-    @pytest.mark.parametrize(
-        "folder", ["runs/mine", "elsewhere/a-20260101-000000", "runs/c-20260101-000009"]
-    )
-    def test_is_not_made_for_what_has_a_name_of_its_own_or_is_not_there(self, runs, folder):
-        folders.link_latest(Path(folder))
-        assert not os.path.lexists(runs / "latest")

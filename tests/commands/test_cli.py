@@ -54,7 +54,7 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
             (("--level", "-1"), ("'-1'", "0, 1, 2, several")),
             (("--cases", "0"), ("--cases is 0",)),
             (("--gate", "failure"), ("choose failures",)),
-            (("--junit", "gone/junit.xml"), ("--junit", "there is not a folder gone")),
+            (("--junit", "gone/junit.xml"), ("--junit", "there is no folder gone")),
             (("--workers", "two"), ("'two'", "tcp://HOST:PORT")),
             (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
             (("--seed", "-1"), ("--seed is -1",)),

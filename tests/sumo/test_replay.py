@@ -279,8 +279,8 @@ def without_vut(record: etree._Element) -> None:
 
 
 CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
-    (many(HOLD_STEPS), "must have from 11 to 1511 timesteps"),
-    (many(MAX_TIMESTEPS + 1), "must have from 11 to 1511 timesteps"),
+    (many(HOLD_STEPS), "in 11 or more rows"),
+    (many(MAX_TIMESTEPS + 1), "has 1512 timesteps, and at most 1511 are read"),
     (lambda record: record[ROW].set("time", "4.05"), "at 4.05 s: there is one every 0.1 s"),
     (lambda record: record[ROW].attrib.pop("time"), "without a time"),
     (lambda record: record[ROW].append(copy.deepcopy(record[ROW][1])), "two rows of vut at 4 s"),
