@@ -87,7 +87,7 @@ class TestAFolderThatVanishes:
 
     def test_with_trajectories_ends_it_and_keeps_the_outcomes(self, tmp_path):
         # Not uniform: its batches run ahead, and those that end together are written together.
-        gone = Vanishing(tmp_path / "run" / "trajectories", at=25)
+        gone = Vanishing(tmp_path / "run" / "trajectories", at=15)
         with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
             run_campaign(replace(SETTINGS, sampler="annealing"), tmp_path / "run", on_case=gone)
         assert len(Run(tmp_path / "run").outcomes) == 20

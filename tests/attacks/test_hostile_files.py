@@ -22,8 +22,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.road.xml_input import MAX_BYTES
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.sumo import mirror
 from merge_sumo.sumo import replay as replay_module
-from merge_sumo.sumo import shadow_sumo
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import Replay, open_gui, replay
@@ -265,7 +265,7 @@ def test_of_a_hostile_net_nothing_reaches_sumo_or_an_export(scene, name):
     path = scene.folder / "hostile.net.xml"
     path.write_text(text)
     (scene.folder / "shadow").mkdir()
-    for file in (shadow_sumo.NET, shadow_sumo.TYPES, shadow_sumo.SETUP):
+    for file in (mirror.NET, mirror.TYPES, mirror.ROAD):
         (scene.folder / "shadow" / file).touch()
 
     def use() -> bytes:
@@ -277,8 +277,8 @@ def test_of_a_hostile_net_nothing_reaches_sumo_or_an_export(scene, name):
     result = scene.come_to(use)
     assert isinstance(result, bytes) == (name in HARMLESS), result
     if name in HARMLESS:
-        shadow_sumo.write_files(scene.folder / "shadow", road_of(path), US23)
-        for content in (result, (scene.folder / "shadow" / shadow_sumo.NET).read_bytes()):
+        mirror.write_files(scene.folder / "shadow", road_of(path), US23)
+        for content in (result, (scene.folder / "shadow" / mirror.NET).read_bytes()):
             assert not [
                 word for word in (*scene.names.values(), SECRET) if word.encode() in content
             ]

@@ -43,8 +43,7 @@ from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.system.arrays import regular
-from merge_sumo.system.folders import check_own, make_place, replace_own
+from merge_sumo.system.folders import check_own, make_place, regular, replace_own
 from merge_sumo.system.printable import counted
 from merge_sumo.system.records import decode
 from merge_sumo.system.result import Result
