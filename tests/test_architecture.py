@@ -170,7 +170,7 @@ def unsafe_calls(source: str) -> list[str]:
 
 
 REMOVERS = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
-MAY_REMOVE = {"merge_sumo.system.folders", "merge_sumo.system.scratch", "merge_sumo.vuts.fmu"}
+MAY_REMOVE = {"merge_sumo.system.folders", "merge_sumo.system.scratch"}
 """The first asks what is ours; the second removes temporary folders of ours that no process locks;
 the third removes what was unpacked for it."""
 

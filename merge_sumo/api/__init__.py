@@ -91,7 +91,7 @@ from merge_sumo.system.records import check_toml_size, to_plain
 from merge_sumo.system.result import Shown
 from merge_sumo.system.workers import open_workers
 from merge_sumo.verdict.conflict import check_from
-from merge_sumo.vuts.base import Car, Seen
+from merge_sumo.vuts.controller import Car, Seen
 from merge_sumo.vuts.in_memory import AnyVut, drivers_of
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.python import SeenBatch

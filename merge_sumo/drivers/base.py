@@ -98,26 +98,15 @@ class Scene(NamedTuple):
 
 
 class VutLostError(Exception):
-    """A driver has lost the state of its corridors: their episodes have to begin anew.
+    """A driver has lost the state of its corridors: their episodes have to begin again.
 
     Attributes:
         reason: what happened.
-        corridor: whose doing it was; None where nobody knows.
-        final: whether the case whose doing it was would do it again; a process that died may have
-            died of what came before.
-        killed: whether SIGKILL ended its process.
     """
 
-    def __init__(
-        self,
-        reason: str,
-        corridor: int | None = None,
-        *,
-        final: bool = False,
-        killed: bool = False,
-    ) -> None:
+    def __init__(self, reason: str) -> None:
         super().__init__(reason)
-        self.reason, self.corridor, self.final, self.killed = reason, corridor, final, killed
+        self.reason = reason
 
 
 class PovLostError(VutLostError):

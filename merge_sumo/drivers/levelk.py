@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,7 +54,19 @@ _HORIZON_S: Final = 20.0
 _GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
 
 
-def actions_mps2(scenario: Scenario) -> FloatArray:
+class AccelerationLimits(Protocol):
+    """Least and largest acceleration, m/s2, as of a scenario."""
+
+    @property
+    def a_min_mps2(self) -> float:
+        """Least acceleration."""
+
+    @property
+    def a_max_mps2(self) -> float:
+        """Largest acceleration."""
+
+
+def actions_mps2(scenario: AccelerationLimits) -> FloatArray:
     """Return the accelerations of the actions of a learned driver, (7,), in rising order.
 
     In the paper's scenario they are the whole numbers from -4 to +2 m/s2.

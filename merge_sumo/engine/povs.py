@@ -240,8 +240,7 @@ class PovAdapter(DriverWrapper):
         try:
             return self._driver.act(other)
         except VutLostError as lost:
-            how = {"final": lost.final, "killed": lost.killed}
-            raise PovLostError(lost.reason, lost.corridor, **how) from lost
+            raise PovLostError(lost.reason) from lost
 
 
 def seen_from(case: Case, car: int) -> Case:

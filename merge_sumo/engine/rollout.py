@@ -19,8 +19,6 @@ from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
 from merge_sumo.scenario.signals import Left, series
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 from merge_sumo.sumo.world import SimulationError, World
-from merge_sumo.system.blame import Blame
-from merge_sumo.system.pulse import Pulse
 
 RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
@@ -35,8 +33,9 @@ WRONGS: Final = (Exception, SystemExit)
 OF_THE_POV: Final = "the POV: "
 """Begins the reason of an error that is the doing of a POV."""
 
-MOST_PAUSES: Final = 2
-"""So often an error of an episode is put down to this process having been stopped."""
+MAX_DEATHS: Final = 2
+"""A case that ends the process of its controller this often, alone, is at fault: once may have come
+from outside."""
 
 END_OF_ROAD_M: Final = 20.0
 """No vehicle is followed up to where the road ends."""
@@ -71,20 +70,18 @@ def rollout(
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
-    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR; where that took the
-    memory of the others' controllers with it, they begin anew. When SUMO fails, the episodes that
-    were running end as SIM_ERROR, SUMO is started again, and the others go on.
-
-    `system/blame.py` says whose doing a death is; an error that comes when this process was stopped
-    is nobody's.
+    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR. Where that ended the
+    process of the controllers, the running episodes begin again, one by one; an episode that ends
+    it twice, alone, is at fault. When SUMO fails, the episodes that were running end as
+    SIM_ERROR, SUMO is started again, and the others go on.
 
     Args:
         world: the corridors.
         pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
         vut: drives the VUT of each corridor.
         cases: cases of the world's scenario.
-        ran_again: gets the places of cases that ran again alone, or because of a stop, and were
-            not to blame.
+        ran_again: gets the places of cases that ran again although none was at fault: something
+            from outside ended the process.
     """
     return _Rollout(world, pov, vut, cases, ran_again).run()
 
@@ -103,20 +100,15 @@ class _Rollout:
         self.mainline = [row for row in range(vehicles) if row != VUT]
         self.following = Following(corridors) if len(self.mainline) > 1 else None
         self.queue = enumerate(cases)
-        self.again: deque[tuple[int, Case]] = deque()
-        """Episodes that have to begin anew through no fault of theirs."""
         self.suspects: deque[tuple[int, Case]] = deque()
-        """Those that may have been at fault: each runs alone, so that a second loss is its own."""
-        self.quarantine = False
+        """Episodes that ran when a process of controllers died: each runs again alone."""
+        self.alone = False
         """Whether a suspect runs alone."""
-        self.blame = Blame[tuple[int, End]]()
+        self.deaths = Counter[int]()
+        """How often a process died with one case alone, by the place of the case."""
         self.ran_again = set() if ran_again is None else ran_again
-        self.struck = set[int]()
-        """Those that ran when something died of which nobody knows whose doing it was."""
-        self.pulse = Pulse()
-        self.pauses = 0
-        self.excused: Counter[int] = Counter()
-        """How often the error of an episode was put down to a pause, by its index."""
+        self.unexplained = set[int]()
+        """Those of them of which none was at fault so far."""
         self.episodes: list[_Running | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
@@ -142,9 +134,8 @@ class _Rollout:
         """The row of this step."""
 
     def run(self) -> list[Trajectory]:
-        with self.pulse:
-            self.run_all()
-        self.ran_again |= self.struck
+        self.run_all()
+        self.ran_again |= self.unexplained
         return [trajectory for _, trajectory in sorted(self.ended.items())]
 
     def run_all(self) -> None:
@@ -161,7 +152,7 @@ class _Rollout:
                 merged = None if merging is None else merging.step(world.x_m, world.v_mps)
                 world.command(acceleration, merged)
             except VutLostError as lost:
-                self.begin_anew(lost, paused=self.was_paused())
+                self.begin_again(lost)
                 continue
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
@@ -169,8 +160,6 @@ class _Rollout:
                 world.restart()
                 self.errors.clear()
                 self.refill(everywhere)
-                continue
-            if self.errors and self.was_paused() and self.excuse():
                 continue
             self.step += 1
             if self.merging is not None:
@@ -204,68 +193,32 @@ class _Rollout:
         on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
         return self.row < self.timeout_at[corridor] and on_the_road
 
-    def was_paused(self) -> bool:
-        """Return whether this process was stopped since this was asked before."""
-        before, self.pauses = self.pauses, self.pulse.pauses()
-        return self.pauses > before
-
-    def excuse(self) -> bool:
-        """Begin what runs anew after a pause, unless that was done for all who have an error."""
-        running = self.running()
-        wrong = {running[corridor].index for corridor in self.errors}
-        if all(self.excused[index] >= MOST_PAUSES for index in wrong):
-            return False
-        self.excused.update(wrong)
-        self.ran_again |= wrong
-        self.again += [(episode.index, episode.case) for episode in running.values()]
-        self.begin_others()
-        return True
-
-    def running(self) -> dict[int, _Running]:
-        """Return the episodes that run, by corridor."""
+    def begin_again(self, lost: VutLostError) -> None:
+        """Let what was running begin again, one by one; end the episode at fault, if any."""
         episodes = enumerate(self.episodes)
-        return {k: e for k, e in episodes if e is not None and self.active[k]}
-
-    def begin_anew(self, lost: VutLostError, *, paused: bool) -> None:
-        """Start over what was running; end the episode that is known to be at fault, if any."""
-        running = self.running()
-        alone = len(running) == 1
-        end, reason = End.VUT_ERROR, lost.reason
-        if isinstance(lost, PovLostError):
-            end, reason = End.SIM_ERROR, OF_THE_POV + lost.reason
-        named = None if lost.corridor is None else lost.corridor % self.world.corridors
-        guilty = next(iter(running)) if alone else named if named in running else None
-        for corridor, episode in running.items():
-            if guilty is not None and corridor != guilty:
-                self.again.append((episode.index, episode.case))
-            elif self.blame.died(
-                (episode.index, end),
-                alone=alone,
-                named=guilty is not None,
-                repeatable=lost.final and not paused,
-                killed=lost.killed,
-            ):
-                self.ran_again.discard(episode.index)
-                self.struck.clear()
-                self.finish(corridor, end, reason)
+        running = [(k, e) for k, e in episodes if e is not None and self.active[k]]
+        for corridor, episode in running:
+            self.deaths[episode.index] += len(running) == 1
+            if self.deaths[episode.index] == MAX_DEATHS:
+                self.unexplained.clear()
+                if isinstance(lost, PovLostError):
+                    self.finish(corridor, End.SIM_ERROR, OF_THE_POV + lost.reason)
+                else:
+                    self.finish(corridor, End.VUT_ERROR, lost.reason)
             else:
-                (self.struck if guilty is None else self.ran_again).add(episode.index)
+                self.unexplained.add(episode.index)
                 self.suspects.append((episode.index, episode.case))
-        self.begin_others()
-
-    def begin_others(self) -> None:
-        """Leave what was running, and begin what is to run now."""
         self.errors.clear()
         self.active[:] = False
-        self.quarantine = bool(self.suspects)
+        self.alone = bool(self.suspects)
         self.refill(range(self.world.corridors))
 
     def refill(self, corridors: Sequence[int]) -> None:
         """Begin the next episodes in corridors whose own have ended."""
         if not corridors:
             return
-        if self.quarantine:  # nothing else runs
-            self.quarantine = bool(self.suspects)
+        if self.alone:  # nothing else runs
+            self.alone = bool(self.suspects)
             corridors = range(self.world.corridors)
         for corridor in corridors:
             self.active[corridor] = False
@@ -275,10 +228,8 @@ class _Rollout:
 
     def next_case(self) -> tuple[int, Case | None]:
         """Return what is to run next; None where a corridor is to stay empty."""
-        if self.quarantine:
+        if self.alone:
             return (-1, None) if self.active.any() else self.suspects.popleft()
-        if self.again:
-            return self.again.popleft()
         return next(self.queue, (-1, None))
 
     def begin(self, corridor: int, index: int, case: Case | None) -> None:

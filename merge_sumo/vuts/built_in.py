@@ -11,7 +11,7 @@ from merge_sumo.drivers import __name__ as room
 from merge_sumo.drivers import __path__ as folders
 from merge_sumo.drivers.base import BuiltInVut, Driver
 from merge_sumo.errors import UserError
-from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
 
 
 def found() -> dict[str, BuiltInVut]:
@@ -23,26 +23,30 @@ def found() -> dict[str, BuiltInVut]:
 BUILT_IN_VUTS: Final = found()
 
 
-def built_in_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT of a name with its parameters; `UserError` for those that it cannot have."""
-    built_in = BUILT_IN_VUTS[spec.argument]
-    known = {} if built_in.design is None else asdict(built_in.design)
-    chosen = {name: float(value) for name, value in spec.numbers().items()}
-    for name in chosen:
-        if name not in known:
-            raise spec.has_no(name, known)
-    arguments: tuple[Any, ...] = (options.policies,) if built_in.network else ()
-    if built_in.design is not None:
-        try:
-            arguments = (replace(built_in.design, **chosen),)
-        except UserError as error:
-            raise UserError(f"{spec}: {error}") from error
+class BuiltInKind(ControllerKind):
+    """A VUT that the package brings, with its parameters."""
 
-    def make(corridors: int, _world: object) -> Driver:
-        return built_in.make(corridors, *arguments)
+    own_code, asks_sumo, by_arrays = False, False, True
 
-    no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
-    return Vut(make=make, parameters=known | chosen, no_pov=no_pov if built_in.ramp_only else "")
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Take the parameters; `UserError` for those that it cannot have."""
+        super().__init__(spec, options)
+        self._built_in = built_in = BUILT_IN_VUTS[spec.argument]
+        known = {} if built_in.design is None else asdict(built_in.design)
+        chosen = {name: float(value) for name, value in spec.numbers().items()}
+        for name in chosen:
+            if name not in known:
+                raise spec.has_no(name, known)
+        self._arguments: tuple[Any, ...] = (options.policies,) if built_in.network else ()
+        if built_in.design is not None:
+            try:
+                self._arguments = (replace(built_in.design, **chosen),)
+            except UserError as error:
+                raise UserError(f"{spec}: {error}") from error
+        self.parameters = known | chosen
+        if built_in.ramp_only:
+            self.no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
 
-
-KIND: Final = VutKind(prepare=built_in_vut, own_code=False, asks_sumo=False, by_arrays=True)
+    def driver(self, corridors: int, _world: object) -> Driver:
+        """Return its driver for a number of corridors."""
+        return self._built_in.make(corridors, *self._arguments)

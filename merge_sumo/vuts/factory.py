@@ -16,10 +16,10 @@ from merge_sumo.system.printable import printable, quoted
 from merge_sumo.system.suggestions import meant
 from merge_sumo.system.trust import check_code
 from merge_sumo.system.workers import workers_or_cores
-from merge_sumo.vuts.base import INSTALLED, Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import INSTALLED, ControllerKind, VutOptions, VutSpec
 from merge_sumo.vuts.built_in import BUILT_IN_VUTS
 from merge_sumo.vuts.here import object_of, objects
-from merge_sumo.vuts.host.hosted import SUPPORTED, hosted_vut
+from merge_sumo.vuts.hosting import SUPPORTED, HostedKind
 from merge_sumo.vuts.parameters import Range
 from merge_sumo.vuts.python import installed_vuts
 from merge_sumo.vuts.registry import KINDS
@@ -49,12 +49,12 @@ class VutFactory:
         return cls(parse(text), options or VutOptions())
 
     @property
-    def kind(self) -> VutKind:
+    def kind(self) -> type[ControllerKind]:
         """The kind of the VUT."""
         return KINDS[self.spec.kind]
 
     @cached_property
-    def vut(self) -> Vut:
+    def vut(self) -> ControllerKind:
         """The VUT, hosted in a process of its own where its kind says so."""
         spec, kind = self.spec, self.kind
         if spec.kind == INSTALLED and spec.argument not in installed_vuts():
@@ -62,12 +62,13 @@ class VutFactory:
         if file := kind.file_of(spec.argument):
             check_code(Path(file))
         if not kind.hosted or self.options.in_process or not SUPPORTED:
-            return kind.prepare(spec, self.options)
+            return kind(spec, self.options)
         if kind.no_parameters:
-            return hosted_vut(spec, self.options, alike=spec)
-        # Facts of a controller do not depend on the values of its parameters.
+            return HostedKind.open(spec, self.options, alike=spec)
+        # What is known of a controller does not depend on the values of its parameters.
         names = tuple((name, "") for name in sorted(spec.numbers()))
-        return hosted_vut(spec, self.options, VutSpec(spec.kind, spec.argument, names))
+        alike = VutSpec(spec.kind, spec.argument, names)
+        return HostedKind.open(spec, self.options, alike)
 
     def with_log(self, log: Path) -> VutFactory:
         """Return what makes the same VUT, with what it prints added to a file."""
@@ -80,6 +81,8 @@ class VutFactory:
         """
         count, most = workers_or_cores(requested), self.vut.max_workers
         if most is None or count <= most:
+            if count > 1:
+                self.vut.release()
             return count
         if requested is None:
             return most
@@ -90,13 +93,13 @@ class VutFactory:
 
         Raises `UserError` where the code of the VUT has changed since this was made.
         """
-        then, now = self.files or {}, hashed(set(self.vut.files) - set(self.vut.data))
+        then, now = self.files or {}, hashed(self.vut.files)
         if other := [name for name, sha256 in now.items() if sha256 not in then.values()]:
             raise UserError(
                 f"{printable(other[0])}, code of the VUT {self.spec}, is not as it was when this "
                 "began: let it be while it runs, and let all workers have the same"
             )
-        return self.vut.make(corridors, world)
+        return self.vut.driver(corridors, world)
 
     def parameters(self) -> dict[str, float]:
         """Return the parameters that a spec may set, with their present values.
@@ -139,14 +142,20 @@ class VutFactory:
         return {name: float(known[name]) for name in names}
 
     def __reduce__(self) -> tuple[Callable[..., VutFactory], tuple[Any, ...]]:
-        """Travel as plain values, with an object of this process; look the VUT up on arrival."""
-        return (_arrived, (self.spec, self.options, self.files, object_of(self.spec)))
+        """Travel as plain values, with what was opened and an object of this process."""
+        hosted = self.vut if isinstance(self.vut, HostedKind) else None
+        return (_arrived, (self.spec, self.options, self.files, hosted, object_of(self.spec)))
 
 
-def _arrived(spec: VutSpec, options: VutOptions, files: Files | None, vut: Any) -> VutFactory:
+def _arrived(
+    spec: VutSpec, options: VutOptions, files: Files | None, hosted: HostedKind | None, vut: Any
+) -> VutFactory:
     if vut is not None:
         objects[spec.argument] = vut
-    return VutFactory(spec, options, files)
+    factory = VutFactory(spec, options, files)
+    if hosted is not None:
+        factory.__dict__["vut"] = hosted
+    return factory
 
 
 def _why_unknown(name: str) -> str:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import shutil
 from contextlib import chdir, suppress
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.system.suggestions import either
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
-from merge_sumo.vuts.blame_cell import current_call
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.vuts.controller import Controller, Seen, Start, as_merge
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"
@@ -26,23 +25,6 @@ NAMES: Final = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
 _FLOATS: Final = ("Real", "Float64", "Float32")
 _BOOLEAN: Final = "Boolean"
 _INTEGERS: Final = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
-
-
-def fmu_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT of `fmu:FILE?x_vut_m=NAME&...`; `UserError` for one that cannot be."""
-    file, names = Path(spec.argument), dict(spec.parameters)
-    if unknown := set(names) - set(NAMES):
-        raise UserError(
-            f"{spec}: there is no variable {unknown.pop()!r} to name: choose from "
-            f"{', '.join(NAMES)}"
-        )
-    unit = Unit(file, names)
-
-    def make(corridors: int, _world: object) -> Driver:
-        return FmuVut(corridors, unit, options.deadline_s)
-
-    once = str(unit.description.coSimulation.canBeInstantiatedOnlyOncePerProcess) == "True"
-    return Vut(make=make, max_corridors=1 if once else None, files=(file,))
 
 
 class Unit:
@@ -58,7 +40,7 @@ class Unit:
             import fmpy
         except ImportError as error:
             raise UserError("an FMU needs FMPy: run `pip install 'merge-sumo[fmu]'`") from error
-        self._fmpy, self._path = fmpy, path
+        self._fmpy, self._path, self._instances = fmpy, path, 0
         if not path.is_file():
             raise UserError(f"there is no FMU {path}")
         try:
@@ -123,17 +105,15 @@ class Unit:
         return variable
 
     @cached_property
-    def folder(self) -> str:
-        """The unpacked unit; `remove` takes it away."""
-        return str(self._fmpy.extract(str(self._path)))
+    def _folder(self) -> TemporaryDirectory[str]:
+        """The unpacked unit, which is removed with this object."""
+        folder = TemporaryDirectory(prefix="merge-sumo-fmu-", ignore_cleanup_errors=True)
+        self._fmpy.extract(str(self._path), folder.name)
+        return folder
 
-    def remove(self) -> None:
-        """Remove the unpacked unit."""
-        if "folder" in self.__dict__:
-            shutil.rmtree(self.__dict__.pop("folder"), ignore_errors=True)
-
-    def instance(self, name: str) -> Any:
+    def instance(self) -> Any:
         """Return a new instance of the unit."""
+        self._instances += 1
         if self.version == "2":
             from fmpy.fmi2 import FMU2Slave as Slave
         else:
@@ -142,60 +122,47 @@ class Unit:
         with chdir("."):
             made: Any = Slave(
                 guid=self.description.guid,
-                unzipDirectory=self.folder,
+                unzipDirectory=self._folder.name,
                 modelIdentifier=self.description.coSimulation.modelIdentifier,
-                instanceName=name,
+                instanceName=f"vut{self._instances}",
             )
         made.instantiate()
         return made
 
 
-class FmuVut(PerCorridor):
-    """Steps an instance of the unit in each corridor: set the state, step by 0.1 s, read."""
+class FmuController(Controller):
+    """Steps an instance of the unit: set the state, step by 0.1 s, read."""
 
-    def __init__(self, corridors: int, unit: Unit, deadline_s: float) -> None:
-        """Make an instance for each corridor; `UserError` when the unit cannot be made."""
-        super().__init__(corridors, deadline_s)
-        self._unit = unit
-        self._instances: list[Any] = [None] * corridors
-        self._ran = [False] * corridors
+    def __init__(self, unit: Unit) -> None:
+        """Make an instance; `UserError` when that cannot be."""
+        self._unit, self._ran = unit, False
         try:
-            for corridor in range(corridors):
-                self.renew(corridor)
+            self._instance = unit.instance()
         except Exception as error:  # of FMPy or of the loader of the binary
-            self.close()
             raise UserError(f"the FMU cannot be made: {error}") from error
 
-    def renew(self, corridor: int) -> None:
-        """Replace the instance of a corridor."""
-        current_call.note(corridor)
-        _free(self._instances[corridor])
-        self._instances[corridor] = None
-        self._instances[corridor] = self._unit.instance(f"vut{corridor}")
-        self._ran[corridor] = False
-
-    def reset(self, corridor: int, seen: Seen) -> None:
+    def reset(self, start: Start) -> None:
         """Initialise the instance at t = 0 with the state at the start."""
-        instance = self._instances[corridor]
-        if self._ran[corridor]:
+        instance = self._instance
+        if self._ran:
             instance.reset()
-        self._ran[corridor] = True
+        self._ran = True
         if self._unit.version == "2":
             instance.setupExperiment(startTime=0.0)
             instance.enterInitializationMode()
         else:
             instance.enterInitializationMode(startTime=0.0)
-        self._set(instance, seen)
+        self._set(start.seen)
         if (taken := self._unit.seed) is not None:
             # A signed integer of 32 bits has no room for all seeds.
-            seed = float(self.seed) if taken.type in _FLOATS else self.seed % 2**31
+            seed = float(start.seed) if taken.type in _FLOATS else start.seed % 2**31
             getattr(instance, f"set{taken.type}")([taken.valueReference], [seed])
         instance.exitInitializationMode()
 
-    def answer(self, corridor: int, seen: Seen) -> float | tuple[float, bool]:
+    def act(self, seen: Seen) -> float | tuple[float, bool]:
         """Return the outputs after a step with the state held."""
-        instance, unit = self._instances[corridor], self._unit
-        self._set(instance, seen)
+        instance, unit = self._instance, self._unit
+        self._set(seen)
         instance.doStep(seen.t_s, DT_S)
         acceleration = float(_value(instance, unit.output))
         if unit.reaches:
@@ -205,14 +172,15 @@ class FmuVut(PerCorridor):
         return acceleration, as_merge(float(_value(instance, unit.wish)))
 
     def close(self) -> None:
-        """Free the instances and remove the unpacked unit."""
-        for instance in self._instances:
-            _free(instance)
-        self._unit.remove()
+        """Free the instance."""
+        with suppress(Exception):  # a unit that failed cannot be terminated
+            self._instance.terminate()
+        self._instance.freeInstance()
 
-    def _set(self, instance: Any, seen: Seen) -> None:
+    def _set(self, seen: Seen) -> None:
         for kind, (places, references) in self._unit.inputs.items():
-            getattr(instance, f"set{kind}")(references, [seen[1 + place] for place in places])
+            set_all = getattr(self._instance, f"set{kind}")
+            set_all(references, [seen[1 + place] for place in places])
 
 
 def _value(instance: Any, variable: Any) -> Any:
@@ -220,20 +188,34 @@ def _value(instance: Any, variable: Any) -> Any:
     return getattr(instance, f"get{variable.type}")([variable.valueReference])[0]
 
 
-def _free(instance: Any) -> None:
-    if instance is not None:
-        with suppress(Exception):  # a unit that failed cannot be terminated
-            instance.terminate()
-        instance.freeInstance()
+class FmuKind(ControllerKind):
+    """A unit: `fmu:FILE?x_vut_m=NAME&...`."""
 
+    form = "fmu:FILE[?VARIABLE=NAME&...]"
+    what = "an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables"
+    example = '--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"'
+    no_parameters = "the options of an FMU are the names of its variables"
+    hosted, asks_sumo = True, False
 
-KIND: Final = VutKind(
-    form="fmu:FILE[?VARIABLE=NAME&...]",
-    what="an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables",
-    example='--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"',
-    no_parameters="the options of an FMU are the names of its variables",
-    prepare=fmu_vut,
-    hosted=True,
-    asks_sumo=False,
-    file_of=str,
-)
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Read the description of the unit; `UserError` for one that cannot drive."""
+        super().__init__(spec, options)
+        names = dict(spec.parameters)
+        if unknown := set(names) - set(NAMES):
+            raise UserError(
+                f"{spec}: there is no variable {unknown.pop()!r} to name: choose from "
+                f"{', '.join(NAMES)}"
+            )
+        self.files = (Path(spec.argument),)
+        self._unit = Unit(self.files[0], names)
+        once = str(self._unit.description.coSimulation.canBeInstantiatedOnlyOncePerProcess)
+        self.max_corridors = 1 if once == "True" else None
+
+    @classmethod
+    def file_of(cls, argument: str) -> str:
+        """Return the file of the unit."""
+        return argument
+
+    def controller(self) -> Controller:
+        """Return a controller of one corridor."""
+        return FmuController(self._unit)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.vuts.base import HERE, Vut, VutKind, VutOptions, VutSpec, text_of
-from merge_sumo.vuts.python import is_code, vut_of
+from merge_sumo.vuts.base import HERE, VutSpec
+from merge_sumo.vuts.deadline import text_of
+from merge_sumo.vuts.python import OfPython, is_code
 
 objects: Final[dict[str, Any]] = {}
 """By the arguments of their specs."""
@@ -21,30 +20,30 @@ def object_of(spec: VutSpec) -> Any:
     return objects.get(spec.argument) if spec.kind == HERE else None
 
 
-def here_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT of an object; `UserError` where that is an object of another process."""
-    if spec.argument not in objects:
-        raise UserError(
-            f"{spec} was an object of a Python process: name a VUT, or give the object again"
+class HereKind(OfPython):
+    """An object of this process."""
+
+    files_are_known = False
+
+    def target(self) -> Any:
+        """Return the object; `UserError` where that was an object of another process."""
+        if self.spec.argument not in objects:
+            raise UserError(
+                f"{self.spec} was an object of a Python process: name a VUT, or give the object "
+                "again"
+            )
+        target = objects[self.spec.argument]
+        try:
+            file = inspect.getsourcefile(target if is_code(target) else type(target))
+        except (TypeError, OSError):
+            file = None
+        if file and Path(file).is_file():
+            self.files = (Path(file),)
+        return target
+
+    def refused(self, target: Any) -> UserError:
+        """Return the error for an object that is not a VUT."""
+        return UserError(
+            f"{text_of(target, repr)[:80]} is no VUT: give a spec, a class or an object with "
+            "`act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
         )
-    return vut_of_object(objects[spec.argument], spec, options, spec.numbers())
-
-
-def vut_of_object(
-    thing: Any, spec: VutSpec, options: VutOptions, given: Mapping[str, float]
-) -> Vut:
-    """Return the VUT that an object, a class or a function is; `UserError` for one that is none."""
-    vut = vut_of(thing, spec, options, given)
-    if vut is None:
-        raise UserError(
-            f"{text_of(thing, repr)[:80]} is no VUT: give a spec, a class or an "
-            "object with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
-        )
-    try:
-        file = inspect.getsourcefile(thing if is_code(thing) else type(thing))
-    except (TypeError, OSError):
-        file = None
-    return replace(vut, files=(Path(file),) if file and Path(file).is_file() else ())
-
-
-KIND: Final = VutKind(prepare=here_vut, files_are_known=False, asks_sumo=False)

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final, Protocol, SupportsFloat
 
-from merge_sumo.errors import notice
+from merge_sumo.errors import UserError, notice
 from merge_sumo.system.workers import AnyWorkers
-from merge_sumo.vuts.base import HERE, Seen, VutOptions, VutSpec
-from merge_sumo.vuts.here import object_of, objects, vut_of_object
+from merge_sumo.vuts.base import HERE, VutOptions, VutSpec
+from merge_sumo.vuts.controller import Seen
+from merge_sumo.vuts.here import HereKind, object_of, objects
 from merge_sumo.vuts.python import SeenBatch, is_code
 from merge_sumo.vuts.spec import parse
 
@@ -54,13 +55,18 @@ def spec_of(vut: Any) -> str:
             return importable
     name = str(getattr(vut, "__qualname__", type(vut).__qualname__)).rpartition(".")[2]
     name = "lambda" if name == "<lambda>" else name
-    vut_of_object(vut, VutSpec(HERE, name), VutOptions(), {})
     number, unique = 1, name
     while objects.get(unique, vut) is not vut:
         number += 1
         unique = f"{name}-{number}"
+    spec = VutSpec(HERE, unique)
     objects[unique] = vut
-    return str(VutSpec(HERE, unique))
+    try:
+        HereKind(spec, VutOptions())
+    except UserError:
+        del objects[unique]
+        raise
+    return str(spec)
 
 
 def is_here(text: str) -> bool:

@@ -11,12 +11,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.vuts.base import PerCorridor, Seen, Vut, VutKind, VutOptions, VutSpec, as_merge
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.vuts.controller import Controller, Seen, Start, as_merge
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its decision."""
@@ -32,19 +32,6 @@ _DTYPES: Final = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 _ANSWERS: Final = (*_DTYPES, "tensor(float16)")
 """Types of outputs: an integer would be the index of an action, or a class, and no acceleration."""
 _SEEDS: Final[dict[str, Any]] = {**_DTYPES, "tensor(int64)": np.int64}
-
-
-def onnx_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT of `onnx:FILE?decision_period_s=...`; `UserError` for one that cannot be."""
-    file, given = Path(spec.argument), dict(spec.parameters)
-    if unknown := set(given) - {PERIOD}:
-        raise UserError(f"{spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
-    network = Network(file, given.get(PERIOD))
-
-    def make(corridors: int, _world: object) -> Driver:
-        return OnnxVut(corridors, network, options.deadline_s)
-
-    return Vut(make=make, files=(file,))
 
 
 class Network:
@@ -142,44 +129,48 @@ class Network:
         return acceleration_mps2, as_merge(float(output[-WISH]))
 
 
-class OnnxVut(PerCorridor):
-    """Asks the network when a decision is due, corridor by corridor, and holds in between."""
+class OnnxController(Controller):
+    """Asks the network when a decision is due, and holds the decision in between."""
 
-    def __init__(self, corridors: int, network: Network, deadline_s: float) -> None:
-        super().__init__(corridors, deadline_s)
+    def __init__(self, network: Network) -> None:
+        """Take the network, which all corridors share."""
         self._network = network
-        self._held: list[Decision] = [0.0] * corridors
-        self._of_actions: list[FloatArray] = [np.empty(0)] * corridors
-        self._seeds = [0] * corridors
+        self._held: Decision = 0.0
 
-    def begin(self, corridor: int, case: Case) -> None:
-        """Take the accelerations of the actions in the scenario of the case."""
-        self._of_actions[corridor] = actions_mps2(case.scenario)
-        self._seeds[corridor] = case.told_seed
-        super().begin(corridor, case)
+    def reset(self, start: Start) -> None:
+        """Take the accelerations of the actions, and the seed."""
+        self._of_actions, self._seed = actions_mps2(start), start.seed
 
-    def renew(self, corridor: int) -> None:
-        """Do nothing."""
-
-    def reset(self, corridor: int, seen: Seen) -> None:
-        """Do nothing: the first step is a decision."""
-
-    def answer(self, corridor: int, seen: Seen) -> Decision:
-        """Return the held decision, made anew where one is due."""
+    def act(self, seen: Seen) -> Decision:
+        """Return the held decision; the network decides again where that is due."""
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
-            self._held[corridor] = self._network.decision(
-                seen[1:], self._of_actions[corridor], self._seeds[corridor]
-            )
-        return self._held[corridor]
+            self._held = self._network.decision(seen[1:], self._of_actions, self._seed)
+        return self._held
 
 
-KIND: Final = VutKind(
-    form="onnx:FILE[?decision_period_s=SECONDS]",
-    what="a network from the state to an acceleration, or to values of the 7 actions",
-    example="--vut onnx:policy.onnx",
-    no_parameters="the parameters of a network are its weights",
-    prepare=onnx_vut,
-    hosted=True,
-    asks_sumo=False,
-    file_of=str,
-)
+class OnnxKind(ControllerKind):
+    """A network: `onnx:FILE?decision_period_s=...`."""
+
+    form = "onnx:FILE[?decision_period_s=SECONDS]"
+    what = "a network from the state to an acceleration, or to values of the 7 actions"
+    example = "--vut onnx:policy.onnx"
+    no_parameters = "the parameters of a network are its weights"
+    hosted, asks_sumo = True, False
+
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Load the network; `UserError` for one that cannot be."""
+        super().__init__(spec, options)
+        given = dict(spec.parameters)
+        if unknown := set(given) - {PERIOD}:
+            raise UserError(f"{spec}: there is no option {unknown.pop()!r}, only {PERIOD}")
+        self.files = (Path(spec.argument),)
+        self._network = Network(self.files[0], given.get(PERIOD))
+
+    @classmethod
+    def file_of(cls, argument: str) -> str:
+        """Return the file of the network."""
+        return argument
+
+    def controller(self) -> Controller:
+        """Return a controller of one corridor."""
+        return OnnxController(self._network)

@@ -11,7 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Final
@@ -40,6 +40,7 @@ class Echo:
 
     def __init__(self) -> None:
         self._last, self._again = b"", 0
+        self._text = self._held = b""
 
     def close(self) -> None:
         """Say how often the last was printed again."""
@@ -47,33 +48,40 @@ class Echo:
             sys.stderr.write(f"(printed {counted(self._again, 'more time')})\n")
         self._again = 0
 
-    def show(self, parts: Iterable[bytes]) -> None:
-        """Show what one start prints as it comes, from where it differs from the start before."""
-        text = held = b""
-        for part in parts:
-            text, held = (text + part)[:PENDING_BYTES], held + part
-            if len(text) == PENDING_BYTES or not self._last.startswith(text):
-                held = self._write(held)
-        if held and held == self._last:
-            self._again += 1
-            return
-        self._write(held)
-        self._last = text or self._last
+    def show(self, part: bytes) -> None:
+        """Show what a start prints, from where it differs from the start before."""
+        self._text, self._held = (self._text + part)[:PENDING_BYTES], self._held + part
+        if len(self._text) == PENDING_BYTES or not self._last.startswith(self._text):
+            self._write()
 
-    def _write(self, text: bytes) -> bytes:
-        """Show a text; return what is left of it."""
-        if text:
+    def end(self) -> None:
+        """Take note that a start has printed all."""
+        if self._held and self._held == self._last:
+            self._again += 1
+        else:
+            self._write()
+            self._last = self._text or self._last
+        self._text = self._held = b""
+
+    def _write(self) -> None:
+        if self._held:
             self.close()
-            sys.stderr.write(text.decode("utf-8", errors="replace"))
-        return b""
+            sys.stderr.write(self._held.decode("utf-8", errors="replace"))
+        self._held = b""
 
 
 class Output:
-    """Reads what a program prints until it ends, so that a full pipe never holds it up."""
+    """Reads what a program prints until it ends, so that a full pipe never holds it up.
+
+    Attributes:
+        log: file to which it is added; None shows it on standard error. A log that is set later
+            has what was printed before, too.
+    """
 
     def __init__(self, pipe: IO[bytes], log: Path | None, echo: Echo) -> None:
-        """Read a pipe; add what comes to the file `log`, or show it where that is None."""
-        self._pipe, self._log, self._echo = pipe, log, echo
+        """Read a pipe; what comes goes to `log`, or to `echo` where that is None."""
+        self.log = log
+        self._pipe, self._echo = pipe, echo
         self._tail = self._pending = b""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
@@ -90,21 +98,22 @@ class Output:
 
     def _read(self) -> None:
         with self._pipe as pipe:
-            if self._log is None:
-                self._echo.show(self._parts(pipe))
-                return
-            for part in self._parts(pipe):
+            while part := os.read(pipe.fileno(), 1 << 16):
+                self._tail = (self._tail + part)[-TAIL_BYTES:]
                 self._pending = (self._pending + part)[-PENDING_BYTES:]
-                if self._log.parent.is_dir():
-                    # A full disk costs what was printed, not the campaign.
-                    with suppress(OSError):
-                        append(self._log, self._pending)
-                    self._pending = b""
+                if self.log is None:
+                    self._echo.show(part)
+                else:
+                    self._keep(self.log)
+        self._echo.end()
+        if self.log is not None:
+            self._keep(self.log)
 
-    def _parts(self, pipe: IO[bytes]) -> Iterator[bytes]:
-        while part := os.read(pipe.fileno(), 1 << 16):
-            self._tail = (self._tail + part)[-TAIL_BYTES:]
-            yield part
+    def _keep(self, log: Path) -> None:
+        if self._pending and log.parent.is_dir():
+            with suppress(OSError):  # a full disk costs what was printed, not the campaign
+                append(log, self._pending)
+            self._pending = b""
 
 
 LINES: Final = 40

@@ -8,8 +8,7 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -20,25 +19,22 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, VUT, lane_of
-from merge_sumo.scenario.signals import as_signals
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, VUT
+from merge_sumo.scenario.signals import Left, as_signals
 from merge_sumo.system.registry import entries_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.system.trust import check_code
-from merge_sumo.vuts.base import (
-    Deadline,
-    PerCorridor,
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.vuts.controller import (
+    Controller,
+    ControllerArray,
+    ControllerDriver,
     Seen,
-    Vut,
-    VutKind,
-    VutOptions,
-    VutSpec,
+    Start,
     WrongAnswerError,
-    seen_at_start,
-    text_of,
 )
-from merge_sumo.vuts.blame_cell import ALL_CORRIDORS, NO_CORRIDOR, current_call
+from merge_sumo.vuts.deadline import Deadline, closed, text_of
 from merge_sumo.vuts.parameters import Parameters
 from merge_sumo.vuts.signatures import check_call, check_methods, fits, takes_seed
 
@@ -51,137 +47,185 @@ def installed_vuts() -> dict[str, EntryPoint]:
     return {name: entry for name, found in entries_of(GROUP).items() for entry in found.values()}
 
 
-def installed_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT that an installed package registers; `UserError` when it cannot be loaded."""
-    try:
-        target = installed_vuts()[spec.argument].load()
-    except (Exception, SystemExit) as error:
-        raise UserError(_cannot_load(spec.argument, error)) from error
-    module = sys.modules.get(getattr(target, "__module__", ""))
-    return _named_vut(target, spec, module, options)
-
-
-def python_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT `module:Name` or `file.py:Name`; `UserError` when it cannot be loaded."""
-    source, _, name = spec.argument.rpartition(":")
-    module = _module_of(source)
-    target: Any = module
-    for part in name.split("."):
-        target = getattr(target, part, None)
-    if target is None:
-        raise UserError(f"{source} has no {name!r}: name a class or a function of it")
-    return _named_vut(target, spec, module, options)
-
-
-def _named_vut(target: Any, spec: VutSpec, module: ModuleType | None, options: VutOptions) -> Vut:
-    vut = vut_of(target, spec, options, spec.numbers()) if is_code(target) else None
-    if vut is None:
-        raise UserError(
-            f"{spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)`, a "
-            "class with `act_batch(self, seen)`, or a function `f(seen)`"
-        )
-    file = getattr(module, "__file__", None)
-    return replace(vut, files=(Path(file),) if file else ())
-
-
 def is_code(target: Any) -> bool:
     """Return whether something is a class or a function, and no other object."""
     return isinstance(target, type) or inspect.isroutine(target)
 
 
-def vut_of(
-    target: Any, spec: VutSpec, options: VutOptions, given: Mapping[str, float]
-) -> Vut | None:
-    """Return the VUT that a class, a function or an object makes; None where it makes none.
+NO_VUT: Final = (
+    "a VUT is a class with `act(self, seen)`, a class with `act_batch(self, seen)`, or a function "
+    "`f(seen)`"
+)
+
+
+class OfPython(ControllerKind):
+    """A class, a function or an object, which a subclass finds.
 
     Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
-    in all corridors at once is not copied, unless parameters are `given`. Raises `UserError` where
-    a method or a function cannot be called as VUTs are, or has no such parameter.
-    """
-    if inspect.isroutine(target):
-        check_call(target, ("seen",))
-    else:
-        check_methods(target)
-    is_class = isinstance(target, type)
-    batched, acts = (callable(getattr(target, method, None)) for method in ("act_batch", "act"))
-    if not (batched or acts or (not is_class and callable(target) and fits(target, 1))):
-        return None
-    parameters = Parameters(target, spec, given, in_order=int(not is_class or batched))
-
-    def make(corridors: int, _world: object) -> Driver:
-        def new(*arguments: int) -> Any:
-            if is_class:
-                made = _made(target, spec, *arguments, **parameters.keywords)
-                return parameters.set_in(made)
-            if inspect.isroutine(target):
-                return parameters.bound(target)
-            return parameters.set_in(target if batched and not given else _copied(target, spec))
-
-        if batched:
-            return BatchedVut(corridors, lambda: new(corridors), options.deadline_s, parameters)
-        return PythonVut(corridors, new, options.deadline_s, parameters, acts=acts)
-
-    return Vut(make=make)
-
-
-class PythonVut(PerCorridor):
-    """Drives by one object per corridor, with `act(seen)` or called itself.
-
-    An object with `reset(seen)`, or `reset(seen, seed)`, drives one episode after the other in its
-    corridor. One without is never told that an episode begins, so each episode has a new one; a
-    function has nothing to begin anew. `close()` is called in the end where an object has it.
+    in all corridors at once is not copied, unless parameters are given.
     """
 
-    def __init__(
-        self,
-        corridors: int,
-        new: Callable[[], Any],
-        deadline_s: float,
-        parameters: Parameters,
-        *,
-        acts: bool,
-    ) -> None:
-        """Make an object for each corridor by `new`; `acts` says whether it has `act`."""
-        super().__init__(corridors, deadline_s)
-        self._new, self._parameters, self._acts = new, parameters, acts
-        self._objects: list[Any] = [None] * corridors
-        for corridor in range(corridors):
-            self.renew(corridor)
+    asks_sumo = False
 
-    def renew(self, corridor: int) -> None:
-        """Replace the object of a corridor."""
-        _close(self._objects[corridor], self._deadline.deadline_s)
-        self._objects[corridor] = self._new()
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Check the target; `UserError` where it cannot be called as a VUT is."""
+        super().__init__(spec, options)
+        self._given = spec.numbers()
+        self._target = target = self.target()
+        if inspect.isroutine(target):
+            check_call(target, ("seen",))
+        else:
+            check_methods(target)
+        self._is_class = isinstance(target, type)
+        self._is_batched = callable(getattr(target, "act_batch", None))
+        self._acts = callable(getattr(target, "act", None))
+        called = not self._is_class and callable(target) and fits(target, 1)
+        if not (self._is_batched or self._acts or called):
+            raise self.refused(target)
+        in_order = int(not self._is_class or self._is_batched)
+        self._parameters = Parameters(target, spec, self._given, in_order)
 
-    def reset(self, corridor: int, seen: Seen) -> None:
-        """Call `reset`; an object without is replaced before the next episode."""
-        vut = self._objects[corridor]
-        if getattr(vut, "reset", None) is not None:
-            _reset(vut.reset, seen, seed=self.seed)
-        elif not inspect.isroutine(vut):
-            self.renewal = "made anew for this episode, as it has no `reset`"
-            self.renew_first[corridor] = True
+    def target(self) -> Any:
+        """Return the class, function or object; `UserError` where it cannot be loaded."""
+        raise NotImplementedError
 
-    def answer(self, corridor: int, seen: Seen) -> Any:
-        """Ask the object, and keep the `signals` that it leaves as an attribute."""
-        vut = self._objects[corridor]
-        answer = vut.act(seen) if self._acts else vut(seen)
-        left = getattr(vut, "signals", None)
-        if left is not None:
-            self._signals[corridor] = as_signals(left)
-        return answer
+    def refused(self, target: Any) -> UserError:
+        """Return the error for a target that is not a VUT."""
+        return UserError(f"{self.spec} is {text_of(target, repr)[:80]}: {NO_VUT}")
+
+    def controller(self) -> Controller:
+        """Return a controller of one corridor."""
+        return PythonController(self._new(), self._parameters, acts=self._acts)
+
+    def driver(self, corridors: int, _world: object) -> Driver:
+        """Return the driver of all corridors."""
+        deadline_s = self.options.deadline_s
+        if self._is_batched:
+            new = lambda: self._new(corridors)  # noqa: E731
+            return BatchedVut(corridors, new, deadline_s, self._parameters)
+        return ControllerArray(corridors, self.controller, deadline_s)
+
+    def _new(self, *corridors: int) -> Any:
+        """Return a new object, made with the number of corridors where it acts in all of them."""
+        parameters, target = self._parameters, self._target
+        if inspect.isroutine(target):
+            return parameters.bound(target)
+        if self._is_class:
+            return parameters.set_in(self._made(*corridors))
+        return parameters.set_in(target if self._is_batched and not self._given else self._copy())
+
+    def _made(self, *corridors: int) -> Any:
+        try:
+            return self._target(*corridors, **self._parameters.keywords)
+        except (Exception, SystemExit) as error:
+            given = f" with {corridors[0]} corridors" if corridors else " without arguments"
+            what = f"{type(error).__name__}: {text_of(error)}"
+            raise UserError(f"{self.spec} cannot be made{given}: {what}") from error
+
+    def _copy(self) -> Any:
+        """Return a copy of the object as it was given: no episode changes that of another."""
+        try:
+            return copy.deepcopy(self._target)
+        except Exception as error:
+            raise UserError(
+                f"{self.spec} cannot be copied for the episodes that run at a time "
+                f"({text_of(error)}): give its class, or a function that makes no difference "
+                "between them"
+            ) from error
+
+
+class PythonKind(OfPython):
+    """`module:Name` or `file.py:Name`."""
+
+    form = "MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME"
+    what = "a class with act(seen), a function of seen, or a batched class"
+    example = "--vut my_vut.py:MyVut"
+    hosted = True
+
+    @classmethod
+    def file_of(cls, argument: str) -> str:
+        """Return the file that an argument names."""
+        source = argument.rpartition(":")[0]
+        return source if source.endswith(".py") else ""
+
+    def target(self) -> Any:
+        """Return what the module has by that name."""
+        source, _, name = self.spec.argument.rpartition(":")
+        module = _module_of(source)
+        target: Any = module
+        for part in name.split("."):
+            target = getattr(target, part, None)
+        if target is None:
+            raise UserError(f"{source} has no {name!r}: name a class or a function of it")
+        return self.code_of(target, module)
+
+    def code_of(self, target: Any, module: ModuleType | None) -> Any:
+        """Return a class or a function, and note its file; `UserError` for something else."""
+        if not is_code(target):
+            raise self.refused(target)
+        if file := getattr(module, "__file__", None):
+            self.files = (Path(file),)
+        return target
+
+
+class InstalledKind(PythonKind):
+    """A name that an installed package registers."""
+
+    form = what = example = ""
+
+    @classmethod
+    def file_of(cls, _argument: str) -> str:
+        """Return that a name is not a file."""
+        return ""
+
+    def target(self) -> Any:
+        """Return what the package registers."""
+        name = self.spec.argument
+        try:
+            target = installed_vuts()[name].load()
+        except (Exception, SystemExit) as error:
+            raise UserError(_cannot_load(name, error)) from error
+        return self.code_of(target, sys.modules.get(getattr(target, "__module__", "")))
+
+
+class PythonController(Controller):
+    """An object with `act(seen)`, or one that is called itself.
+
+    An object without `reset` is never told that an episode begins, so each episode has a new one; a
+    function has nothing to reset.
+    """
+
+    def __init__(self, thing: Any, parameters: Parameters, *, acts: bool) -> None:
+        """Drive by a thing; `acts` says whether it has `act`."""
+        self._thing, self._parameters = thing, parameters
+        self._act = thing.act if acts else thing
+        self._reset = getattr(thing, "reset", None)
+        self.single_use = self._reset is None and not inspect.isroutine(thing)
+
+    def reset(self, start: Start) -> None:
+        """Call `reset`, if there is one."""
+        if self._reset is not None:
+            _reset(self._reset, start.seen, seed=start.seed)
+
+    def act(self, seen: Seen) -> Any:
+        """Ask the object."""
+        return self._act(seen)
+
+    def signals(self) -> Left:
+        """Return the `signals` that the object has left as an attribute."""
+        left = getattr(self._thing, "signals", None)
+        return {} if left is None else as_signals(left)
 
     def parameters(self) -> Mapping[str, float]:
-        """Return the parameters of the first object."""
-        return self._parameters.present(self._objects[0])
+        """Return the parameters of the object."""
+        return self._parameters.present(self._thing)
 
     def close(self) -> None:
-        """Call `close` of every object that has it; what it raises is printed."""
-        for vut in self._objects:
-            _close(vut, self._deadline.deadline_s)
+        """Call `close`, if there is one."""
+        _close(self._thing)
 
 
-class BatchedVut(Driver):
+class BatchedVut(ControllerDriver):
     """Drives by one object that acts in all corridors at once.
 
     It is made with the number of corridors K, has `act_batch(seen)`, which returns K
@@ -192,37 +236,44 @@ class BatchedVut(Driver):
     def __init__(
         self,
         corridors: int,
-        make: Callable[[], Any],
+        new: Callable[[], Any],
         deadline_s: float,
         parameters: Parameters,
     ) -> None:
+        """Make the object.
+
+        Args:
+            corridors: number of corridors.
+            new: makes an object.
+            deadline_s: time for one call.
+            parameters: its parameters.
+        """
         super().__init__(corridors)
         self._deadline = Deadline(deadline_s)
-        self._make, self._parameters = make, parameters
-        self._object = make()
-        self._renew_first = False
+        self._new, self._parameters = new, parameters
+        self._object = new()
+        self._replace = False
         self._raised: str | None = None
         self._wrong: dict[int, str] = {}
         """What is wrong in a corridor alone: its reset raised something, or its wish is none."""
         self._lanes_m = np.zeros((2, corridors))
 
-    def begin(self, corridor: int, case: Case) -> None:
+    def reset(self, corridor: int, start: Start) -> None:
         """Call `reset`, if there is one; an error is kept as the reason of the answer.
 
-        After an act that failed all episodes begin, and the object is made anew for the first.
+        After an act that failed all episodes begin, and a new object serves them.
         """
         self._wrong.pop(corridor, None)
-        self._lanes_m[:, corridor] = lane_of(case.scenario) or (0.0, 0.0)
+        self._lanes_m[:, corridor] = start.lane_m or (0.0, 0.0)
         try:
             with self._deadline as deadline:
-                if self._renew_first:
-                    self._object = deadline.call(corridor, self._make)
-                    self._renew_first = False
+                deadline.start()
+                if self._replace:
+                    self._object, self._replace = self._new(), False
                 reset = getattr(self._object, "reset", None)
                 if reset is not None:
-                    begun = seen_at_start(case)
-                    again = partial(_reset, reset, seed=case.told_seed)
-                    deadline.call(corridor, again, corridor, begun)
+                    _reset(reset, corridor, start.seen, seed=start.seed)
+                deadline.stop()
         except BaseException as error:
             self._wrong[corridor] = f"reset: {self._deadline.reason(error)}"
 
@@ -235,7 +286,9 @@ class BatchedVut(Driver):
         seen, k = _batch(scene, self._lanes_m), self.corridors
         try:
             with self._deadline as deadline:
-                answer = np.asarray(deadline.call(ALL_CORRIDORS, self._object.act_batch, seen))
+                deadline.start()
+                answer = np.asarray(self._object.act_batch(seen))
+                deadline.stop()
             if answer.shape not in ((k,), (2, k)) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of {k} numbers, or "
@@ -243,9 +296,9 @@ class BatchedVut(Driver):
                 )
         except BaseException as error:
             self._raised = self._deadline.reason(error)
-            self._renew_first = True
+            self._replace = True
             if scene.active.sum() > 1:
-                raise VutLostError(self._raised, final=True) from None
+                raise VutLostError(self._raised) from None
             return np.full(self.corridors, np.nan)
         answer = answer.astype(np.float64)
         if answer.ndim == 2:
@@ -272,7 +325,7 @@ class BatchedVut(Driver):
 
     def close(self) -> None:
         """Call `close`, if there is one."""
-        _close(self._object, self._deadline.deadline_s)
+        closed(self._deadline.deadline_s, lambda: _close(self._object))
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,14 +381,10 @@ def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
     )
 
 
-def _made(target: type, spec: VutSpec, *arguments: int, **keywords: float) -> Any:
-    current_call.note(NO_CORRIDOR)  # it goes on: each object may take its time
-    try:
-        return target(*arguments, **keywords)
-    except (Exception, SystemExit) as error:
-        given = f" with {arguments[0]} corridors" if arguments else " without arguments"
-        what = f"{type(error).__name__}: {text_of(error)}"
-        raise UserError(f"{spec} cannot be made{given}: {what}") from error
+def _close(thing: Any) -> None:
+    """Call `close` of an object that has it."""
+    if getattr(thing, "close", None) is not None:
+        thing.close()
 
 
 def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
@@ -344,30 +393,6 @@ def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
         reset(*arguments, seed=seed)
     else:
         reset(*arguments)
-
-
-def _copied(target: Any, spec: VutSpec) -> Any:
-    """Return a copy of an object as it was given, so that no episode changes that of another."""
-    try:
-        return copy.deepcopy(target)
-    except Exception as error:
-        raise UserError(
-            f"{spec} cannot be copied for the episodes that run at a time ({text_of(error)}): give "
-            "its class, or a function that makes no difference between them"
-        ) from error
-
-
-def _close(vut: Any, deadline_s: float) -> None:
-    """Call `close`, if there is one; what it raises comes too late to matter, and is printed."""
-    if vut is None:
-        return
-    deadline = Deadline(deadline_s)  # of its own: this may be part of another call
-    try:
-        with deadline:
-            if getattr(vut, "close", None) is not None:
-                deadline.call(NO_CORRIDOR, vut.close)
-    except BaseException as error:
-        sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
 
 
 def _module_of(source: str) -> ModuleType:
@@ -393,20 +418,3 @@ def _module_of(source: str) -> ModuleType:
 
 def _cannot_load(what: str, error: BaseException) -> str:
     return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"
-
-
-def _file_of(argument: str) -> str:
-    source = argument.rpartition(":")[0]
-    return source if source.endswith(".py") else ""
-
-
-KIND: Final = VutKind(
-    form="MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME",
-    what="a class with act(seen), a function of seen, or a batched class",
-    example="--vut my_vut.py:MyVut",
-    prepare=python_vut,
-    hosted=True,
-    asks_sumo=False,
-    file_of=_file_of,
-)
-INSTALLED_KIND: Final = VutKind(prepare=installed_vut, hosted=True, asks_sumo=False)

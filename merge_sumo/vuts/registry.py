@@ -5,21 +5,21 @@ from __future__ import annotations
 from typing import Final
 
 from merge_sumo.system.registry import Registry
-from merge_sumo.vuts.base import BUILT_IN, HERE, INSTALLED, PYTHON, VutKind
+from merge_sumo.vuts.base import BUILT_IN, HERE, INSTALLED, PYTHON, ControllerKind
 
-KINDS: Final[Registry[VutKind]] = Registry(
+KINDS: Final[Registry[type[ControllerKind]]] = Registry(
     "merge_sumo.vut_kinds",
     "kind of VUT",
     {
-        PYTHON: "merge_sumo.vuts.python:KIND",
-        "traci": "merge_sumo.vuts.traci.vut:KIND",
-        "sumo": "merge_sumo.vuts.sumo_model:KIND",
-        "onnx": "merge_sumo.vuts.onnx:KIND",
-        "fmu": "merge_sumo.vuts.fmu:KIND",
-        HERE: "merge_sumo.vuts.here:KIND",
-        INSTALLED: "merge_sumo.vuts.python:INSTALLED_KIND",
-        BUILT_IN: "merge_sumo.vuts.built_in:KIND",
+        PYTHON: "merge_sumo.vuts.python:PythonKind",
+        "traci": "merge_sumo.vuts.traci.vut:TraciKind",
+        "sumo": "merge_sumo.vuts.sumo_model:SumoKind",
+        "onnx": "merge_sumo.vuts.onnx:OnnxKind",
+        "fmu": "merge_sumo.vuts.fmu:FmuKind",
+        HERE: "merge_sumo.vuts.here:HereKind",
+        INSTALLED: "merge_sumo.vuts.python:InstalledKind",
+        BUILT_IN: "merge_sumo.vuts.built_in:BuiltInKind",
     },
-    accepts=lambda item: isinstance(item, VutKind),
-    contract="a merge_sumo.vuts.base.VutKind",
+    accepts=lambda item: isinstance(item, type) and issubclass(item, ControllerKind),
+    contract="a subclass of merge_sumo.vuts.base.ControllerKind",
 )

@@ -21,7 +21,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.sumo.world import World
-from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
 
 SHARED_OPTIONS: Final = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),
@@ -72,28 +72,37 @@ MODELS: Final[dict[str, tuple[set[str], dict[str, float]]]] = {
 noise all are deterministic."""
 
 
-def sumo_vut(spec: VutSpec, _options: VutOptions) -> Vut:
-    """Return the VUT of `sumo:MODEL?NAME=VALUE&...`; `UserError` for what SUMO does not have."""
-    model = spec.argument
-    if model not in MODELS:
-        raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
-    own, defaults = MODELS[model]
-    known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
-    chosen = spec.numbers()
-    for name, value in chosen.items():
-        if name not in known:
-            raise spec.has_no(name, known)
-        least = -1 if name in LANE_CHANGE_OPTIONS else 0
-        if value < least:
-            raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
+class SumoKind(ControllerKind):
+    """SUMO's own driver: `sumo:MODEL?NAME=VALUE&...`."""
 
-    def make(corridors: int, world: object) -> Driver:
+    form = "sumo:MODEL[?OPTION=VALUE&...]"
+    what = "SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic"
+    example = '--vut "sumo:IDM?tau=1.2"'
+    own_code = False
+
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Take model and options; `UserError` for what SUMO does not have."""
+        super().__init__(spec, options)
+        model = spec.argument
+        if model not in MODELS:
+            raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
+        own, defaults = MODELS[model]
+        known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
+        self.parameters = chosen = spec.numbers()
+        for name, value in chosen.items():
+            if name not in known:
+                raise spec.has_no(name, known)
+            least = -1 if name in LANE_CHANGE_OPTIONS else 0
+            if value < least:
+                raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
+        options_of_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
+        self.vut_type = {"carFollowModel": model, **options_of_type}
+
+    def driver(self, corridors: int, world: object) -> Driver:
+        """Return a driver in a world of SUMO."""
         if not isinstance(world, World):
-            raise UserError(f"{spec} drives in a SUMO world only")
+            raise UserError(f"{self.spec} drives in a SUMO world only")
         return SumoVut(corridors, world)
-
-    vut_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
-    return Vut(make=make, vut_type={"carFollowModel": model, **vut_type}, parameters=chosen)
 
 
 class SumoVut(Driver):
@@ -133,12 +142,3 @@ class SumoVut(Driver):
         _, end_m = self.world.road.lane_m or (0.0, 0.0)
         next_m = self.world.x_m[VUT] + self.world.v_mps[VUT] * DT_S
         return stopping_mps(end_m - END_MARGIN_M - next_m, -self.world.scenario.a_min_mps2)
-
-
-KIND: Final = VutKind(
-    form="sumo:MODEL[?OPTION=VALUE&...]",
-    what="SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic",
-    example='--vut "sumo:IDM?tau=1.2"',
-    prepare=sumo_vut,
-    own_code=False,
-)

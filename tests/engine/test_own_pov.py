@@ -26,7 +26,8 @@ from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import LEVELS, OWN, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.verdict.score import measure
-from merge_sumo.vuts.base import VutOptions, seen_at_start
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.controller import Start
 
 KEEPS = "def Pov(seen):\n    return 0.0\n"
 YIELDS = """
@@ -116,7 +117,7 @@ class Noting(Driver):
         self.scenes: list[Scene] = []
 
     def begin(self, corridor, case):
-        self.begun.append((corridor, seen_at_start(case)))
+        self.begun.append((corridor, Start.of(case).seen))
 
     def act(self, scene):
         self.scenes.append(scene)

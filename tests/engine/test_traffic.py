@@ -16,7 +16,8 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.world import World
 from merge_sumo.verdict.score import FOLLOWED_UP, measure
-from merge_sumo.vuts.base import VutOptions, seen_in
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.controller import seen_in
 from merge_sumo.vuts.factory import VutFactory
 
 TRAFFIC = replace(

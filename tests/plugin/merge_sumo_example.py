@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
@@ -15,7 +14,8 @@ from merge_sumo.scenario.scenario import POV, VUT
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.verdict.bodies import CentreLines
 from merge_sumo.verdict.measures import Measure
-from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.vuts.controller import Controller, Seen
 
 
 class MiddleSampler(LevelwiseSampler):
@@ -50,35 +50,33 @@ CLOSEST = Measure(
 )
 
 
-class ConstantDriver(Driver):
+class ConstantController(Controller):
     """Drives with one acceleration in every step."""
 
-    def __init__(self, corridors: int, acceleration_mps2: float) -> None:
-        """Drive in a number of corridors."""
-        super().__init__(corridors)
+    def __init__(self, acceleration_mps2: float) -> None:
+        """Take the acceleration."""
         self._acceleration_mps2 = acceleration_mps2
 
-    def act(self, scene: Scene) -> FloatArray:
-        """Return the acceleration in each corridor, (K,)."""
-        return np.full(self.corridors, self._acceleration_mps2)
+    def act(self, _seen: Seen) -> float:
+        """Return the acceleration."""
+        return self._acceleration_mps2
 
 
-def constant_vut(spec: VutSpec, _options: VutOptions) -> Vut:
-    """Return the VUT `constant:MPS2`; `UserError` where that is no number."""
-    try:
-        acceleration_mps2 = float(spec.argument)
-    except ValueError as error:
-        raise UserError(f"{spec}: give an acceleration in m/s2") from error
+class ConstantKind(ControllerKind):
+    """`constant:MPS2`."""
 
-    def make(corridors: int, _world: object) -> Driver:
-        return ConstantDriver(corridors, acceleration_mps2)
+    form = "constant:MPS2"
+    what = "one acceleration in every step"
+    example = "--vut constant:0.5"
 
-    return Vut(make=make)
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Read the acceleration; `UserError` where it is not a number."""
+        super().__init__(spec, options)
+        try:
+            self._acceleration_mps2 = float(spec.argument)
+        except ValueError as error:
+            raise UserError(f"{spec}: give an acceleration in m/s2") from error
 
-
-CONSTANT = VutKind(
-    form="constant:MPS2",
-    what="one acceleration in every step",
-    example="--vut constant:0.5",
-    prepare=constant_vut,
-)
+    def controller(self) -> Controller:
+        """Return a controller of one corridor."""
+        return ConstantController(self._acceleration_mps2)

@@ -1,4 +1,4 @@
-"""The process of a user's VUT: how it starts, what ends it, what it leaves, and what it may say."""
+"""The process of a user's controller: how it starts, what ends it, and what it may answer."""
 
 # mypy: no-strict-optional
 
@@ -21,11 +21,12 @@ from processes import none_left, wait_for
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
-from merge_sumo.scenario.scenario import US23, as_merge, lane_of
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.controller import Start
 from merge_sumo.vuts.factory import VutFactory
-from merge_sumo.vuts.host import wire
-from merge_sumo.vuts.host.hosted import HostedVut
+from merge_sumo.vuts.hosting import HostedDriver
+from merge_sumo.vuts.messages import Act, decode_request, encode, packed, unpacked
 from merge_sumo.vuts.process import Echo, append
 from merge_sumo.vuts.spec import parse
 
@@ -88,21 +89,34 @@ def scene(corridors: int) -> Scene:
     return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
 
 
-def test_after_a_death_it_starts_anew_and_knows_which_files_there_were(spec, tmp_path):
-    source = """
-import os, pathlib
-open(pathlib.Path(__file__).with_name("gains.txt")).close()
-def Vut(seen):
-    os._exit(3)
-"""
-    (tmp_path / "gains.txt").touch()
-    vut = HostedVut(2, parse(spec(source)), OPTIONS)
+def test_after_a_death_it_starts_again_and_knows_which_files_there_were(spec):
+    vut = HostedDriver(2, parse(spec("import os\ndef Vut(seen):\n    os._exit(3)\n")), OPTIONS)
     try:
         for _ in range(2):
-            with pytest.raises(VutLostError, match="exit code 3") as lost:
+            with pytest.raises(VutLostError, match="exit code 3"):
                 vut.act(scene(2))
-            assert lost.value.corridor == 0
-            assert {file.name for file in vut.files()} == {"my_vut.py", "gains.txt"}
+            assert {file.name for file in vut.files()} == {"my_vut.py"}
+    finally:
+        vut.close()
+
+
+def test_a_controller_is_opened_once_and_drives_in_that_process(spec, tmp_path):
+    source = """
+import os, pathlib
+with open(pathlib.Path(__file__).with_name("opened"), "a") as file:
+    file.write(f"{os.getpid()} ")
+def Vut(seen):
+    return 1.0
+"""
+    run_campaign(campaign_settings(vut=spec(source), cases=4, batch=2), tmp_path / "run")
+    assert len((tmp_path / "opened").read_text().split()) == 1
+
+
+def test_controllers_that_take_long_together_are_not_late(spec):
+    source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
+    vut = HostedDriver(10, parse(spec(source)), OPTIONS)  # 2 s, and the process has 1.7 s
+    try:
+        assert vut.act(scene(10)).tolist() == [1.0] * 10
     finally:
         vut.close()
 
@@ -110,13 +124,15 @@ def Vut(seen):
 def test_what_starts_print_is_shown_from_where_it_differs(capsys):
     echo = Echo()
     for parts in ([b"a", b"b"], [b"ab"], [b"a", b"b"], [b""], [b"a", b"c"], [b"a"], [b"a"]):
-        echo.show(parts)
+        for part in parts:
+            echo.show(part)
+        echo.end()
     echo.close()
     told = "ab(printed 2 more times)\naca(printed 1 more time)\n"
     assert capsys.readouterr().err == told
 
 
-def test_what_it_reads_may_be_its_to_write_and_its_code_is_not(spec, tmp_path):
+def test_its_code_may_not_change_and_data_that_it_reads_may(spec, tmp_path):
     (tmp_path / "helper.py").touch()
     count = tmp_path / "count.txt"
     count.write_text("1")
@@ -127,7 +143,7 @@ def Vut(seen):
     return 1.0
 """
     factory = VutFactory.of(spec(source))
-    assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py", "count.txt"}
+    assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py"}
     count.write_text("2")
     factory(1).close()
     (tmp_path / "helper.py").write_text("changed = True")
@@ -135,30 +151,13 @@ def Vut(seen):
         factory(1)
 
 
-def test_what_it_loads_while_it_drives_is_of_its_files_and_what_it_writes_is_not(spec, tmp_path):
-    for name in ("helper.py", "late.py", "gains.txt", "more.txt", "control.so", "never.txt"):
-        (tmp_path / name).touch()
-    source = """
-import ctypes, os, pathlib, helper
-HERE = pathlib.Path(__file__).parent
-(HERE / "gains.txt").read_text()
-try:
-    ctypes.CDLL(str(HERE / "control.so"))
-except OSError:
-    pass
-def Vut(seen):
-    import late
-    os.close(os.open(HERE / "more.txt", os.O_RDONLY))
-    (HERE / "log.txt").write_text("x")
-    (HERE / "log.txt").read_text()
-    return 1.0
-"""
-    vut = HostedVut(1, parse(spec(source)), OPTIONS)
+def test_what_it_imports_while_it_drives_is_of_its_files(spec, tmp_path):
+    (tmp_path / "late.py").touch()
+    vut = HostedDriver(1, parse(spec("def Vut(seen):\n    import late\n    return 1.0\n")), OPTIONS)
     try:
-        loaded = {"my_vut.py", "helper.py", "gains.txt", "control.so"}
-        assert {f.name for f in vut.files()} == loaded
+        assert {f.name for f in vut.files()} == {"my_vut.py"}
         vut.act(scene(1))
-        assert {f.name for f in vut.files()} == loaded | {"late.py", "more.txt"}
+        assert {f.name for f in vut.files()} == {"my_vut.py", "late.py"}
     finally:
         vut.close()
 
@@ -184,18 +183,16 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
     append(tmp_path / "pipe", b"x")
 
 
-class TestTheWire:
-    def test_the_lane_and_who_has_merged_travel_and_the_rest_of_the_case_does_not(self):
-        lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
-        cases = [
-            MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=scenario)
-            for scenario in (US23, lane)
-        ]
-        merged = np.array([False, True])
-        sent = scene(2)._replace(merged=merged)
-        begun, told = wire.unpack_scene(wire.pack_scene(list(enumerate(cases)), sent))
-        assert told.merged.tolist() == [False, True]
-        assert told.facing is None
-        assert [lane_of(case.scenario) for _, case in begun] == [None, (-70.0, 130.0)]
-        assert as_merge(begun[1][1].scenario).lane_end == "merge"
-        assert wire.unpack_scene(wire.pack_scene([], scene(2)))[1].merged is None
+def test_the_lane_and_who_has_merged_reach_the_process_and_the_rest_of_the_case_does_not():
+    lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
+    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
+    sent = scene(2)._replace(merged=np.array([False, True]))
+    request = decode_request(encode(Act([(1, Start.of(case))], packed(sent))))
+    ((corridor, start),) = request.starts
+    assert (corridor, start) == (1, Start.of(case))
+    assert start.seen.lane_end_m == 130.0
+    assert {"level", "svo_rad"}.isdisjoint(start.__struct_fields__)
+    told = unpacked(request.scene)
+    assert told.merged.tolist() == [False, True]
+    assert told.facing is None
+    assert np.array_equal(told.x_m, sent.x_m)

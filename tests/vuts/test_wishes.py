@@ -10,8 +10,9 @@ from conftest import some
 from vut_contract import ON_LANE, begin, factory, in_process, on_lane
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
-from merge_sumo.vuts.base import Seen, VutOptions, seen_at_start, seen_in
-from merge_sumo.vuts.host.hosted import HostedVut
+from merge_sumo.vuts.base import VutOptions
+from merge_sumo.vuts.controller import Seen, Start, seen_in
+from merge_sumo.vuts.hosting import HostedDriver
 from merge_sumo.vuts.spec import parse
 
 
@@ -44,7 +45,7 @@ def test_it_sees_the_lane_and_whether_a_wish_would_be_granted():
     assert all(isinstance(s, Seen) for s in seen)
     assert seen[0][1:] == (-102.01, 30.0, -72.01, 20.0)
     assert [car.x_m for car in seen[0].others] == [-102.01]
-    start = seen_at_start(ON_LANE)
+    start = Start.of(ON_LANE).seen
     assert (start.lane_begin_m, start.may_merge, start.merged) == (-70.0, False, False)
 
 
@@ -186,14 +187,12 @@ def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
 
 def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(spec):
     source = """
-import json, os
-import merge_sumo.vuts.host.wire as wire
-wire.pack_answers = lambda answers, *more: answers.tobytes() + json.dumps(
-    {"reasons": {}, "signals": {}, "wishes": [7] * len(answers)}).encode()
+from merge_sumo.vuts.messages import Acted
+Acted.of = lambda driver, scene: Acted(driver.act(scene).tobytes(), {}, {}, bytes([7, 7]))
 def Vut(seen):
     return 1.0, True
 """
-    driver = HostedVut(2, parse(spec(source)), VutOptions(deadline_s=1.0))
+    driver = HostedDriver(2, parse(spec(source)), VutOptions(deadline_s=1.0))
     try:
         begun(driver, 2)
         with pytest.raises(VutLostError, match="broke the channel to its process"):

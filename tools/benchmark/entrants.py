@@ -27,7 +27,7 @@ from merge_sumo.system.hashing import sha256_of
 from merge_sumo.system.source_files import module_of_file
 from merge_sumo.verdict.prediction import Prediction
 from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.base import Deadline, DeadlineExceeded, text_of
+from merge_sumo.vuts.deadline import Deadline, DeadlineExceeded, text_of
 
 T = TypeVar("T")
 
@@ -179,7 +179,9 @@ class Watch:
     def _timed(self, function: Callable[..., T], *arguments: Any) -> T:
         start_s, start_cpu_s = perf_counter(), process_time()
         try:
-            answer: T = self.deadline.call(0, function, *arguments)
+            self.deadline.start()
+            answer: T = function(*arguments)
+            self.deadline.stop()
         except UserError:
             raise
         except DeadlineExceeded as error:

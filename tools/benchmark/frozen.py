@@ -17,7 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.system.suggestions import meant
-from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
 from merge_sumo.vuts.registry import KINDS
 
 CRUISE_MPS: Final = 28.0
@@ -148,12 +148,20 @@ FROZEN_VUTS: Final[dict[str, Callable[[int], Driver]]] = {
 """The frozen VUTs by name."""
 
 
-def _frozen_vut(spec: VutSpec, _options: VutOptions) -> Vut:
-    """Return the VUT of `frozen:NAME`; `UserError` for another name."""
-    name = spec.argument
-    if name not in FROZEN_VUTS:
-        raise UserError(f"there is no VUT frozen:{name}: {meant(name, FROZEN_VUTS)}")
-    return Vut(make=lambda corridors, _world: FROZEN_VUTS[name](corridors))
+class FrozenKind(ControllerKind):
+    """`frozen:NAME`."""
+
+    own_code, by_arrays = False, True
+
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Find the VUT; `UserError` for another name."""
+        super().__init__(spec, options)
+        if spec.argument not in FROZEN_VUTS:
+            raise UserError(f"there is no VUT {spec}: {meant(spec.argument, FROZEN_VUTS)}")
+
+    def driver(self, corridors: int, _world: object) -> Driver:
+        """Return its driver."""
+        return FROZEN_VUTS[self.spec.argument](corridors)
 
 
-KINDS.register("frozen", VutKind(prepare=_frozen_vut, own_code=False, by_arrays=True))
+KINDS.register("frozen", FrozenKind)

@@ -27,7 +27,7 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.sumo.world import World
 from merge_sumo.system.trust import check_code
-from merge_sumo.vuts.base import Vut, VutKind, VutOptions, VutSpec
+from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
 from merge_sumo.vuts.process import GRACE_S, Echo, Program, append, code_of, split_command
 from merge_sumo.vuts.traci.child import (
     HOST,
@@ -45,36 +45,55 @@ LOOK_S: Final = 0.1
 """Time between two looks whether a program that is waited for has ended."""
 
 
-def traci_vut(spec: VutSpec, options: VutOptions) -> Vut:
-    """Return the VUT of `traci`, `traci:PORT` or `traci:COMMAND`.
+class TraciKind(ControllerKind):
+    """`traci`, `traci:PORT` or `traci:COMMAND`.
 
     A command gets its port as an argument: any free one will do, and several can run at a time.
-    Raises `UserError` for a port or a command that is none, and for code that others may write.
     """
-    command, port = None, 0
-    if is_port(spec.argument):
-        port = int(spec.argument or DEFAULT_PORT)
-        if not 1 <= port <= 65535:
-            raise UserError(f"{spec}: the port is a number from 1 to 65535")
-    else:
-        command = split_command(spec.argument)
-    files = code_of(command) if command else ()
-    for file in files:
-        check_code(file)
 
-    def make(corridors: int, world: object) -> Driver:
-        if not isinstance(world, World):
-            raise UserError(f"{spec} drives in a SUMO world only")
-        return TraciVut(world.road, world.scenario, port, command, options)
-
-    return Vut(
-        make=make,
-        max_corridors=1,
-        max_workers=None if command else 1,
-        files=files,
-        no_pov="a TraCI client drives the vehicle named vut and no other; bring the POV as "
-        "Python, an FMU, a network or sumo:MODEL",
+    form = "traci:COMMAND or traci[:PORT]"
+    what = (
+        "a program in any language that drives `vut` by TraCI; started by you where no command is "
+        "given"
     )
+    example = '--vut "traci:python my_controller.py {port}"'
+    has_parameters, files_are_known = False, False
+    no_parameters = "a TraCI client is a program with parameters of its own"
+    max_corridors = 1
+    no_pov = (
+        "a TraCI client drives the vehicle named vut and no other; bring the POV as Python, an "
+        "FMU, a network or sumo:MODEL"
+    )
+
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Read the port or the command.
+
+        Raises `UserError` for a port or a command that is none, and for code that others may write.
+        """
+        super().__init__(spec, options)
+        self._command, self._port = None, 0
+        if is_port(spec.argument):
+            self._port = int(spec.argument or DEFAULT_PORT)
+            if not 1 <= self._port <= 65535:
+                raise UserError(f"{spec}: the port is a number from 1 to 65535")
+            self.max_workers = 1
+        else:
+            self._command = split_command(spec.argument)
+            self.files = code_of(self._command)
+        for file in self.files:
+            check_code(file)
+
+    @classmethod
+    def waits(cls, argument: str) -> bool:
+        """Return whether an argument names the port at which a user's client is waited for."""
+        return is_port(argument)
+
+    def driver(self, _corridors: int, world: object) -> Driver:
+        """Return a driver in a world of SUMO."""
+        if not isinstance(world, World):
+            raise UserError(f"{self.spec} drives in a SUMO world only")
+        road, scenario = world.road, world.scenario
+        return TraciVut(road, scenario, self._port, self._command, self.options)
 
 
 def is_port(argument: str) -> bool:
@@ -230,9 +249,7 @@ class TraciVut(Driver):
         except ChildDiedError as died:
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
-            raise VutLostError(
-                f"the SUMO that answers the controller {died}", killed=died.killed
-            ) from died
+            raise VutLostError(f"the SUMO that answers the controller {died}") from died
         except TimeoutError as error:
             raise FaultError(
                 "the SUMO that answers the controller did not come to an end with what it asked"
@@ -320,16 +337,3 @@ class TraciVut(Driver):
         if self._program is not None:
             self._program.stop(GRACE_S if grace else 0.0)
             self._program = None
-
-
-KIND: Final = VutKind(
-    form="traci:COMMAND or traci[:PORT]",
-    what="a program in any language that drives `vut` by TraCI; started by you where no "
-    "command is given",
-    example='--vut "traci:python my_controller.py {port}"',
-    prepare=traci_vut,
-    has_parameters=False,
-    no_parameters="a TraCI client is a program with parameters of its own",
-    files_are_known=False,
-    waits=is_port,
-)

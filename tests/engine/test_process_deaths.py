@@ -1,4 +1,4 @@
-"""Deaths and stops that come from outside, and those that are a VUT's own doing."""
+"""Deaths of a controller's process: from outside, and by the controller itself."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.system.blame import MAX_DEATHS, MAX_KILLS, Blame
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
 
@@ -32,22 +31,6 @@ class Vut:
         return 0.5
 """
 KILLED = "os.kill(os.getpid(), signal.SIGKILL)"
-STOPS = """
-import os, pathlib, subprocess, time
-HERE = pathlib.Path(__file__).parent
-class Vut:
-    def reset(self, seen):
-        self.bad = seen.v_pov_mps > 33.0
-    def act(self, seen):
-        if self.bad and seen.t_s == 0.3 and not (HERE / "was-stopped").exists():
-            (HERE / "was-stopped").touch()
-            all_of_us = f"{os.getpid()} {os.getppid()}"
-            script = f"kill -STOP {all_of_us}; sleep 5; touch went-on; kill -CONT {all_of_us}"
-            subprocess.Popen(["sh", "-c", script], cwd=HERE)
-            while not (HERE / "went-on").exists():
-                time.sleep(0.01)
-        return 0.5
-"""
 
 
 def settings(spec: str, **more: object) -> CampaignSettings:
@@ -78,42 +61,18 @@ def calm(tmp_path_factory) -> Run:
     return run_campaign(settings(f"{folder / 'calm.py'}:Vut"), folder / "run")
 
 
-class TestBlame:
-    def test_is_for_what_dies_again_alone(self):
-        blame = Blame[int]()
-        assert not blame.died(1, alone=False)
-        assert not blame.died(1, alone=True)
-        assert blame.died(1, alone=True)
-        assert not blame.died(2, alone=True)
-
-    def test_never_falls_on_what_died_beside_others(self):
-        blame = Blame[int]()
-        assert not any(blame.died(1, alone=False, named=True) for _ in range(9))
-        assert blame.died(1, alone=True)
-
-    def test_comes_at_once_where_it_hangs_and_late_where_it_is_killed(self):
-        assert Blame[int]().died(1, alone=True, repeatable=True)
-        blame = Blame[int]()
-        found = [blame.died(1, alone=True, killed=True) for _ in range(MAX_KILLS)]
-        assert found == [False] * (MAX_KILLS - 1) + [True]
-        assert MAX_DEATHS < MAX_KILLS
-
-
 class TestKills:
     @pytest.mark.slow
-    @pytest.mark.parametrize(
-        ("how", "times"),
-        [(KILLED, MAX_KILLS - 1), ("os._exit(3)", 1)],
-    )
-    def test_that_a_case_did_not_earn_leave_it_as_it_is(self, campaign, calm, how, times):
-        struck = campaign("struck", DIES.format(how=how, times=times))
+    @pytest.mark.parametrize("how", [KILLED, "os._exit(3)"])
+    def test_that_come_once_leave_cases_as_they_are(self, campaign, calm, how):
+        struck = campaign("struck", DIES.format(how=how, times=1))
         assert outcomes(struck) == outcomes(calm)
-        bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
         assert calm.settings.ran_again == 0
         assert RAN_AGAIN not in calm.record
-        assert struck.settings.ran_again == bad
-        assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] == bad
-        assert f"{bad} cases ran again, because a process was killed" in struck.ran_again_in_words
+        bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
+        assert struck.settings.ran_again >= bad
+        assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] >= bad
+        assert "cases ran again, because a process was killed" in struck.ran_again_in_words
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
@@ -141,11 +100,3 @@ if not flag.exists():
         assert outcomes(campaign("once", once + CALM)) == outcomes(calm)
         with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
             campaign("always", f"import os, signal\n{KILLED}\n{CALM}")
-
-
-@pytest.mark.slow
-def test_a_stop_of_all_of_us_is_no_error_of_the_vut(campaign, calm):
-    stopped = campaign("stopped", STOPS, deadline_s=2.0)
-    assert (stopped.folder.parent / "went-on").exists()
-    assert outcomes(stopped) == outcomes(calm)
-    assert stopped.settings.ran_again >= 1

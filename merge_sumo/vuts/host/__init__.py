@@ -1,1 +1,0 @@
-"""A process of its own for the code of a user."""
