@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns import journal
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -165,7 +165,7 @@ def begin(settings: CampaignSettings, folder: Path) -> None:
 def go_on(folder: Path) -> None:
     """Go on with a campaign."""
     settings = settings_in(folder, read_settings(folder))
-    resume_campaign(settings, resolve(settings), folder)
+    run_campaign(settings, resolve(settings), folder, resumes=True)
 
 
 def main() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -12,7 +11,7 @@ from merge_sumo import config as c
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.settings import opened
 from merge_sumo.campaigns.again import call_again
-from merge_sumo.campaigns.campaign import resume_campaign, run_campaign
+from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.engine.plan import SimulationPlan
@@ -77,13 +76,16 @@ def run_and_report(
     try:
         with opened(where, plan) as workers, bars, report:
             begun_s = perf_counter()
-            run = run_campaign
-            if goes_on:
-                run = partial(resume_campaign, on_before=bars.ran_before, warn=notice)
-            done = run(
-                *(settings, plan, folder, (bars.ended, report.rewrite, on_cases)),
+            done = run_campaign(
+                settings,
+                plan,
+                folder,
+                (bars.ended, report.rewrite, on_cases),
+                resumes=goes_on,
+                on_before=bars.ran_before,
                 workers=workers,
                 begin=lambda: bars.begin(title),
+                warn=notice,
             )
             result = CampaignRun(done, config.gates)
             took_s = perf_counter() - begun_s

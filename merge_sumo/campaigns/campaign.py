@@ -28,6 +28,7 @@ from merge_sumo.system.hashing import files_now
 from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.twin.pair import TwinPair
 from merge_sumo.twin.twin import Twin
+from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.process import LOG
 
@@ -49,92 +50,121 @@ def run_campaign(
     folder: Path,
     callbacks: Sequence[Callback] = (),
     *,
-    workers: Workers | None = None,
-    begin: Callable[[], None] = lambda: None,
-) -> Run:
-    """Run a campaign into a new folder and return it.
-
-    Same settings, same versions: same `outcomes.jsonl`, whatever the workers. The worst failures
-    are exported as folders that sumo-gui opens.
-
-    Args:
-        settings: what to run.
-        plan: how its cases run: that of the settings (`resolve`).
-        folder: where to.
-        callbacks: called in turn with the outcomes of one or more groups. What stops the campaign
-            there is followed by `resume_campaign`.
-        workers: where cases run, by default in this process.
-        begin: called before the first case, when nothing is refused any more.
-
-    Raises:
-        UserError: if the folder exists, or the plan cannot be carried out.
-    """
-    check_new(folder)
-    check_new(folder / SCENARIOS / case_name(settings.cases))
-    plan = _sized(settings, plan, folder, workers)
-    with workers_or_here(workers) as available, ExitStack() as opened:
-        open_simulators(plan, available)
-        journal = opened.enter_context(Journal.create(folder, record_of(settings, plan)))
-        if plan.earlier is not None:
-            record = record_of(settings.earlier, plan.earlier)
-            journal.earlier = opened.enter_context(Journal.create(folder / AGAINST, record))
-        begin()
-        return _run(settings, plan, journal, available, callbacks)
-
-
-def resume_campaign(
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    folder: Path,
-    callbacks: Sequence[Callback] = (),
-    *,
+    resumes: bool = False,
     on_before: Callback = lambda _: None,
     workers: Workers | None = None,
     begin: Callable[[], None] = lambda: None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Run:
-    """Continue a campaign that was stopped, however it was; return it as `run_campaign` does.
+    """Run a campaign into a new folder, or one that was stopped to its end; return it.
 
-    The result is the same to the last byte as if it had never been stopped; also where the settings
-    have more cases than it had, if those ended with a whole batch.
+    Same settings, same versions: same `outcomes.jsonl`, whatever the workers, and as if the
+    campaign had never been stopped; also where the settings have more cases than it had, if those
+    ended with a whole batch. The worst failures are exported as folders that sumo-gui opens.
 
     Args:
-        settings: those of the folder, and those that were named again (`settings_of`).
-        plan: as of `run_campaign`.
-        folder: of the campaign.
-        callbacks: as of `run_campaign`.
+        settings: what to run; of a campaign that resumes, those of the folder, and those that were
+            named again (`settings_of`).
+        plan: how its cases run: that of the settings (`resolve`).
+        folder: where to.
+        callbacks: called in turn with the outcomes of one or more groups when they are stored.
+        resumes: whether the folder has a campaign that was stopped, however it was.
         on_before: called with the outcomes of the cases that ran before.
-        workers: as of `run_campaign`.
-        begin: as of `run_campaign`.
-        warn: called with a sentence on what was dropped.
+        workers: where cases run, by default in this process.
+        begin: called before the first case, when nothing is refused any more.
+        warn: called with a sentence on outcomes that were dropped.
 
     Raises:
-        UserError: if something differs that decides outcomes: settings, versions, net, policies.
-            The sentence has the name of the field.
+        UserError: if the plan cannot be carried out; if the folder of a new campaign exists; if
+            something of a stopped one differs that decides outcomes: settings, versions, net,
+            policies. The sentence has the name of the field.
     """
-    check_own(folder / SCENARIOS, folder / AGAINST)
+    if resumes:
+        check_own(folder / SCENARIOS, folder / AGAINST)
+    else:
+        check_new(folder)
+        check_new(folder / SCENARIOS / case_name(settings.cases))
     plan = _sized(settings, plan, folder, workers)
+    outcomes: list[Outcome] = []
     with workers_or_here(workers) as available, ExitStack() as opened:
-        journal, before = _reopened(folder, opened, warn)
-        records = [(journal, _compared(settings, plan, before))]
-        history, old = before.outcomes, None
-        if plan.earlier is not None:
-            place = folder / AGAINST
-            if not before.outcomes:  # it may have been stopped before that folder was whole
-                record = record_of(settings.earlier, plan.earlier)
-                with suppress(TakenError), Journal.create(place, record):
-                    pass
-            journal.earlier, old = _reopened(place, opened, warn)
-            records.append((journal.earlier, _compared(settings.earlier, plan.earlier, old)))
-            before.earlier()  # raises where cases are missing; more of them run again
-            journal.earlier.keep(old, len(history))
-        open_simulators(plan, available)
-        for one, rewritten in records:
-            if rewritten is not None:
-                one.rewrite_settings(rewritten)
-        on_before(history)
+        if resumes:
+            journal, history = _resumed(settings, plan, folder, opened, available, warn)
+            outcomes += [episode.outcome for episode in history]
+            on_before(outcomes)
+        else:
+            open_simulators(plan, available)
+            journal, history = _created(settings, plan, folder, opened), []
         begin()
-        return _run(settings, plan, journal, available, callbacks, before, old)
+
+        def on_groups(groups: Groups) -> None:
+            journal.append(*groups)
+            stored = [episode.outcome for group in groups for episode in group]
+            outcomes.extend(stored)
+            for callback in callbacks:
+                callback(stored)
+
+        sampler = _sampler(settings, plan)
+        young = sampler.uses_predictions and plan.against is not None
+        loop = SearchLoop(
+            sampler,
+            plan,
+            settings.cases,
+            workers=available,
+            batch=settings.batch,
+            first=FIRST_BATCH * len(settings.levels) if young else None,
+            in_flight=settings.in_flight,
+            stop=settings.stopping_rule(),
+            history=history,
+        )
+        loop.run(on_groups)
+        done = Run(folder, outcomes)
+        _finish(done, settings, plan, available)
+    return done
+
+
+def _created(
+    settings: CampaignSettings, plan: SimulationPlan, folder: Path, opened: ExitStack
+) -> Journal:
+    """Return the journal of a new folder, which `opened` closes."""
+    journal = opened.enter_context(Journal.create(folder, record_of(settings, plan)))
+    if plan.earlier is not None:
+        record = record_of(settings.earlier, plan.earlier)
+        journal.earlier = opened.enter_context(Journal.create(folder / AGAINST, record))
+    return journal
+
+
+def _resumed(
+    settings: CampaignSettings,
+    plan: SimulationPlan,
+    folder: Path,
+    opened: ExitStack,
+    workers: Workers,
+    warn: Callable[[str], None],
+) -> tuple[Journal, list[Episode]]:
+    """Return the journal of a folder, which `opened` closes, and the episodes that it has."""
+    journal, before = _reopened(folder, opened, warn)
+    records = [(journal, _compared(settings, plan, before))]
+    motion = SAMPLERS[settings.sampler].uses_predictions
+    old: Run | None = None
+    if plan.earlier is not None:
+        place = folder / AGAINST
+        if not before.outcomes:  # it may have been stopped before that folder was whole
+            record = record_of(settings.earlier, plan.earlier)
+            with suppress(TakenError), Journal.create(place, record):
+                pass
+        journal.earlier, old = _reopened(place, opened, warn)
+        records.append((journal.earlier, _compared(settings.earlier, plan.earlier, old)))
+        before.earlier()  # raises where cases are missing; more of them run again
+        journal.earlier.keep(old, len(before.outcomes))
+    open_simulators(plan, workers)
+    for one, rewritten in records:
+        if rewritten is not None:
+            one.rewrite_settings(rewritten)
+    history = before.episodes(motion=motion)
+    if old is not None:
+        pairs = zip(history, old.episodes(motion=motion), strict=True)
+        history = [replace(new, earlier=earlier) for new, earlier in pairs]
+    return journal, history
 
 
 def _sized(
@@ -196,52 +226,15 @@ def _compared(
     return record if moved or grown else None
 
 
-def _run(
-    settings: CampaignSettings,
-    plan: SimulationPlan,
-    journal: Journal,
-    workers: Workers,
-    callbacks: Sequence[Callback],
-    before: Run | None = None,
-    old: Run | None = None,
-) -> Run:
-    """Run the cases that are missing, then some a second time; export the worst."""
-    sampler = _sampler(settings, plan)
-    motion = sampler.uses_predictions
-    history = [] if before is None else before.episodes(motion=motion)
-    if old is not None:
-        pairs = zip(history, old.episodes(motion=motion), strict=True)
-        history = [replace(new, earlier=earlier) for new, earlier in pairs]
-    outcomes = [episode.outcome for episode in history]
-
-    def on_groups(groups: Groups) -> None:
-        journal.append(*groups)
-        stored = [episode.outcome for group in groups for episode in group]
-        outcomes.extend(stored)
-        for callback in callbacks:
-            callback(stored)
-
-    search = SearchLoop(
-        sampler,
-        plan,
-        settings.cases,
-        workers=workers,
-        batch=settings.batch,
-        first=FIRST_BATCH * len(settings.levels) if motion and plan.against else None,
-        in_flight=settings.in_flight,
-        stop=settings.stopping_rule(),
-        history=history,
-    )
-    search.run(on_groups)
+def _finish(done: Run, settings: CampaignSettings, plan: SimulationPlan, workers: Workers) -> None:
+    """Run some cases of a campaign a second time; export the worst."""
     if plan.earlier is not None:
-        repeat(Run(journal.folder / AGAINST), settings.earlier, plan.earlier, workers)
-    done = Run(journal.folder, outcomes)
+        repeat(Run(done.folder / AGAINST), settings.earlier, plan.earlier, workers)
     repeat(done, settings, replace(plan, against=None), workers)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         folder = done.folder / SCENARIOS / case_name(outcome.index)
         with suppress(TakenError):  # whatever it is, the campaign has ended
             export_case(done, outcome.index, folder, plan.road)
-    return done
 
 
 def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:

@@ -39,4 +39,4 @@ def resume_campaign(folder: Path, given: Mapping[str, object] | None = None, **o
     recorded = read_settings(folder)
     named = {**controllers(recorded), **(given or {})}
     settings = settings_of(folder, recorded, named, goes_on=True)
-    return campaign.resume_campaign(settings, resolve(settings), folder, **other)
+    return campaign.run_campaign(settings, resolve(settings), folder, resumes=True, **other)
