@@ -88,7 +88,9 @@ if not TYPE_CHECKING:
         from importlib import import_module
 
         home = "merge_sumo.errors" if name in ("Notice", "UserError") else "merge_sumo.api"
-        return getattr(import_module(home), name)
+        # Kept, as the import sets `vuts` to the folder of that name.
+        globals()[name] = value = getattr(import_module(home), name)
+        return value
 
 
 def __dir__() -> list[str]:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
 
 from cyclopts import App, CycloptsError, Group, Parameter, Token
 
+import merge_sumo as ms
 from merge_sumo import config as c
 from merge_sumo.console import (
     flag_of,
@@ -33,7 +34,7 @@ from merge_sumo.system.streams import prepare_streams
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection
 
-    from merge_sumo.api import CaseRun
+    from merge_sumo import CaseRun
 
 T = TypeVar("T")
 
@@ -184,8 +185,6 @@ def campaign(
     ] = None,
     json: Json = False,
 ) -> int:
-    from merge_sumo import api
-
     if resume is not None and out is not None:
         raise UserError("--resume names the folder: leave --out away")
     folder = resume or out or dated(vut)
@@ -195,20 +194,18 @@ def campaign(
 
     with stoppable(how_to_go_on) as check:
         if resume is None:
-            run = api.campaign(vut, **vars(config), out=folder, check=check)
+            run = ms.campaign(vut, **vars(config), out=folder, check=check)
         else:
-            run = api.resume(folder, **vars(config), vut=vut or None, check=check)
-    print_result(run, json)
+            run = ms.resume(folder, **vars(config), vut=vut or None, check=check)
+    code = print_result(run, json)
     for remark in run.remarks():
         say(remark)
-    return 0 if run.passed else 1
+    return code
 
 
 def _how_to_go_on(folder: Path, config: c.CampaignOptions) -> str:
     """Return the command that goes on, with the options that are no setting of the campaign."""
-    from merge_sumo import api
-
-    words = [api.open_run(folder).go_on]
+    words = [ms.open_run(folder).go_on]
     words += [f"--gate {quoted(gate)}" for gate in config.gates]
     if config.junit is not None:
         words.append(f"--junit {quoted(config.junit)}")
@@ -230,8 +227,6 @@ def run(
     ] = None,
     json: Json = False,
 ) -> int:
-    from merge_sumo import api
-
     def ended(result: CaseRun) -> None:
         print_result(result, json, **({"out": config.out} if json else {}))
         if config.out is not None and not json:
@@ -239,8 +234,8 @@ def run(
         if config.gui and not json:
             say("the replay is open in sumo-gui: close the window to end")
 
-    result = api.run(vut, **vars(config), at=_coordinates(at or []), on_end=ended)
-    return 0 if result.passed else 1
+    result = ms.run(vut, **vars(config), at=_coordinates(at or []), on_end=ended)
+    return 0 if result.is_good else 1
 
 
 def _coordinates(words: Sequence[str]) -> dict[str, float]:
@@ -257,30 +252,22 @@ def _coordinates(words: Sequence[str]) -> dict[str, float]:
 
 @command(c.Probability, SEARCH)
 def probability(config: Options[c.Probability], *, json: Json = False) -> int:
-    from merge_sumo import api
-
     file = config.out or Path(str(config.run)) / "probability.json"
-    print_result(api.probability(**vars(config)), json, file=file)
-    return 0
+    return print_result(ms.probability(**vars(config)), json, file=file)
 
 
 @command(c.Report, LOOK)
 def report(config: Options[c.Report], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    run = api.open_run(str(config.run))
-    print_result(api.report(run), json)
+    run = ms.open_run(str(config.run))
+    code = print_result(ms.report(run), json)
     if sentence := run.run.interruption:
         say(sentence)
-    return 0
+    return code
 
 
 @command(c.Explain, LOOK)
 def explain(config: Options[c.Explain], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.explain(**vars(config)), json)
-    return 0
+    return print_result(ms.explain(**vars(config)), json)
 
 
 @command(c.ReplayCase, LOOK)
@@ -290,20 +277,14 @@ def replay(
     gui: Annotated[bool, Parameter(help="Open it in sumo-gui.")] = False,
     json: Json = False,
 ) -> int:
-    from merge_sumo import api
-
     if gui:
-        return api.open_in_gui(**vars(config))
-    result = api.replay(**vars(config))
-    print_result(result, json)
-    return 0 if result.identical else 1
+        return ms.open_in_gui(**vars(config))
+    return print_result(ms.replay(**vars(config)), json)
 
 
 @command(c.Export, LOOK)
 def export(config: Options[c.Export], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    paths = api.export(**vars(config))
+    paths = ms.export(**vars(config))
     if json:
         print_json({"written": list(map(str, paths))})
         return 0
@@ -327,100 +308,66 @@ def rerun(
     ] = False,
     json: Json = False,
 ) -> int:
-    from merge_sumo import api
-
     if not stress:
-        result = api.rerun(**vars(config))
+        result = ms.rerun(**vars(config))
         page = {"page" if result.text is None else "cases": config.out}
-        print_result(result, json, **page)
-        return 1 if result.worse else 0
+        return print_result(result, json, **page)
     options = c.values_of(config, c.Recorded)
     if c.changed(config, c.Rerun).keys() - options.keys() - {"run"}:
         raise UserError("--stress runs all cases: leave indices, --level, --out and --junit away")
-    print_result(api.stress(config.run, **options), json)
-    return 0
+    return print_result(ms.stress(config.run, **options), json)
 
 
 @command(c.Compare, CHANGE)
 def compare(config: Options[c.Compare], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    result = api.compare(**vars(config))
-    print_result(result, json, page=config.out)
-    return 1 if result.worse else 0
+    return print_result(ms.compare(**vars(config)), json, page=config.out)
 
 
 @command(c.Vuts, OWN)
 def vuts(config: Options[c.Vuts] = c.Vuts(), *, json: Json = False) -> int:
-    from merge_sumo import api
+    from merge_sumo import api  # `merge_sumo.vuts` may be the folder of that name
 
-    print_result(api.vuts(**vars(config)), json)
-    return 0
+    return print_result(api.vuts(**vars(config)), json)
 
 
 @command(c.CheckVut, OWN, "check-vut")
 def check_vut(config: Options[c.CheckVut], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    result = api.check_vut(**vars(config))
-    print_result(result, json)
-    return 0 if result.ok else 1
+    return print_result(ms.check_vut(**vars(config)), json)
 
 
 @command(c.Scenarios, name="list", of=scenario)
 def list_scenarios(*, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.scenarios(), json)
-    return 0
+    return print_result(ms.scenarios(), json)
 
 
 @command(c.NewScenario, name="new", of=scenario)
 def new_scenario(config: Options[c.NewScenario], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.new_scenario(**vars(config)), json)
-    return 0
+    return print_result(ms.new_scenario(**vars(config)), json)
 
 
 @command(c.CheckScenario, name="check", of=scenario)
 def check_scenario(config: Options[c.CheckScenario], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.check_scenario(**vars(config)), json)
-    return 0
+    return print_result(ms.check_scenario(**vars(config)), json)
 
 
 @command(c.Train, OWN)
 def train(config: Options[c.Train] = c.Train(), *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.train(**vars(config)), json)
-    return 0
+    return print_result(ms.train(**vars(config)), json)
 
 
 @command(c.GroundTruth, RESEARCH)
 def truth(config: Options[c.GroundTruth], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.truth(**vars(config)), json)
-    return 0
+    return print_result(ms.truth(**vars(config)), json)
 
 
 @command(c.Benchmark, RESEARCH)
 def benchmark(config: Options[c.Benchmark], *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.benchmark(**vars(config)), json)
-    return 0
+    return print_result(ms.benchmark(**vars(config)), json)
 
 
 @command(c.Reproduce, RESEARCH)
 def reproduce(config: Options[c.Reproduce] = c.Reproduce(), *, json: Json = False) -> int:
-    from merge_sumo import api
-
-    print_result(api.reproduce(**vars(config)), json)
-    return 0
+    return print_result(ms.reproduce(**vars(config)), json)
 
 
 def _check_working_folder() -> None:

@@ -76,8 +76,8 @@ def print_json(record: dict[str, Any]) -> None:
     show(json.dumps(record, allow_nan=False))
 
 
-def print_result(result: Result, as_json: bool, **paths: object) -> None:
-    """Print a result in lines or as one JSON object.
+def print_result(result: Result, as_json: bool, **paths: object) -> int:
+    """Print a result in lines or as one JSON object, and return the exit code.
 
     Args:
         result: the result.
@@ -87,11 +87,12 @@ def print_result(result: Result, as_json: bool, **paths: object) -> None:
     written = {name: str(path) for name, path in paths.items() if path is not None}
     if as_json:
         print_json({**result.to_record(), **written})
-        return
-    for line in result.lines():
-        show(_with_flags(line))
-    for name, path in written.items():
-        show(f"{name}: {path}")
+    else:
+        for line in result.lines():
+            show(_with_flags(line))
+        for name, path in written.items():
+            show(f"{name}: {path}")
+    return 0 if result.is_good else 1
 
 
 @contextmanager

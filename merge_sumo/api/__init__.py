@@ -25,9 +25,9 @@ from merge_sumo.api.campaigns import notice_povs, run_and_report
 from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.settings import (
     case_in,
+    explicit,
     opened_study,
     opened_truths,
-    overrides,
     path_of,
     recorded_case,
     scenario_of,
@@ -99,11 +99,7 @@ from merge_sumo.vuts.python import SeenBatch
 if TYPE_CHECKING:
     from merge_sumo.training.library import PolicyChecks
 
-__all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch"]
-__all__ += ["benchmark", "campaign", "check_scenario", "check_vut", "compare", "dated", "explain"]
-__all__ += ["export", "new_scenario", "open_in_gui", "open_run", "probability", "replay"]
-__all__ += ["report", "reproduce", "rerun", "resume", "run", "scenarios", "stress", "train"]
-__all__ += ["truth", "vuts"]
+__all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch", "dated"]
 
 # Campaigns
 
@@ -123,14 +119,14 @@ def resume(config: c.Resume) -> CampaignRun:
     """Go on with a campaign that was stopped."""
     folder = folder_of(config.run)
     recorded = read_settings(folder)
-    new = overrides(config, vut=recorded.get("vut") or "", pov=recorded.get("pov"))
-    settings = settings_of(folder, recorded, new.fields, goes_on=True)
+    fields, where = explicit(config, recorded.get("vut") or "", recorded.get("pov"))
+    settings = settings_of(folder, recorded, fields, goes_on=True)
     if config.level != "all":
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
         levels = parse_levels(config.level, policies, settings.scenario.levels, own=own)
         settings = replace(settings, levels=levels)
-    return run_and_report(settings, resolve(settings), folder, new.where, config, goes_on=True)
+    return run_and_report(settings, resolve(settings), folder, where, config, goes_on=True)
 
 
 def open_run(folder: c.AnyPath) -> CampaignRun:
@@ -201,7 +197,7 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
 
 
 def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
-    """Write the page, or the cases file of now, and JUnit, where they are asked for."""
+    """Write the page, or the cases file of now, and JUnit, where they are wanted."""
     text = compared.text
     if out is not None and text is not None:
         check_toml_size(text.encode(errors="backslashreplace"), out)

@@ -159,6 +159,11 @@ class CampaignRun(Result):
         return [gate.check(self.verdict, self.summary, regressions) for gate in self._gates]
 
     @property
+    def is_good(self) -> bool:
+        """See `Result`."""
+        return self.passed
+
+    @property
     def passed(self) -> bool:
         """Whether the VUT merged in some case, and no gate is met."""
         return self.verdict.tested > 0 and not any(gate.met for gate in self.gates)
@@ -263,6 +268,11 @@ class CaseRun(Result):
     def failed(self) -> bool:
         """Whether this case is a failure of the VUT under the criterion."""
         return self.outcome.failed
+
+    @property
+    def is_good(self) -> bool:
+        """See `Result`."""
+        return self.passed
 
     @property
     def passed(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from merge_sumo.reports.progress import Bars, Counter
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing
-from merge_sumo.scenario.scenario import US23, Scenario, level_name
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.studies.run_study import RunStudy
 from merge_sumo.studies.sampler_study import Study
 from merge_sumo.system.scratch import ScratchFolder
@@ -68,9 +68,9 @@ def opened_study(
 
 def current(run: Run, config: c.Recorded) -> tuple[CampaignSettings, SimulationPlan, c.Execution]:
     """Return how cases of a campaign run: settings with overrides, their plan, and where."""
-    given = overrides(config, vut=run.vut)
-    settings = settings_of(run.folder, run.record, given.fields)
-    return settings, resolve(settings), given.where
+    fields, where = explicit(config, run.vut)
+    settings = settings_of(run.folder, run.record, fields)
+    return settings, resolve(settings), where
 
 
 @contextmanager
@@ -103,8 +103,7 @@ def scenario_of(
     scenario: Scenario | Path | str | None, changes: Mapping[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario of a config, with changes by the fields of `ScenarioChanges`."""
-    if scenario is None:
-        scenario = US23
+    scenario = scenario or US23
     named = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
     values = dict(changes or {})
     for name, kind in (("sense", Sensing), ("act", Actuation)):
@@ -113,70 +112,35 @@ def scenario_of(
     return replace(named, **values) if values else named
 
 
-def settings_for(
-    config: c.Campaign | c.GroundTruth | c.Benchmark, **search: Any
-) -> tuple[CampaignSettings, c.Execution]:
-    """Return the settings of a campaign, or of a study, and where it runs.
-
-    `search` has settings that the study chooses.
-    """
-    spec, pov, workers = drivers_of(config.vut, config.pov, config.workers)
-    fields: dict[str, Any] = {"vut": spec, "pov": pov}
-    if isinstance(config, c.Campaign):
-        fields |= c.values_of(config, c.Search)
-        if config.cases is None:
-            del fields["cases"]
-            fields["stop_when_converged"] = True
-        if config.against is not None:
-            fields["against"], _, workers = drivers_of(config.against, None, workers)
-    scenario = scenario_of(config.scenario, c.changed(config, c.ScenarioChanges))
-    folder = policies_folder(config.policies, scenario)
-    fields["levels"] = parse_levels(config.level, folder, scenario.levels, own=pov is not None)
-    settings = settings_in(config, scenario, fields | search)
-    return settings, c.Execution(workers=workers, progress=config.progress)
-
-
-def settings_in(config: c.Test, scenario: Scenario, fields: Mapping[str, Any]) -> CampaignSettings:
-    """Return the settings of a scenario, with others by name."""
-    criterion = c.changed(config, c.FailureRule) or {"fail_when": scenario.criterion}
-    if config.policies is not None:
-        criterion["policies"] = str(config.policies)
-    limits = c.changed(config, c.Limits)
-    return CampaignSettings(scenario=scenario, **criterion, **limits, **fields)
-
-
-@dataclass(frozen=True)
-class Overrides:
-    """What replaces settings of a recorded campaign, and where its cases run."""
-
-    fields: dict[str, Any]
-    where: c.Execution
-
-
-def overrides(config: c.Drivers, vut: AnyVut = "", pov: AnyVut | None = None) -> Overrides:
-    """Return what a config replaces in a recorded campaign.
+def explicit(
+    config: c.Drivers,
+    vut: AnyVut = "",
+    pov: AnyVut | None = None,
+    scenario: Scenario | None = None,
+) -> tuple[dict[str, Any], c.Execution]:
+    """Return the settings that a config names, and where its cases run.
 
     Args:
-        config: the config, with the VUT.
+        config: the config.
         vut: the recorded VUT, where an object drives again.
         pov: the recorded POV.
+        scenario: the scenario of a config that names none; None for that of the recorded campaign.
 
     Raises:
         UserError: for a change of a scenario that is not named.
     """
-    fields = c.changed(config, c.Limits)
-    if config.policies is not None:
-        fields["policies"] = str(config.policies)
-    new: AnyVut | None = getattr(config, "vut", None)
+    named: AnyVut | None = getattr(config, "vut", None)
     where = config if isinstance(config, c.Execution) else c.Execution()
-    spec, pov_spec, workers = drivers_of(new or vut, config.pov or pov, where.workers)
-    fields |= {} if new is None else {"vut": spec}
+    spec, pov_spec, workers = drivers_of(named or vut, config.pov or pov, where.workers)
+    fields = c.changed(config, c.Limits)
+    fields |= {} if named is None else {"vut": spec}
     fields |= {} if config.pov is None else {"pov": pov_spec}
+    fields |= {} if config.policies is None else {"policies": str(config.policies)}
     if isinstance(config, c.Test):
         fields |= c.changed(config, c.FailureRule)
         changes = c.changed(config, c.ScenarioChanges)
-        if config.scenario is not None:
-            fields["scenario"] = scenario_of(config.scenario, changes)
+        if base := config.scenario or scenario:
+            fields["scenario"] = scenario_of(base, changes)
         elif changes:
             raise UserError(
                 f"`{next(iter(changes))}` is of the scenario: name that, too, with `scenario`"
@@ -187,19 +151,39 @@ def overrides(config: c.Drivers, vut: AnyVut = "", pov: AnyVut | None = None) ->
             fields["against"], _, workers = drivers_of(config.against, None, workers)
         if config.cases is not None:
             fields["stop_when_converged"] = config.stop_when_converged
-    return Overrides(fields, c.Execution(workers=workers, progress=where.progress))
+    return fields, c.Execution(workers=workers, progress=where.progress)
+
+
+def settings_for(
+    config: c.Campaign | c.GroundTruth | c.Benchmark, **search: Any
+) -> tuple[CampaignSettings, c.Execution]:
+    """Return the settings of a campaign, or of a study, and where it runs.
+
+    `search` has settings that the study chooses.
+    """
+    fields, where = explicit(config, scenario=US23)
+    if isinstance(config, c.Campaign) and config.cases is None:
+        search = {"stop_when_converged": True}
+    scenario, own = fields["scenario"], config.pov is not None
+    folder = policies_folder(config.policies, scenario)
+    levels = parse_levels(config.level, folder, scenario.levels, own=own)
+    return _new_settings(fields | {"levels": levels} | search), where
+
+
+def _new_settings(fields: dict[str, Any]) -> CampaignSettings:
+    """Return settings whose failures are those of the scenario, where nothing else is named."""
+    if "require" not in fields:
+        fields.setdefault("fail_when", fields["scenario"].criterion)
+    return CampaignSettings(**fields)
 
 
 def recorded_case(config: c.RunCase) -> tuple[CampaignSettings, Case]:
     """Return a case of a campaign with other settings and coordinates, and how it is run."""
     assert config.recorded is not None, "one of a campaign"  # noqa: S101
-    fields = overrides(config).fields
+    fields, _ = explicit(config)
     run = recorded(config.recorded[0])
     before = run.outcome(config.recorded[1]).case
-    level = before.level
-    if config.level is not None:
-        policies, own = policies_folder(config.policies, run.scenario), bool(fields.get("pov"))
-        level = one_level(str(config.level), policies, run.scenario.levels, own=own)
+    level = _level(config, before.level, run.scenario)
     settings = settings_of(run.folder, run.record, {**fields, **ONE, "levels": (level,)})
     names = ("v_vut0_mps", *(d.field for d in settings.scenario.dimensions(level)))
     kept = {name: getattr(before, name) for name in names}
@@ -211,14 +195,11 @@ def case_in(config: c.RunCase) -> tuple[CampaignSettings, Case]:
     """Return a case by its coordinates, which win over those of a row, and how it is run."""
     if not config.vut:
         raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
-    spec, pov, _ = drivers_of(config.vut, config.pov, 1)
-    row: Mapping[str, Any] = config.case or {}
-    scenario = scenario_of(config.scenario, c.changed(config, c.ScenarioChanges))
+    fields, _ = explicit(config, scenario=US23)
+    scenario, row = fields["scenario"], config.case or {}
     of_row = {name: row[name] for name in scenario.notation if row.get(name) is not None}
-    name = level_name(int(row.get("level", 0))) if config.level is None else str(config.level)
-    policies = policies_folder(config.policies, scenario)
-    level = one_level(name, policies, scenario.levels, own=pov is not None)
-    settings = settings_in(config, scenario, {"vut": spec, "pov": pov, "levels": (level,), **ONE})
+    level = _level(config, int(row.get("level", 0)), scenario)
+    settings = _new_settings({**fields, **ONE, "levels": (level,)})
     case = case_of(settings.scenario, level, {**of_row, **_coordinates(config)})
     draw = row.get("draw")
     if draw is None or draw != draw:  # noqa: PLR0124 (NaN of a data frame: the first)
@@ -227,6 +208,14 @@ def case_in(config: c.RunCase) -> tuple[CampaignSettings, Case]:
         return settings, replace(case, draw=int(draw))
     except (TypeError, ValueError, OverflowError):
         raise UserError(f"draw is {draw!r:.60}: it must be a whole number") from None
+
+
+def _level(config: c.RunCase, default: int, scenario: Scenario) -> int:
+    """Return the level of a case."""
+    if config.level is None:
+        return default
+    folder = policies_folder(config.policies, scenario)
+    return one_level(str(config.level), folder, scenario.levels, own=config.pov is not None)
 
 
 def _coordinates(config: c.RunCase) -> dict[str, float]:

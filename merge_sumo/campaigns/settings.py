@@ -11,7 +11,7 @@ from typing import Any, Final
 from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
-from merge_sumo.config import Search
+from merge_sumo.config import Search, changed
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import POLICIES
@@ -55,68 +55,47 @@ class CampaignSettings(Search):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        self._check_texts()
+        for name in ("vut", "policies", "pov", "against"):
+            _check_text(name, getattr(self, name))
         criterion = self.criterion
         object.__setattr__(self, "fail_when", criterion.fail_when)
         object.__setattr__(self, "require", criterion.require)
         criterion.check(self.scenario)
         self.vut_options(None)
-        if not self.levels or len(set(self.levels)) < len(self.levels):
-            raise UserError(f"the levels are {list(self.levels)}: name each level once")
-        for level in self.levels:
-            if level not in self.scenario.levels:
-                levels = ", ".join(map(level_name, self.scenario.levels))
-                raise UserError(f"the levels are {list(self.levels)}: choose from {levels}")
-        if OWN in self.levels and self.pov is None:
-            raise UserError("level own is that of a POV of your own: name one as pov")
         self.new_sampler()
-        for name in ("cases", "batch", "in_flight", "repeat"):
+        check_tolerated(self.tolerated)
+        for name, least in {"cases": 1, "batch": 1, "in_flight": 1, "repeat": 1, "seed": 0}.items():
             number = getattr(self, name)
-            if isinstance(number, int) and number < 1:
-                raise UserError(f"`{name}` is {number}: it must be 1 or more")
-        if self.batch is not None and self.batch > self.cases:
-            raise UserError(
-                f"batch is {self.batch} and `cases` is {self.cases}: a batch cannot have more "
-                "cases than the campaign"
-            )
+            if isinstance(number, int) and number < least:
+                raise UserError(f"`{name}` is {number}: it must be {least} or more")
+        for name in ("batch", "in_flight", "repeat"):
+            number = getattr(self, name)
+            if isinstance(number, int) and number > self.cases:
+                raise UserError(
+                    f"`{name}` is {number} and `cases` is {self.cases}: it cannot be more"
+                )
+        self._check_levels()
         if self.in_flight is not None:
-            self._check_in_flight(self.in_flight)
+            self._check_in_flight()
         if self.against is not None:
             self._check_against(self.against)
-        if self.seed < 0:
-            raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
-        check_tolerated(self.tolerated)
         if not self.may_vary:  # a case fails in all of its runs or in none
             object.__setattr__(self, "tolerated", 0.0)
-        if self.repeat > self.cases:
-            raise UserError(
-                f"`repeat` is {self.repeat} and `cases` is {self.cases}: runs of a case are among "
-                "the cases of the campaign, and cannot be more"
-            )
 
-    def _check_texts(self) -> None:
-        for option, text in (
-            ("`vut`", self.vut),
-            ("`policies`", self.policies),
-            ("`pov`", self.pov),
-            ("`against`", self.against),
-        ):
-            if text is not None and not _is_text(text):
-                raise UserError(
-                    f"{option} is {text!r}, which campaign.json cannot record: it is not UTF-8; "
-                    "rename it"
-                )
+    def _check_levels(self) -> None:
+        if not self.levels or len(set(self.levels)) < len(self.levels):
+            raise UserError(f"the levels are {list(self.levels)}: name each level once")
+        if not set(self.levels) <= set(self.scenario.levels):
+            known = ", ".join(map(level_name, self.scenario.levels))
+            raise UserError(f"the levels are {list(self.levels)}: choose from {known}")
+        if OWN in self.levels and self.pov is None:
+            raise UserError("level own is that of a POV of your own: name one as `pov`")
 
-    def _check_in_flight(self, in_flight: int) -> None:
+    def _check_in_flight(self) -> None:
         if self.batch is not None:
             raise UserError(
-                f"`in_flight` is {in_flight} and batch is {self.batch}: a search runs in batches "
-                "or with cases in flight; leave one of them away"
-            )
-        if in_flight > self.cases:
-            raise UserError(
-                f"`in_flight` is {in_flight} and `cases` is {self.cases}: no more cases can be in "
-                "flight than the campaign has"
+                "a search runs in batches or with cases in flight: leave `in_flight` or `batch` "
+                "away"
             )
         if not SAMPLERS[self.sampler].learns:
             raise UserError(
@@ -125,19 +104,15 @@ class CampaignSettings(Search):
             )
 
     def _check_against(self, against: str) -> None:
-        for option, given in (
-            ("`in_flight`", self.in_flight),
-            ("`repeat`", None if self.repeat == 1 else self.repeat),
-            ("`tolerated`", self.tolerated or None),
-        ):
-            if given is not None:
+        for name in ("in_flight", "repeat", "tolerated"):
+            if name in changed(self, Search):
                 raise UserError(
-                    f"{option} does not go with `against`, which runs each batch with two "
+                    f"`{name}` does not go with `against`, which runs each batch with two "
                     "versions: leave one of them away"
                 )
         if waits_for_client(against):
             raise UserError(
-                f"`against` is {against}: a client that a person starts drives one VUT; name an "
+                f"`against` is {against}: a client that a user starts drives one VUT; name an "
                 "earlier version that needs none"
             )
         if against == self.vut:
@@ -201,13 +176,14 @@ RECORDED_BY_DEFAULT: Final = {
 """What the settings were in a campaign that does not record them."""
 
 
-def _is_text(text: str) -> bool:
-    """Return whether a text from the command line is one; other bytes come as half characters."""
+def _check_text(name: str, text: str | None) -> None:
+    """Raise `UserError` for bytes of a command line that are no text, which no record can hold."""
     try:
-        text.encode()
+        (text or "").encode()
     except UnicodeEncodeError:
-        return False
-    return True
+        raise UserError(
+            f"`{name}` is {text!r}, which campaign.json cannot record: it is not UTF-8; rename it"
+        ) from None
 
 
 def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:

@@ -300,6 +300,11 @@ class Comparison(Result):
         return sum(step.count(Change.BROKE) for step in self.steps)
 
     @property
+    def is_good(self) -> bool:
+        """See `Result`."""
+        return not self.worse
+
+    @property
     def worse(self) -> bool:
         """Whether a case broke or lost too much margin, or a version passes less often.
 

@@ -54,6 +54,11 @@ class VutCheck(Result):
     us_per_step_worst: float
 
     @property
+    def is_good(self) -> bool:
+        """See `Result`."""
+        return self.ok
+
+    @property
     def ok(self) -> bool:
         """Whether nothing is wrong."""
         return not self.problems

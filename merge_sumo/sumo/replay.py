@@ -85,6 +85,11 @@ class Replay(Result):
     words: tuple[str, ...] = ()
 
     @property
+    def is_good(self) -> bool:
+        """See `Result`."""
+        return self.identical
+
+    @property
     def identical(self) -> bool:
         """True where no row differs."""
         return self.diverged_at_s is None

