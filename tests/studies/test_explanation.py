@@ -82,9 +82,7 @@ class TestACampaign:
         assert not (own.folder / EXPLANATIONS.name).exists()
 
     def test_is_not_explained_where_the_engines_differ(self, tmp_path, monkeypatch):
-        monkeypatch.setattr(
-            "merge_sumo.studies.explanation.pass_of", lambda results: [True] * len(results)
-        )
+        monkeypatch.setattr("merge_sumo.studies.explanation.pass_of", lambda _: True)
         run = uniform("level0", tmp_path / "run", 60, level=0)
         assert run.failures
         assert not (run.folder / EXPLANATIONS.name).exists()
