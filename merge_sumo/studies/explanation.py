@@ -36,7 +36,6 @@ from merge_sumo.system.workers import Workers, workers_or_here
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome
 from merge_sumo.vuts.base import VutSpec
-from merge_sumo.vuts.factory import VutFactory
 from merge_sumo.vuts.parameters import Range
 
 START_STEPS: Final = 160
@@ -319,7 +318,7 @@ class _Neighbours:
             places = [place for place, (of, _) in enumerate(trials) if of == spec]
             cases, own = [trials[place][1] for place in places], spec == plan.vut.spec
             try:
-                vut = plan.vut if own else VutFactory(spec, plan.vut.options)
+                vut = plan.vut if own else plan.vut.with_spec(spec)
                 ran = list(evaluate(replace(plan, vut=vut), cases, self._workers, pass_of))
             except UserError:
                 if own:

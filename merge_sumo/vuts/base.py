@@ -165,5 +165,9 @@ class ControllerKind:
         """Return a driver for a number of corridors in a world of SUMO; None for no world."""
         return ControllerArray(corridors, self.controller, self.options.deadline_s)
 
+    def with_options(self, spec: VutSpec, options: VutOptions) -> ControllerKind:
+        """Return the controller with other parameters, or hosted otherwise."""
+        return type(self)(spec, options)
+
     def release(self) -> None:
         """End what was started to load it, as its drivers are in other processes."""

@@ -61,18 +61,22 @@ class VutFactory:
             raise UserError(_why_unknown(spec.argument))
         if file := kind.file_of(spec.argument):
             check_code(Path(file))
-        if not kind.hosted or self.options.in_process or not SUPPORTED:
-            return kind(spec, self.options)
-        if kind.no_parameters:
-            return HostedKind.open(spec, self.options, alike=spec)
-        # What is known of a controller does not depend on the values of its parameters.
-        names = tuple((name, "") for name in sorted(spec.numbers()))
-        alike = VutSpec(spec.kind, spec.argument, names)
-        return HostedKind.open(spec, self.options, alike)
+        if kind.hosted and SUPPORTED and not self.options.in_process:
+            return HostedKind(spec, self.options)
+        return kind(spec, self.options)
+
+    def with_spec(self, spec: VutSpec) -> VutFactory:
+        """Return what makes the same VUT with other parameters."""
+        return self._with(VutFactory(spec, self.options, self.files))
 
     def with_log(self, log: Path) -> VutFactory:
         """Return what makes the same VUT, with what it prints added to a file."""
-        return VutFactory(self.spec, replace(self.options, log=log), self.files)
+        return self._with(VutFactory(self.spec, replace(self.options, log=log), self.files))
+
+    def _with(self, other: VutFactory) -> VutFactory:
+        """Let another factory know what was opened for this one."""
+        other.__dict__["vut"] = self.vut.with_options(other.spec, other.options)
+        return other
 
     def workers(self, requested: int | None) -> int:
         """Return in how many processes it is tested: the requested ones, or one a core for None.

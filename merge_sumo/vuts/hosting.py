@@ -7,15 +7,13 @@ second death is that of one case.
 
 from __future__ import annotations
 
-import atexit
 import multiprocessing
 import os
 import select
 import signal
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, TypeVar
 
@@ -26,7 +24,6 @@ from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import Left
-from merge_sumo.system.hashing import Files, changed, hashed
 from merge_sumo.system.scratch import ScratchFolder
 from merge_sumo.system.spawning import python_command
 from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
@@ -75,7 +72,7 @@ class ControllerProcess:
 
     Attributes:
         spec: the controller.
-        opened: what its kind knows of it.
+        ready: what its kind knows of it.
         alive: whether requests can be sent.
         output: what it prints.
         echo: shows what it prints, where there is no log.
@@ -90,7 +87,7 @@ class ControllerProcess:
             echo: shows what it prints, where the options have no log.
         """
         self.spec, self._options, self.echo = spec, options, echo
-        self.alive, self._owner, self._folder = True, os.getpid(), Path.cwd()
+        self.alive = False
         # A process that is killed leaves its temporary files: they are in a folder of ours.
         self._scratch = ScratchFolder()
         self._connection, theirs = multiprocessing.Pipe()
@@ -121,12 +118,13 @@ class ControllerProcess:
         finally:
             theirs.close()
             os.close(their_lifeline)
+        self.alive = True
         assert self._process.stdout is not None  # noqa: S101 (piped)
         self.output = Output(self._process.stdout, options.log, echo)
         self._poll = select.poll()
         self._poll.register(self._connection.fileno(), select.POLLIN)
         with self._opening():
-            self.opened = self._receive(Ready, options.connect_s)
+            self.ready = self._receive(Ready, options.connect_s)
 
     def make(self, corridors: int) -> Mapping[str, float]:
         """Make the controllers of a number of corridors; return their parameters."""
@@ -153,11 +151,6 @@ class ControllerProcess:
             raise self._died() from None
         return self._receive(kind, patience_s)
 
-    def serves(self, spec: VutSpec, options: VutOptions) -> bool:
-        """Return whether this process of this one's was opened for the same controller."""
-        same = self.spec == spec and replace(self._options, log=options.log) == options
-        return same and self.alive and self._owner == os.getpid() and self._folder == Path.cwd()
-
     def kill(self) -> None:
         """End the process, and what it started."""
         if not self.alive:
@@ -170,6 +163,10 @@ class ControllerProcess:
         self._process.wait()
         self.output.close()
         self._scratch.cleanup()
+
+    def __del__(self) -> None:
+        """End the process of a controller that nothing refers to."""
+        self.kill()
 
     def close(self) -> None:
         """Let the controllers close, then end the process."""
@@ -238,106 +235,84 @@ def how_it_ended(code: int | None) -> str:
     return f"ended its process by signal {-code} ({name})"
 
 
-@dataclass(slots=True)
-class _Known:
-    """What is known of a controller that was opened, and the files of which it was made then."""
+def opened(
+    spec: VutSpec, options: VutOptions, echo: Echo, *, again: bool = False
+) -> ControllerProcess:
+    """Return a process in which a controller is loaded; `UserError` where that fails.
 
-    opened: Ready
-    files: Files
-    process: ControllerProcess | None
-
-
-_known: dict[tuple[VutSpec, str, float], _Known] = {}
-"""By the controller without values of parameters, working folder and memory: the same controller is
-opened once, and the first driver takes its process."""
+    Args:
+        spec: the controller.
+        options: how it is hosted.
+        echo: shows what it prints, where the options have no log.
+        again: whether a process died before; the first may have been killed from outside.
+    """
+    try:
+        return ControllerProcess(spec, options, echo)
+    except ProcessDiedError as died:
+        if again or died.hung:
+            raise UserError(str(died)) from died
+        return opened(spec, options, echo, again=True)
 
 
 class HostedKind(ControllerKind):
-    """A controller whose code runs in a process of its own."""
+    """A controller whose code runs in a process of its own; the first driver takes that process."""
 
-    def __init__(self, spec: VutSpec, options: VutOptions, opened: Ready) -> None:
-        """Take what is known of an opened controller."""
+    def __init__(self, spec: VutSpec, options: VutOptions, ready: Ready | None = None) -> None:
+        """Open the controller, unless it is known what it is; `UserError` where that fails."""
         super().__init__(spec, options)
-        self.max_corridors, self.max_workers = opened.max_corridors, opened.max_workers
-        self.files = tuple(Path(os.fsdecode(file)) for file in opened.files)
+        self._process = None if ready is not None else opened(spec, options, Echo())
+        self._ready = ready = ready or self._process.ready  # type: ignore[union-attr]
+        self.max_corridors, self.max_workers = ready.max_corridors, ready.max_workers
+        self.files = tuple(Path(os.fsdecode(file)) for file in ready.files)
 
-    @classmethod
-    def open(cls, spec: VutSpec, options: VutOptions, alike: VutSpec) -> HostedKind:
-        """Open a controller in a process; `UserError` where that fails.
+    def __reduce__(self) -> tuple[type[HostedKind], tuple[VutSpec, VutOptions, Ready]]:
+        """Travel without the process."""
+        return HostedKind, (self.spec, self.options, self._ready)
 
-        Args:
-            spec: the controller.
-            options: how it is hosted.
-            alike: names all controllers of the same files, whatever their parameters.
-        """
-        key = alike, str(Path.cwd()), options.memory_gib
-        if key not in _known or changed(_known[key].files):
-            release(_known.pop(key, None))
-            process = _twice(lambda: ControllerProcess(spec, options, Echo()))
-            files = [Path(os.fsdecode(file)) for file in process.opened.files]
-            _known[key] = _Known(process.opened, hashed(files), process)
-        return cls(spec, options, _known[key].opened)
+    def with_options(self, spec: VutSpec, options: VutOptions) -> ControllerKind:
+        """Return the controller with other parameters, or with another log."""
+        other = HostedKind(spec, options, self._ready)
+        if spec == self.spec and self._process is not None:
+            other._process, self._process = self._process, None
+            other._process.output.log = options.log
+        return other
 
     def driver(self, corridors: int, _world: object) -> Driver:
         """Return a driver that asks the process."""
-        return HostedDriver(corridors, self.spec, self.options)
+        process, self._process = self._process, None
+        return HostedDriver(corridors, self.spec, self.options, process)
 
     def release(self) -> None:
-        """End a process that no driver has taken: the drivers are in other processes."""
-        for known in _known.values():
-            release(known)
-
-
-def release(known: _Known | None) -> None:
-    """End the process of a known controller, if no driver has taken it."""
-    if known is not None and known.process is not None:
-        known.process.kill()
-        known.process = None
-
-
-def _take(spec: VutSpec, options: VutOptions, echo: Echo) -> ControllerProcess:
-    """Return the process in which a controller was opened, or a new one."""
-    for known in _known.values():
-        process = known.process
-        if process is not None and process.serves(spec, options):
-            known.process = None
-            process.output.log = options.log
-            return process
-    return ControllerProcess(spec, options, echo)
-
-
-def _twice(opened: Callable[[], ControllerProcess]) -> ControllerProcess:
-    """Open a process, and again where it died: it may have been killed from outside."""
-    try:
-        return opened()
-    except ProcessDiedError as died:
-        if died.hung:
-            raise UserError(str(died)) from died
-    try:
-        return opened()
-    except ProcessDiedError as died:
-        raise UserError(str(died)) from died
-
-
-@atexit.register
-def _release_all() -> None:
-    for known in _known.values():
-        release(known)
+        """End a process that no driver has taken."""
+        self._process = None
 
 
 class HostedDriver(ControllerDriver):
     """Passes each step on to the process of a controller."""
 
-    def __init__(self, corridors: int, spec: VutSpec, options: VutOptions) -> None:
-        """Make the controllers in their process; `UserError` where that fails."""
+    def __init__(
+        self,
+        corridors: int,
+        spec: VutSpec,
+        options: VutOptions,
+        process: ControllerProcess | None = None,
+    ) -> None:
+        """Make the controllers in their process; `UserError` where that fails.
+
+        Args:
+            corridors: number of corridors.
+            spec: the controller.
+            options: how it is hosted.
+            process: where it is loaded; None starts a process.
+        """
         super().__init__(corridors)
-        self._spec, self._options, self._echo = spec, options, Echo()
+        self._spec, self._options = spec, options
         self._starts: list[tuple[int, Start]] = []
         self._reasons: Mapping[int, str] = {}
         self._signals: Mapping[int, Left] = {}
         self._files: set[Path] = set()
         self._parameters: Mapping[str, float] = {}
-        self._process = _twice(self._made)
+        self._process = self._with_controllers(process or opened(spec, options, Echo()))
 
     def reset(self, corridor: int, start: Start) -> None:
         """Note that an episode begins; the controller is told with the next scene."""
@@ -352,12 +327,11 @@ class HostedDriver(ControllerDriver):
         self._starts = []
         try:
             if not self._process.alive:
-                self._process = self._made()
+                process = opened(self._spec, self._options, self._process.echo)
+                self._process = self._with_controllers(process)
         except UserError as error:  # its files have changed since
             self._reasons = dict.fromkeys(range(self.corridors), f"started again: {error}")
             return np.full(self.corridors, np.nan)
-        except ProcessDiedError as died:
-            raise VutLostError(str(died)) from None
         try:
             answer = self._process.ask(request, Acted)
             answers, self._wishes = answer.numbers(self.corridors)
@@ -392,11 +366,13 @@ class HostedDriver(ControllerDriver):
         """Close the controllers, and end their process."""
         self._process.close()
 
-    def _made(self) -> ControllerProcess:
-        process = _take(self._spec, self._options, self._echo)
-        self._echo = process.echo
-        self._note(process.opened.files)
-        self._parameters = process.make(self.corridors)
+    def _with_controllers(self, process: ControllerProcess) -> ControllerProcess:
+        """Make the controllers in a process, and return it."""
+        self._note(process.ready.files)
+        try:
+            self._parameters = process.make(self.corridors)
+        except ProcessDiedError as died:
+            raise UserError(str(died)) from died
         return process
 
     def _note(self, files: list[bytes]) -> None:

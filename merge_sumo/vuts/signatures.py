@@ -6,7 +6,6 @@ import inspect
 import os
 from collections.abc import Callable
 from functools import partial
-from inspect import Parameter
 from pathlib import Path
 from typing import Any, Final
 
@@ -65,15 +64,14 @@ def check_call(
 def fits(function: Callable[..., Any], count: int) -> bool | None:
     """Return whether a function takes exactly `count` positional arguments; None if unknown."""
     try:
-        parameters = inspect.signature(function).parameters.values()
+        bound = inspect.signature(function).bind
     except (TypeError, ValueError):
         return None
-    places = [p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
-    stars = (Parameter.VAR_POSITIONAL, Parameter.VAR_KEYWORD)
-    needed = [p for p in parameters if p.default is p.empty and p.kind not in stars]
-    by_name = any(p.kind is p.KEYWORD_ONLY for p in needed)
-    more = any(p.kind is p.VAR_POSITIONAL for p in parameters)
-    return len(needed) <= count and (more or count <= len(places)) and not by_name
+    try:
+        bound(*range(count))
+    except TypeError:
+        return False
+    return True
 
 
 def _place(function: Callable[..., Any]) -> str:

@@ -72,6 +72,29 @@ RECIPES = {
             'VUTS = {"cruise": BuiltInVut(Cruise, CruiseDesign())}\n'
         }
     ),
+    "a kind of controller with two parameters": Recipe(
+        new={
+            "vuts/hold.py": "from merge_sumo.vuts.base import ControllerKind\n"
+            "from merge_sumo.vuts.controller import Controller\n\n\n"
+            "class HoldKind(ControllerKind):\n"
+            '    form, what = "hold:START?a_mps2=A&until_s=T", "accelerates for a while"\n\n'
+            "    def __init__(self, spec, options):\n"
+            "        super().__init__(spec, options)\n"
+            '        self.parameters = {"a_mps2": 1.0, "until_s": 2.0} | spec.numbers()\n\n'
+            "    def controller(self):\n"
+            "        return HoldController(**self.parameters)\n\n\n"
+            "class HoldController(Controller):\n"
+            "    def __init__(self, a_mps2, until_s):\n"
+            "        self.a_mps2, self.until_s = a_mps2, until_s\n\n"
+            "    def act(self, seen):\n"
+            "        return self.a_mps2 if seen.t_s < self.until_s else 0.0\n"
+        },
+        more={
+            "vuts/registry.py": {
+                '        HERE: "merge': '        "hold": "merge_sumo.vuts.hold:HoldKind",\n'
+            }
+        },
+    ),
     "a section of the report": Recipe(
         new={
             "reports/templates/sections/thanks.html.jinja": '<section aria-labelledby="thanks">'
@@ -135,6 +158,7 @@ def ran(folder: Path, *words: str) -> str:
         ("a measure", 1),
         ("a sampler", 2),
         ("a built-in VUT with two parameters", 1),
+        ("a kind of controller with two parameters", 2),
         ("a section of the report", 2),
         ("an option of `campaign` that reaches the engine", 2),
     ],
@@ -160,3 +184,14 @@ def test_a_campaign_has_what_the_recipes_add(copied):
     assert (settings["sampler"], settings["scenario"]["late_m"]) == ("corner", 50.0)
     page = (copied / "run/report.html").read_text(encoding="utf-8")
     assert "drove 8 cases." in page
+
+
+@pytest.mark.slow
+def test_a_kind_of_controller_drives_by_its_parameters(copied):
+    start = ("--level", "0", "--x", "-250", "--v", "30")
+    ended = []
+    for until_s in (1, 3):
+        held = f"hold:start?a_mps2=0.5&until_s={until_s}"
+        ended.append(json.loads(ran(copied, "run", "--vut", held, *start, "--json"))["t_end_s"])
+    assert ended[1] < ended[0], "it is earlier where it accelerates for longer"
+    assert "hold:START" in ran(copied, "vuts")
