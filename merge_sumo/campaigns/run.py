@@ -32,7 +32,7 @@ from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.system.folders import regular
-from merge_sumo.system.printable import counted, printable, quoted
+from merge_sumo.system.printable import counted, printable
 from merge_sumo.system.records import Record, convert, decode, read_indexed
 from merge_sumo.verdict.chance import one_per_case
 from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
@@ -259,20 +259,8 @@ class Run:
         return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
 
     def read_lines(self, name: str, kind: type[T], indices: Container[int]) -> dict[int, T]:
-        """Return the lines of a file of the folder by their index, which is one of `indices`.
-
-        Raises `UserError` for another line: of a case that was to run, it is not the line that is
-        wrong, but outcomes that are gone.
-        """
-        lost = range(len(self.outcomes), self.settings.cases)
-        known = read_indexed(self.folder / name, kind, indices, lost)
-        for index in (index for index in known if index in lost):
-            raise UserError(
-                f"{self.folder / OUTCOMES} has {counted(len(self.outcomes), 'case')}, and {name} "
-                f"knows of case {index}: lines of {OUTCOMES} are lost; take it from a copy, or run "
-                f"their cases again with `merge-sumo campaign --resume {quoted(self.folder)}`"
-            )
-        return known
+        """Return the lines of a file of the folder by their index, which is one of `indices`."""
+        return read_indexed(self.folder / name, kind, indices)
 
     def earlier(self) -> Run | None:
         """Return the run of the version that this campaign is against; None where there is none.
@@ -283,17 +271,11 @@ class Run:
         if self.settings.against is None:
             return None
         earlier = Run(self.folder / AGAINST)
-        count = len(self.outcomes)
-        if len(earlier.outcomes) < count:
+        cases = [outcome.case for outcome in self.outcomes]
+        if [outcome.case for outcome in earlier.outcomes[: len(cases)]] != cases:
             raise UserError(
-                f"{earlier.folder / OUTCOMES} has {counted(len(earlier.outcomes), 'case')}, and "
-                f"{self.folder} {count}: lines of the first are lost; take it from a copy, or run "
-                "the campaign again"
-            )
-        if [o.case for o in earlier.outcomes[:count]] != [o.case for o in self.outcomes]:
-            raise UserError(
-                f"{earlier.folder} has other cases than {self.folder}: take both from a copy, or "
-                "run the campaign again"
+                f"{earlier.folder} does not have the cases of {self.folder}: take both from a "
+                "copy, or run the campaign again"
             )
         return earlier
 

@@ -29,8 +29,6 @@ TEMPORARY: Final = ".merge-sumo-"
 """Begin of the names under which files are written."""
 LONG_NAME: Final = "x" * 64
 """As long as the name of a file that is written into a new folder."""
-NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-"""Flags to open a file that is not a link."""
 GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 DEFAULT: Final = Path("runs")
 """Folder of runs without a name."""
@@ -274,20 +272,6 @@ def replace_own(path: Path, content: bytes) -> None:
             _sync(file, content)
             new.replace(path)
         sync_folder(path.parent)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-def add_to(path: Path, content: bytes, *, new: bool) -> None:
-    """Add to a file of merge-sumo, which is begun where `new`, and sync it.
-
-    Raises `UserError` where a link is there, something that was not begun, or it cannot be written.
-    """
-    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | NO_LINK | (os.O_EXCL if new else 0)
-    try:
-        descriptor = os.open(path, flags, 0o666)
-        with os.fdopen(descriptor, "ab") as file:
-            _sync(file, content)
     except OSError as error:
         raise cannot_write(path, error) from error
 

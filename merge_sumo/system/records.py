@@ -144,13 +144,16 @@ def check_fields(value: Any) -> None:
             raise RecordError(_not_a_value(name, known, hint, str(error))) from error
 
 
-def read_indexed(
-    path: Path, kind: type[T], indices: Container[int], lost: range = range(0)
-) -> dict[int, T]:
+def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
     """Return the lines of a JSON-lines file by their `index`; nothing without the file.
 
-    Raises `RecordError` for a line that is no dataclass `kind` with one of the `indices`, or of
-    what is `lost`, or whose index an earlier line has.
+    Args:
+        path: the file.
+        kind: what each line is.
+        indices: those that a line may have.
+
+    Raises:
+        RecordError: a line is not of that kind, or has another index or that of an earlier line.
     """
     try:
         lines = regular(path).read_bytes().splitlines()
@@ -162,8 +165,7 @@ def read_indexed(
     for number, line in enumerate(lines, start=1):
         try:
             value: Any = convert(decode(line, dict[str, Any]), kind)
-            is_known = value.index in indices or value.index in lost
-            if not is_known or value.index in values:
+            if value.index not in indices or value.index in values:
                 raise RecordError(f"it is of case {value.index}, of which no such line can be")
         except UserError as error:
             line_of = f"line {number} of {path}"
@@ -178,11 +180,7 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     Raises `UserError` where it cannot be read or is no TOML.
     """
     try:
-        if not path.is_file():
-            raise UserError(f"cannot read the {what} {path}: it is not a file")
-        if (size := path.stat().st_size) > MAX_TOML_BYTES:
-            raise UserError(f"cannot read the {what} {path}: {_too_large(size)}")
-        text = path.read_text(encoding="utf-8")
+        text = read_limited(path, MAX_TOML_BYTES).decode()
     except OSError as error:
         raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -196,11 +194,8 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
 def check_toml_size(content: bytes, path: Path) -> None:
     """Raise `UserError` where a file of this content is one that `read_toml` refuses."""
     if len(content) > MAX_TOML_BYTES:
-        raise UserError(f"cannot write {path}: {_too_large(len(content))}; name fewer cases")
-
-
-def _too_large(size: int) -> str:
-    return f"it has {size:,} bytes, and at most {MAX_TOML_BYTES:,} are read"
+        size = f"{MAX_TOML_BYTES // 2**20} MiB"
+        raise UserError(f"cannot write {path}: it is larger than {size}; name fewer cases")
 
 
 def toml_value(value: object) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import queue
 import time
 from collections.abc import Callable
@@ -37,7 +36,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.system.folders import (
-    NO_LINK,
     cannot_write,
     check_own,
     make_place,
@@ -269,9 +267,7 @@ def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
     """Begin the log of a network's training, or append to it; `UserError` if that fails."""
     path = folder / f"{name}{LOG}"
     try:
-        with open(
-            path, mode, encoding="utf-8", opener=lambda name, flags: os.open(name, flags | NO_LINK)
-        ) as log:
+        with path.open(mode, encoding="utf-8") as log:
             log.write(line)
     except OSError as error:
         raise cannot_write(path, error) from error

@@ -396,12 +396,11 @@ def test_the_work_of_reading_grows_with_the_rows_alone(file):
 
 @on_us23
 def test_what_would_not_be_read_is_not_written(run, file, command_line, tmp_path, monkeypatch):
-    large, most = with_rows(file, 7000), 1 << 20
-    assert_refused(command_line("rerun", large), f"{large.stat().st_size:,} bytes", f"{most:,}")
+    assert_refused(command_line("rerun", with_rows(file, 7000)), "it is larger than 1 MiB")
     monkeypatch.setattr(records, "MAX_TOML_BYTES", file.stat().st_size)
     ms.export(run.folder, file_format="cases", out=tmp_path / "as-large.toml")
     assert len(CasesFile(tmp_path / "as-large.toml").outcomes) == 40
-    with pytest.raises(UserError, match="are read; name fewer cases"):
+    with pytest.raises(UserError, match="name fewer cases"):
         ms.export(run.folder, range(60), file_format="cases", out=tmp_path / "new" / "folder")
     assert not (tmp_path / "new").exists()
     edit(file, 'vut = "design2"', 'vut = "level0"')

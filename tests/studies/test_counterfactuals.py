@@ -161,15 +161,6 @@ class TestTheFile:
         assert list(AVOIDANCE.read_lines(Run(folder)).values()) == found
         assert (folder / "outcomes.jsonl").read_bytes() == before
 
-    def test_knows_when_outcomes_are_lost_and_does_not_take_the_blame(self, folder, found):
-        AVOIDANCE.write_lines(folder, found)
-        outcomes = folder / "outcomes.jsonl"
-        lines = outcomes.read_bytes().splitlines(keepends=True)
-        outcomes.write_bytes(b"".join(lines[: found[-1].index]))
-        words = rf"outcomes.jsonl has {found[-1].index} cases, and avoidance.jsonl knows of case .*"
-        with pytest.raises(UserError, match=rf"{words}: lines of outcomes.jsonl are lost"):
-            AVOIDANCE.read_lines(Run(folder))
-
     @pytest.mark.parametrize(
         "change",
         [
