@@ -60,6 +60,9 @@ GROUPS: Final[Mapping[type[Any], Group]] = {
 FIELDS: Final[Mapping[str, Parameter]] = {
     "progress": Parameter(negative=("--quiet", "-q")),
     "workers": Parameter(show_default=False),
+    # Edges of nets of OpenDRIVE and OSM begin with a hyphen.
+    "mainline": Parameter(allow_leading_hyphen=True),
+    "ramp": Parameter(allow_leading_hyphen=True),
 }
 """What else an option is, by the name of its field."""
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
