@@ -135,7 +135,7 @@ if os.getppid() == int(sys.argv[1]):
 def ending_with_us(command: Sequence[str]) -> list[str]:
     """Return a command that does the same, and on Linux ends when the thread that gives it ends.
 
-    So a program that waits for us, or for a person, is not left when this process is killed.
+    So a program that waits for us, or for the user, is not left when this process is killed.
     """
     if sys.platform != "linux" or not sys.executable:
         return list(command)
@@ -185,7 +185,7 @@ def run_program(
 
 
 def _kill(process: subprocess.Popen[str]) -> None:
-    with suppress(ProcessLookupError, PermissionError):  # nobody may be left
+    with suppress(ProcessLookupError, PermissionError):  # none may be left
         if hasattr(os, "killpg"):
             os.killpg(process.pid, signal.SIGKILL)
         else:

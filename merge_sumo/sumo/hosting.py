@@ -1,9 +1,9 @@
 """The net that SUMO hosts: copies of a road, each with the two paths of the merge alone.
 
 A copy of a corridor has an edge for every lane of its paths: as long as that lane, with its speed
-limit and its shape, and at M with the rules and the right of way of the junction. Lanes beside the
+limit and its shape, and at M with the rules and the right of way of the junction. Lanes next to the
 paths, other roads at junctions, and traffic lights are left out: nothing there could interfere.
-An acceleration lane and the mainline beside it are two lanes of one edge, whatever their number of
+An acceleration lane and the mainline next to it are two lanes of one edge, whatever their number of
 edges in the file; the acceleration lane leads nowhere, so a driver has to change, and may anywhere.
 Copies lie on top of each other in the plane; SUMO's drivers see along lanes and links only.
 """
@@ -29,7 +29,7 @@ AT_M: Final = f"M{COPY}"
 GORE: Final = f"gore{COPY}"
 END: Final = f"end{COPY}"
 LANE: Final = f"lane{COPY}"
-"""The edge of an acceleration lane and of the mainline beside it."""
+"""The edge of an acceleration lane and of the mainline next to it."""
 KEPT_TYPES: Final = (
     *("priority", "priority_stop", "allway_stop", "zipper", "unregulated"),
     *("right_before_left", "left_before_right"),
@@ -52,17 +52,20 @@ class HostedPath:
 
     def route(self, copy: int) -> list[str]:
         """Return the ids of the edges of a route in a copy."""
-        edges = (lane.rpartition("_")[0] for lane in self.lane_ids)
-        return [_numbered(edge, copy) for edge in edges if not edge.startswith(":")]
+        roads = [lane for lane in self.lanes(copy) if not lane.startswith(":")]
+        return [lane.rpartition("_")[0] for lane in roads]
 
 
 def hosted_paths(road: Corridor) -> tuple[HostedPath, HostedPath]:
     """Return the paths of mainline and ramp."""
-    main, ramp = (
-        HostedPath(tuple(at.lane for at in lanes), tuple(at.piece.start_m for at in lanes))
-        for lanes in _hosted_lanes(road)
-    )
+    main, ramp = map(_path, _hosted_lanes(road))
     return main, ramp
+
+
+def _path(lanes: Sequence[_HostedLane]) -> HostedPath:
+    return HostedPath(
+        tuple(lane.lane for lane in lanes), tuple(lane.piece.start_m for lane in lanes)
+    )
 
 
 def hosted_net(road: Corridor, copies: int, *, lane_goes_on: bool = False) -> bytes:
@@ -75,11 +78,10 @@ def hosted_net(road: Corridor, copies: int, *, lane_goes_on: bool = False) -> by
     # SUMO reads edges before the junctions that name their lanes, and connections last.
     elements = _elements(road, lane_goes_on=lane_goes_on)
     for tag in ("edge", "junction", "connection"):
-        template = "".join(
-            f"{etree.tostring(element, encoding='unicode')}\n"
-            for element in elements
-            if element.tag == tag
-        )
+        template = ""
+        for element in elements:
+            if element.tag == tag:
+                template += etree.tostring(element, encoding="unicode") + "\n"
         text += [_numbered(template, k) for k in range(copies)]
     return "".join([*text, "</net>\n"]).encode()
 
@@ -113,21 +115,28 @@ class _Hop(NamedTuple):
 
 def _hosted_lanes(road: Corridor) -> tuple[list[_HostedLane], list[_HostedLane]]:
     """Return the lanes of mainline and ramp; where the paths are one they are the same."""
-    ramp_name = "main" if road.is_one_path else "ramp"
-    begin_m, end_m = road.lane_m or (0.0, 0.0)
-    first = GORE if road.lane_m else AT_M
-    main, ramp = (
-        [
-            *_named(name, [piece for piece in path.pieces if piece.start_m < begin_m], first),
-            *([_beside(path, road.lane_m, on_ramp=on_ramp)] if road.lane_m else []),
-            *_named("out", [piece for piece in path.pieces if piece.start_m >= end_m], END, AT_M),
-        ]
-        for name, path, on_ramp in (
-            ("main", road.mainline, False),
-            (ramp_name, road.ramp, True),
-        )
-    )
+    main = _lanes_of(road.mainline, "main", road.lane_m, number=1)
+    ramp = _lanes_of(road.ramp, "main" if road.is_one_path else "ramp", road.lane_m, number=0)
     return main, ramp
+
+
+def _lanes_of(
+    path: LanePath, name: str, lane_m: Bounds | None, *, number: int
+) -> list[_HostedLane]:
+    """Return the lanes of a path; `number` is that of its lane along an acceleration lane."""
+    begin_m, end_m = lane_m or (0.0, 0.0)
+    before = [piece for piece in path.pieces if piece.start_m < begin_m]
+    along = [piece for piece in path.pieces if begin_m <= piece.start_m < end_m]
+    after = [piece for piece in path.pieces if piece.start_m >= end_m]
+    lanes = [*_named(name, before, GORE if lane_m else AT_M)]
+    if lane_m:
+        # In one piece; with the limit that its driver is about to see: a ramp's may rise along it.
+        shape = [point for point, _ in groupby(chain(*(piece.shape for piece in along)))]
+        piece = Piece(
+            along[0].lane, begin_m, end_m - begin_m, along[-1].speed_limit_mps, tuple(shape)
+        )
+        lanes.append(_HostedLane(LANE, AT_M, piece, number, leads_on=number > 0))
+    return [*lanes, *_named("out", after, END, AT_M)]
 
 
 def _named(
@@ -144,17 +153,6 @@ def _named(
             road += 1
             junction = last if road == roads else f"{name}{road}-end{COPY}"
             yield _HostedLane(f"{name}{road}{COPY}", junction, piece)
-
-
-def _beside(path: LanePath, lane_m: Bounds, *, on_ramp: bool) -> _HostedLane:
-    """Return the lane of a path between gore and end of the acceleration lane, in one piece."""
-    begin_m, end_m = lane_m
-    pieces = [piece for piece in path.pieces if begin_m <= piece.start_m < end_m]
-    shape = [point for point, _ in groupby(chain(*(piece.shape for piece in pieces)))]
-    # What its driver is about to see: a ramp's limit may rise along the lane.
-    limit_mps = pieces[-1].speed_limit_mps
-    piece = Piece(pieces[0].lane, begin_m, end_m - begin_m, limit_mps, tuple(shape))
-    return _HostedLane(LANE, AT_M, piece, number=0 if on_ramp else 1, leads_on=not on_ramp)
 
 
 def _hops(lanes: Sequence[_HostedLane], *, lane_goes_on: bool) -> Iterator[_Hop]:

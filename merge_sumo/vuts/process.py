@@ -117,7 +117,7 @@ class Output:
 
 
 LINES: Final = 40
-"""Of the end of a log that a person is shown."""
+"""Of the end of a log that is shown."""
 
 
 def end_of(log: Path) -> str:

@@ -97,7 +97,7 @@ class TraciKind(ControllerKind):
 
 
 def is_port(argument: str) -> bool:
-    """Return whether an argument names the port at which a person's client is waited for."""
+    """Return whether an argument names the port at which the user's client is waited for."""
     return not argument or argument.isdecimal()
 
 
