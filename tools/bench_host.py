@@ -29,7 +29,7 @@ from bench_record import add_record_option, append_record
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.engine.povs import PovLibrary, Povs
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, from_unit
@@ -52,7 +52,7 @@ def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
     vut = VutFactory.of(VUT)(world.corridors)
     start = time.perf_counter()
-    trajectories = rollout(world, pov, vut, cases)
+    trajectories = Rollout(world, pov, vut, cases).run()
     return time.perf_counter() - start, trajectories
 
 

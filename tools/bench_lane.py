@@ -27,7 +27,7 @@ from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.engine.kinematic_world import EquationWorld
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
@@ -60,7 +60,7 @@ def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
     """Return what happens in cases of one scenario, in their order."""
     scenario = cases[0].scenario
     world = EquationWorld(pov.corridors, road_for(scenario), scenario)
-    ended = rollout(world, pov, vut, cases)
+    ended = Rollout(world, pov, vut, cases).run()
     return [ended[place] for place in range(len(cases))]
 
 

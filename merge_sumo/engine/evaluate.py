@@ -22,14 +22,22 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.system.hashing import hashed
-from merge_sumo.system.workers import Workers, when_worker_ends, workers_or_here
+from merge_sumo.system.workers import Workers, when_worker_ends
 from merge_sumo.verdict.episode import Episode
 from merge_sumo.verdict.score import Outcome, measure_all
 
 R = TypeVar("R")
 
 
-def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]:
+@overload
+def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]: ...
+@overload
+def simulate(
+    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], R]
+) -> list[R]: ...
+def simulate(
+    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], Any] | None = None
+) -> list[Any]:
     """Run cases in this process; return their episodes in order.
 
     Where the plan has an earlier version of the VUT, each episode has that of the earlier version.
@@ -37,16 +45,17 @@ def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]:
     Args:
         plan: how they run.
         cases: cases of the plan's scenario.
+        keep: gives the part of an episode that is returned, by default all of it.
 
     Raises:
         UserError: if the plan cannot be carried out.
     """
     cases = list(cases)
     if plan.against is not None:
-        return _simulate_both(plan, cases)
+        both = _simulate_both(plan, cases)
+        return both if keep is None else list(map(keep, both))
     with opened_simulator(plan) as simulator:
-        again = set[int]()
-        trajectories = simulator.run(cases, again)
+        trajectories = simulator.run(cases)
         outcomes = _measured(plan, trajectories)
         files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
         episodes = []
@@ -56,11 +65,11 @@ def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]:
                 trajectory,
                 files,
                 pov_files,
-                again=place in again,
+                again=place in simulator.ran_again,
                 in_sumo=place in simulator.in_sumo,
             )
             episodes.append(episode)
-        return episodes
+        return episodes if keep is None else list(map(keep, episodes))
 
 
 def lost(plan: SimulationPlan, case: Case) -> Episode:
@@ -90,26 +99,25 @@ def evaluate(
     workers: Workers | None = None,
     keep: Callable[[Episode], Any] | None = None,
 ) -> Iterator[tuple[int, Any]]:
-    """Simulate cases on workers; yield (place in `cases`, result) in order.
+    """Simulate cases on workers; return (place in `cases`, result) in order, as they end.
 
     Args:
         plan: how they run.
         cases: cases of the plan's scenario.
-        workers: where they run; None for this process.
+        workers: where they run; None for this process, which keeps its simulator open.
         keep: gives the part of an episode that travels to this process, by default all of it. A
             function that is found by its name.
 
     Raises:
         UserError: if the plan cannot be carried out.
     """
-    kept = keep or _whole
-    with workers_or_here(workers) as available:
-        yield from available.run(
-            partial(_simulate_and_keep, plan, kept),
-            cases,
-            lambda case: kept(lost(plan, case)),
-            chunk=CHUNK if plan.engine is Engine.KINEMATIC else None,
-        )
+
+    def lost_result(case: Case) -> Any:
+        return lost(plan, case) if keep is None else keep(lost(plan, case))
+
+    available = Workers(None, 1) if workers is None else workers
+    chunk = CHUNK if plan.engine is Engine.KINEMATIC else None
+    return available.run(partial(simulate, plan, keep=keep), cases, lost_result, chunk=chunk)
 
 
 def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
@@ -194,13 +202,3 @@ def _open_simulators(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[
         _open_simulators(earlier, nothing)
     with opened_simulator(replace(plan, against=None)):
         return nothing
-
-
-def _simulate_and_keep(
-    plan: SimulationPlan, keep: Callable[[Episode], R], cases: Iterable[Case]
-) -> list[R]:
-    return list(map(keep, simulate(plan, cases)))
-
-
-def _whole(episode: Episode) -> Episode:
-    return episode

@@ -20,7 +20,6 @@ import numpy as np
 
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import Engine, SimulationPlan
-from merge_sumo.engine.rollout import rollout
 from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
@@ -51,12 +50,12 @@ class KinematicSimulator(Simulator):
             world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
             self._open_drivers(plan, world, None, opened)
 
-    def run(self, cases: Sequence[Case], ran_again: set[int] | None = None) -> list[Trajectory]:
+    def run(self, cases: Sequence[Case]) -> list[Trajectory]:
         """Run cases; return their trajectories in order.
 
         Raises `UserError` where a case ends otherwise in SUMO.
         """
-        ended = rollout(self.world, self.pov, self.vut, cases, ran_again)
+        ended = super().run(cases)
         close = self._close_calls(ended)
         places = sorted(close | drawn(cases))
         if places and self._sumo is None:

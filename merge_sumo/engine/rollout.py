@@ -59,14 +59,8 @@ class _Running:
     """Signals, by the row of the episode at which the VUT left them."""
 
 
-def rollout(
-    world: World | EquationWorld,
-    pov: Driver,
-    vut: Driver,
-    cases: Iterable[Case],
-    ran_again: set[int] | None = None,
-) -> list[Trajectory]:
-    """Run cases in the world; return their trajectories in order.
+class Rollout:
+    """Cases that run in the corridors of a world.
 
     Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
     episode does not depend on the number of corridors nor on its neighbours. What the VUT does
@@ -75,26 +69,25 @@ def rollout(
     it twice, alone, is at fault. When SUMO fails, the episodes that were running end as
     SIM_ERROR, SUMO is started again, and the others go on.
 
-    Args:
-        world: the corridors.
-        pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
-        vut: drives the VUT of each corridor.
-        cases: cases of the world's scenario.
-        ran_again: gets the places of cases that ran again although none was at fault: something
-            from outside ended the process.
+    Example:
+        trajectories = Rollout(world, pov, vut, cases).run()
+
+    Attributes:
+        unexplained: places of the cases that ran again although none was at fault: something from
+            outside ended the process.
     """
-    return _Rollout(world, pov, vut, cases, ran_again).run()
 
-
-class _Rollout:
     def __init__(
-        self,
-        world: World | EquationWorld,
-        pov: Driver,
-        vut: Driver,
-        cases: Iterable[Case],
-        ran_again: set[int] | None = None,
+        self, world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
     ) -> None:
+        """Take the corridors and their drivers.
+
+        Args:
+            world: the corridors.
+            pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+            vut: drives the VUT of each corridor.
+            cases: cases of the world's scenario.
+        """
         corridors, vehicles = world.corridors, len(world.x_m)
         self.world, self.pov, self.vut = world, pov, vut
         self.mainline = [row for row in range(vehicles) if row != VUT]
@@ -106,9 +99,7 @@ class _Rollout:
         """Whether a suspect runs alone."""
         self.deaths = Counter[int]()
         """How often a process died with one case alone, by the place of the case."""
-        self.ran_again = set() if ran_again is None else ran_again
         self.unexplained = set[int]()
-        """Those of them of which none was at fault so far."""
         self.episodes: list[_Running | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
@@ -134,11 +125,7 @@ class _Rollout:
         """The row of this step."""
 
     def run(self) -> list[Trajectory]:
-        self.run_all()
-        self.ran_again |= self.unexplained
-        return [trajectory for _, trajectory in sorted(self.ended.items())]
-
-    def run_all(self) -> None:
+        """Run all cases; return their trajectories in order."""
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
         while self.next_timeout < NEVER:  # as long as an episode runs
@@ -179,6 +166,7 @@ class _Rollout:
                     else:
                         self.finish(corridor, self.ends_as if arrived[corridor] else End.TIMEOUT)
                 self.refill(corridors)
+        return [trajectory for _, trajectory in sorted(self.ended.items())]
 
     def goes_on(self, corridor: int, *, arrived: bool) -> bool:
         """Return whether an episode goes on behind M; note where that begins."""
@@ -275,7 +263,16 @@ class _Rollout:
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if following is not None:
             scene = scene._replace(facing=following.met(x_m, v_mps))
-        answer = np.concatenate((cars[:VUT], self.ask_vut(scene)[None], cars[VUT:]))
+        self.raised = None
+        try:
+            of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
+            self.take_signals(of_vut)
+        except (SimulationError, VutLostError):
+            raise
+        except WRONGS as error:
+            self.raised = f"{type(error).__name__}: {error}"
+            of_vut = np.full(self.world.corridors, np.nan)
+        answer = np.concatenate((cars[:VUT], of_vut[None], cars[VUT:]))
         # Before the limits of car following, which would turn an infinite answer into a number.
         if not math.isfinite(np.vdot(answer, answer)):
             answer = self.only_numbers(answer)
@@ -294,24 +291,14 @@ class _Rollout:
             self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
         return acceleration
 
-    def ask_vut(self, scene: Scene) -> FloatArray:
-        """Return the VUT's answer, (K,); no numbers, and a note, where it has raised something."""
-        corridors = self.world.corridors
-        self.raised = None
-        try:
-            answer = np.asarray(self.vut.act(scene), dtype=np.float64)
-            if answer.shape != (corridors,):
-                raise ValueError(f"answered shape {answer.shape} instead of ({corridors},)")
-            for corridor, left in self.vut.signals().items():
-                episode = self.episodes[corridor]
-                if left and episode is not None:
-                    episode.left.append((self.row - 1 - episode.first_row, left))
-            return answer
-        except (SimulationError, VutLostError):
-            raise
-        except WRONGS as error:
-            self.raised = f"{type(error).__name__}: {error}"
-            return np.full(corridors, np.nan)
+    def take_signals(self, answer: FloatArray) -> None:
+        """Keep the signals of the VUT; ValueError where its answer is not one a corridor."""
+        if answer.shape != self.active.shape:
+            raise ValueError(f"answered shape {answer.shape} instead of {self.active.shape}")
+        for corridor, left in self.vut.signals().items():
+            episode = self.episodes[corridor]
+            if left and episode is not None:
+                episode.left.append((self.row - 1 - episode.first_row, left))
 
     def only_numbers(self, answer: FloatArray) -> FloatArray:
         """Return answers, (A, K), with 0 where one is no number; note whose doing that was.

@@ -13,7 +13,7 @@ from merge_sumo.drivers.sensing import SensedDriver
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.engine.povs import PovLibrary, Povs
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
@@ -26,12 +26,14 @@ class Simulator:
     Attributes:
         world: that of SUMO, or of a subclass's engine.
         in_sumo: places of the cases of the last `run` that SUMO ran.
+        ran_again: places of those that ran again, because a process was ended from outside.
     """
 
     world: World | EquationWorld
     vut: Driver
     pov: Driver
     in_sumo: Collection[int] = ()
+    ran_again: Collection[int] = ()
 
     def __init__(self, plan: SimulationPlan) -> None:
         """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
@@ -66,13 +68,12 @@ class Simulator:
         opened.callback(self.pov.close)
         self._opened = opened.pop_all()
 
-    def run(self, cases: Sequence[Case], ran_again: set[int] | None = None) -> list[Trajectory]:
-        """Run cases; return their trajectories in order.
-
-        `ran_again` gets the places of those that ran again: see `rollout`.
-        """
+    def run(self, cases: Sequence[Case]) -> list[Trajectory]:
+        """Run cases; return their trajectories in order."""
         self.in_sumo = range(len(cases)) if isinstance(self.world, World) else ()
-        return rollout(self.world, self.pov, self.vut, cases, ran_again)
+        rollout = Rollout(self.world, self.pov, self.vut, cases)
+        self.ran_again = rollout.unexplained
+        return rollout.run()
 
     def close(self) -> None:
         """Stop the POVs, the VUT, then SUMO."""

@@ -31,7 +31,7 @@ from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.engine.evaluate import opened_simulator
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.engine.simulator import povs_for
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray, MergeCase
@@ -275,7 +275,7 @@ class Stage:
     def passed(self, cases: Sequence[_Counterfactual]) -> list[bool]:
         """Return whether each case is passed."""
         passed = []
-        trajectories = rollout(self._world, self._povs, self._substitutes, cases)
+        trajectories = Rollout(self._world, self._povs, self._substitutes, cases).run()
         for case, trajectory in zip(cases, trajectories, strict=True):
             whole = case.from_the_start(trajectory)
             passed.append(_passes(self._criterion, whole, self._lines))

@@ -163,7 +163,7 @@ def share_at(
     points = rng.random((cases, len(plan.scenario.dimensions(level))))
     pool = Pool(levels=(level,), scenario=plan.scenario)
     chosen = plan.for_verdicts().with_engine(None)
-    ran = [ended for _, ended in evaluate(chosen, pool.cases(points, level), workers, end_of)]
+    ran = dict(evaluate(chosen, pool.cases(points, level), workers, end_of)).values()
     failures, errors = (sum(of) for of in zip(*ran, strict=True))
     return LevelShare(level, cases, failures, errors)
 

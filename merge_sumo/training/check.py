@@ -12,7 +12,7 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
@@ -80,7 +80,7 @@ def play(
         for make in (make_pov, make_vut)
     )
     with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
-        return rollout(world, pov, vut, cases)
+        return Rollout(world, pov, vut, cases).run()
 
 
 def check_policy(

@@ -76,7 +76,7 @@ class TestTheArchitecture:
     def test_names_all_that_run_cases_beside_evaluate(self):
         (rule,) = re.findall(r"^- \*\*One plan.*$", self.PAGE, re.MULTILINE)
         named = {file for file in re.findall(r"`(\w+/\w+\.py)`", rule) if "/" in file}
-        calls = re.compile(r"(?<!def )\b(?:rollout|Simulator)\((?!Simulator)")
+        calls = re.compile(r"(?<!def )\b(?:Rollout|Simulator)\((?!Simulator)")
         package = ROOT / "merge_sumo"
         calling = {
             path.relative_to(package).as_posix()

@@ -27,7 +27,7 @@ from merge_sumo.drivers.policies import (
     read_manifest,
 )
 from merge_sumo.engine.povs import PovLibrary, Povs
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -57,7 +57,7 @@ def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors, scenario=US23) as world:
         driver = VutFactory.of(vut)(corridors)
-        trajectories = rollout(world, PovLibrary(corridors, POVS), driver, cases)
+        trajectories = Rollout(world, PovLibrary(corridors, POVS), driver, cases).run()
     return [measure(t) for t in trajectories], trajectories
 
 
@@ -197,7 +197,7 @@ class TestALimitOfBraking:
         with World(corridors, scenario=US23) as world:
             pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
             vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
-            (found,) = rollout(world, pov, vut, [case])
+            (found,) = Rollout(world, pov, vut, [case]).run()
         assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
         assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
 
@@ -212,7 +212,7 @@ class TestTheLibraryOfPeople:
         cases = uniform_cases(level, 300, seed=4)
         with World(32, scenario=US23) as world:
             pov, vut = PovLibrary(32, self.POVS), VutFactory.of("design2")(32)
-            found = [measure(t) for t in rollout(world, pov, vut, cases)]
+            found = [measure(t) for t in Rollout(world, pov, vut, cases).run()]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0
 

@@ -108,7 +108,7 @@ class TestSeverity:
 class TestDrivingOn:
     def test_changes_nothing_up_to_m(self):
         at_m, behind = run("design1", AT_M), run("design1", FOLLOWED)
-        for index, merged in at_m.items():
+        for index, merged in enumerate(at_m):
             on = behind[index]
             assert np.array_equal(on.motion, merged.motion)
             assert (on.end, on.clipped_steps) == (merged.end, merged.clipped_steps)
@@ -116,7 +116,7 @@ class TestDrivingOn:
             assert merged.after is None
 
     def test_is_the_motion_of_both_by_eq_4(self):
-        for trajectory in run("level0", FOLLOWED).values():
+        for trajectory in run("level0", FOLLOWED):
             after = trajectory.after
             assert after.shape == (31, 2, 3)
             assert np.array_equal(after[0, :, :2], trajectory.motion[-1, :, :2])
@@ -127,7 +127,7 @@ class TestDrivingOn:
 
     def test_a_car_behind_the_vut_brakes_for_it(self):
         slow = replace(US23, v_vut0_mps=12.0, level0_a_mps2=0.1)
-        behind = [t for t in run("level0", slow).values() if t.after[0, 0, 0] < t.after[0, VUT, 0]]
+        behind = [t for t in run("level0", slow) if t.after[0, 0, 0] < t.after[0, VUT, 0]]
         assert behind
         assert min(t.after[:, 0, 2].min() for t in behind) < -1.0
 
@@ -135,7 +135,7 @@ class TestDrivingOn:
         (tmp_path / "ends.py").write_text(
             "def ends(seen):\n    return 1.0 if seen.x_vut_m < 10.0 else 1 / 0\n", encoding="utf-8"
         )
-        for trajectory in run(f"{tmp_path / 'ends.py'}:ends", FOLLOWED).values():
+        for trajectory in run(f"{tmp_path / 'ends.py'}:ends", FOLLOWED):
             assert trajectory.end is End.MERGED
             assert "ZeroDivisionError" in trajectory.error
             assert trajectory.after[-1, VUT, 0] >= 10.0

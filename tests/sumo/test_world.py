@@ -11,7 +11,7 @@ from plans import POVS
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.engine.povs import PovLibrary
-from merge_sumo.engine.rollout import rollout
+from merge_sumo.engine.rollout import Rollout
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End
@@ -49,7 +49,7 @@ class RandomDriver(Driver):
 
 
 def run_all(world, pov, vut, cases):
-    return rollout(world, pov, vut, cases)
+    return Rollout(world, pov, vut, cases).run()
 
 
 def assert_eq4(trajectory):
