@@ -105,7 +105,9 @@ class Commands(App):
                 continue
             default = argument.field_info.default
             shown = type(default) in (int, float) or (isinstance(default, str) and default != "")
-            more = Parameter.combine(Parameter(show_default=shown), FIELDS.get(name))
+            # Edges of a net, and conditions, may begin with a hyphen.
+            more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
+            more = Parameter.combine(more, FIELDS.get(name))
             for kind, group in GROUPS.items():
                 if argument.keys and name in kind.__annotations__:
                     more = Parameter.combine(more, Parameter(group=group))
@@ -207,7 +209,7 @@ def campaign(
 
 
 def _how_to_go_on(folder: Path, config: c.CampaignOptions) -> str:
-    """Return the command that goes on, with the options that are no setting of the campaign."""
+    """Return the command that continues, with the options that are not settings of the campaign."""
     words = [ms.open_run(folder).go_on]
     words += [f"--gate {quoted(gate)}" for gate in config.gates]
     if config.junit is not None:

@@ -111,8 +111,9 @@ class Search:
     batch: int | None = None
     """Cases per batch; by default as many as the sampler wants."""
     in_flight: int | None = None
-    """Most cases that run or wait for a worker while the sampler is asked for more, instead of
-    batches: for controllers that take seconds for a case. About three times the workers."""
+    """Maximum number of cases that run or wait for a worker while the sampler proposes more,
+    instead of batches: for controllers that take seconds for a case. About three times the
+    workers."""
     repeat: int = 1
     """Number of runs of each case, each with other random numbers. Each run is one of the
     --cases."""
@@ -196,7 +197,7 @@ class Beginning:
 class CampaignOptions(Levels, Junit, Execution, Search, Test):
     """Test a VUT: run cases in SUMO, find failures, write a report and replayable scenarios.
 
-    Ctrl-C lets the running batch end and says how to go on; twice stops at once.
+    Ctrl-C ends after the running batch and prints how to continue; twice stops at once.
 
     Exit code 1 when a --gate is met, and always when the VUT merged in no case: then nothing was
     tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
@@ -240,7 +241,7 @@ class NoFailures(Campaign):
     """Test a VUT in a campaign, and raise `AssertionError` where a case fails or ends in an error.
 
     The message names the counts, the worst case, the report, and the command that replays the
-    case. A timeout is no failure, unless `fail_when` says so. Returns the campaign.
+    case. A timeout is not a failure, unless `fail_when` says so. Returns the campaign.
     """
 
     _: KW_ONLY
@@ -454,7 +455,7 @@ class Rerun(Page, Levels, Recorded):
 
 @dataclass(frozen=True)
 class Stress(Recorded):
-    """Run the cases of a campaign again, each time a little otherwise: `merge-sumo rerun --stress`.
+    """Measure how results change with the simulation; the same as `merge-sumo rerun --stress`.
 
     `robust` of the result has the failures that fail every time, the worst first.
     """

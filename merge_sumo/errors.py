@@ -1,4 +1,4 @@
-"""What a person did that we cannot go on with: one sentence that says what to do."""
+"""Errors and warnings for the user: one sentence that says what to do."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from types import FrameType
 from typing import Final
 
 MOST_CHARACTERS: Final = 10_000
-"""Of a sentence: it may quote a file that somebody sent, which may say anything at any length."""
+"""Maximum length of a sentence: it may quote a received file."""
 
 
 class UserError(Exception):
@@ -28,7 +28,7 @@ class WorkersLostError(UserError):
 
 
 class Notice(UserWarning):
-    """What a person should know of a result; the command line prints it as a sentence."""
+    """What a user should know of a result; the command line prints it as a sentence."""
 
 
 def notice(sentence: str, category: type[Warning] = Notice) -> None:

@@ -120,13 +120,13 @@ def resume(config: c.Resume) -> CampaignRun:
     folder = folder_of(config.run)
     recorded = read_settings(folder)
     fields, where = explicit(config, recorded.get("vut") or "", recorded.get("pov"))
-    settings = settings_of(folder, recorded, fields, goes_on=True)
+    settings = settings_of(folder, recorded, fields, resumes=True)
     if config.level != "all":
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
         levels = parse_levels(config.level, policies, settings.scenario.levels, own=own)
         settings = replace(settings, levels=levels)
-    return run_and_report(settings, resolve(settings), folder, where, config, goes_on=True)
+    return run_and_report(settings, resolve(settings), folder, where, config, resumes=True)
 
 
 def open_run(folder: c.AnyPath) -> CampaignRun:
@@ -266,7 +266,9 @@ def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
     path = folder_of(folder)
     if not (path / SETTINGS).is_file():
         if index is not None:
-            raise UserError(f"{path} is no campaign, so it has no case {index}: leave that away")
+            raise UserError(
+                f"{path} is no campaign, so it has no case {index}: leave the index away"
+            )
         return path
     if index is None:
         raise UserError(
@@ -364,12 +366,12 @@ def reproduce(config: c.Reproduce) -> Reproduction:
     return replace(result, page=write_reproduction(result, folder))
 
 
-# What a person brings: VUTs, scenarios, learned drivers
+# Bring your own: VUTs, scenarios, learned drivers
 
 
 @verb(c.Vuts)
 def vuts(config: c.Vuts) -> Shown:
-    """Return the VUTs that can be tested, and the kinds that a person can bring."""
+    """Return the VUTs that can be tested, and the kinds that a user can bring."""
     return vut_check.known_vuts(config.policies)
 
 

@@ -47,17 +47,25 @@ def run_and_report(
     where: c.Execution,
     config: c.CampaignCalls,
     *,
-    goes_on: bool = False,
+    resumes: bool = False,
 ) -> CampaignRun:
     """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
 
-    It begins in a new folder, or goes on in one. An interruption has a note on how to go on.
+    An interruption has a note on how to continue.
+
+    Args:
+        settings: the settings of the campaign.
+        plan: how its cases run.
+        folder: a new folder, or that of the campaign.
+        where: where its cases run.
+        config: gates, JUnit file, and functions that are called.
+        resumes: whether the campaign continues in the folder.
     """
     junit = None if config.junit is None else Path(config.junit)
     parse_gates(config.gates, against=settings.against is not None)
     if junit is not None:
         check_junit(junit, folder)
-    if goes_on:
+    if resumes:
         check_report(folder)
     else:
         check_new(folder)
@@ -81,7 +89,7 @@ def run_and_report(
                 plan,
                 folder,
                 (bars.ended, report.rewrite, on_cases),
-                resumes=goes_on,
+                resumes=resumes,
                 on_before=bars.ran_before,
                 workers=workers,
                 begin=lambda: bars.begin(title),
@@ -149,7 +157,7 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Camp
     own, by_sumo = plan.povs.own, plan.vut.vut.vut_type is not None
     on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None
     if on_lane and own is not None and own.vut.vut_type is not None and not by_sumo:
-        # SUMO's drivers make room for a car beside them where its lane-change model asks them to.
+        # SUMO's drivers make room for a car next to them where its lane-change model asks them to.
         notice(
             f"note: until the VUT has merged, the POV {own.spec} keeps its speed: on an "
             "acceleration lane SUMO's drivers see only a VUT that SUMO drives, too (sumo:MODEL)"

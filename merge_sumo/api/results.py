@@ -47,8 +47,8 @@ VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
 `outcomes.jsonl`."""
 
 
-TOLD: Final = ("cases that ran more than once",)
-"""Facts that the terminal lists beside the headline, where there are any."""
+FACTS: Final = ("cases that ran more than once",)
+"""Facts that the terminal lists with the headline, where there are any."""
 
 
 class Table(list[dict[str, Any]]):
@@ -212,7 +212,7 @@ class CampaignRun(Result):
     def lines(self) -> list[str]:
         """Return the headline, what else is to be known, and the path of the report."""
         run = self._run
-        told = [fact for fact in self.facts if fact.level is None and fact.name in TOLD]
+        facts = [fact for fact in self.facts if fact.level is None and fact.name in FACTS]
         tested, *found = headline(run, self.facts)
         optional = [
             unrepeatable(self.repeats),
@@ -220,7 +220,7 @@ class CampaignRun(Result):
             mostly_clipped(run.cases),
             *self.verdict.trouble_lines(),
             *found,
-            *(f"{fact.name}: {fact.shown}" for fact in told),
+            *(f"{fact.name}: {fact.shown}" for fact in facts),
             run.ran_again_in_words if run.settings.ran_again else None,
             *(f"note: {note}" for note in self._doubts),
             *self._against_lines(),
@@ -240,7 +240,7 @@ class CampaignRun(Result):
 
     @property
     def go_on(self) -> str:
-        """The command that goes on with the campaign; a call of Python where an object drives."""
+        """The command that continues the campaign; a call of Python where an object drives."""
         return again("resume", self.folder, self.settings)
 
     def remarks(self) -> list[str]:
@@ -276,7 +276,7 @@ class CaseRun(Result):
 
     @property
     def passed(self) -> bool:
-        """Whether the VUT merged, and the case is no failure."""
+        """Whether the VUT merged, and the case is not a failure."""
         return self.measures.end is End.MERGED and not self.failed
 
     @property
@@ -300,17 +300,17 @@ class CaseRun(Result):
 
 
 def campaign_of(run: AnyRun) -> CampaignRun:
-    """Open a campaign that a person names."""
+    """Open a campaign of a user."""
     return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
 
 
 def recorded(run: AnyRun) -> Run:
-    """Open what a person names: a campaign, or a cases file."""
+    """Open a campaign, or a cases file."""
     path = folder_of(run)
     is_file = not path.is_dir() and (path.suffix == SUFFIX or path.exists())
     return CasesFile(path) if is_file else campaign_of(run).run
 
 
 def folder_of(run: AnyRun) -> Path:
-    """Return the folder of a campaign that a person names."""
+    """Return the folder of a campaign of a user."""
     return Path(run) if isinstance(run, str | Path) else run.folder

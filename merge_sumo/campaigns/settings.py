@@ -135,13 +135,13 @@ class CampaignSettings(Search):
         )
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
-        """Return the sampler, which was told nothing; `predictor` as of `make_sampler`."""
+        """Return the sampler, without outcomes; `predictor` as of `make_sampler`."""
         sampler = make_sampler(self.sampler, self.pool, self.seed, predictor)
         sampler.tolerated = self.tolerated
         return sampler
 
     def with_repeats(self, sampler: Sampler) -> Sampler:
-        """Return a sampler that was told nothing, with repeats among its picks."""
+        """Return a sampler without outcomes, with repetitions among its cases."""
         return sampler if self.repeat == 1 else RepeatingSampler(sampler, self.repeat)
 
     @property
@@ -218,36 +218,40 @@ MOST_SHOWN: Final = 200
 def settings_of(
     folder: Path,
     recorded: Mapping[str, Any],
-    given: Mapping[str, object] | None = None,
+    overrides: Mapping[str, object] | None = None,
     *,
-    goes_on: bool = False,
+    resumes: bool = False,
 ) -> CampaignSettings:
-    """Return the settings of a campaign, as its folder records them or as they are given anew.
+    """Return the settings of a campaign, as its folder records them.
 
-    Only a campaign that goes on runs the earlier version that it is against.
+    Args:
+        folder: the folder, for messages.
+        recorded: what its `campaign.json` says.
+        overrides: settings that replace recorded ones.
+        resumes: whether the campaign continues: else it has no earlier version.
 
-    Raises `UserError` where one is missing or something else, and where it is a controller that is
-    code, which is never run because a folder names it: who may have written that?
+    Raises:
+        UserError: for a setting that is missing or wrong, and for a controller that is code and not
+            among the overrides: a folder that was received runs no code.
     """
-    given = {**({} if goes_on else {"against": None}), **(given or {})}
-    record = {**recorded, **given}
+    explicit = {**({} if resumes else {"against": None}), **(overrides or {})}
+    record = {**recorded, **explicit}
     for name, spec in controllers(record).items():
-        if name not in given:
+        if name not in explicit:
             raise UserError(
                 f"{folder} was run with {name} {printable(spec)[:MOST_SHOWN]}, and a run folder "
                 f"names no code to run: name it again with `{name}`"
             )
-    known = {
-        spec.name: record[spec.name] for spec in fields(CampaignSettings) if spec.name in record
-    }
-    if not isinstance(known.get("scenario"), Scenario):
-        known["scenario"] = scenario_of(record, folder / SETTINGS)
-    if isinstance(known.get("policies"), str) and "policies" not in given:
-        _check_still_there(folder, known["policies"])
-    required = (spec.name for spec in fields(CampaignSettings) if spec.default is MISSING)
-    for name in required:
-        if name not in known:
-            raise UserError(f"{folder / SETTINGS}: it has no {name}")
+    if not isinstance(record.get("scenario"), Scenario):
+        record["scenario"] = scenario_of(record, folder / SETTINGS)
+    if isinstance(record.get("policies"), str) and "policies" not in explicit:
+        _check_still_there(folder, record["policies"])
+    known = {}
+    for field in fields(CampaignSettings):
+        if field.name in record:
+            known[field.name] = record[field.name]
+        elif field.default is MISSING:
+            raise UserError(f"{folder / SETTINGS}: it has no {field.name}")
     try:
         return CampaignSettings(**known)
     except RecordError as error:

@@ -25,7 +25,7 @@ class Result:
 
     __slots__ = ()
     computed: ClassVar[tuple[str, ...]] = ()
-    """Properties that `--json` prints beside the fields."""
+    """Properties that `--json` prints with the fields."""
 
     @property
     def is_good(self) -> bool:

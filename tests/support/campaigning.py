@@ -38,5 +38,5 @@ def resume_campaign(folder: Path, given: Mapping[str, object] | None = None, **o
     """Go on with a campaign, with its controllers named again as they were."""
     recorded = read_settings(folder)
     named = {**controllers(recorded), **(given or {})}
-    settings = settings_of(folder, recorded, named, goes_on=True)
+    settings = settings_of(folder, recorded, named, resumes=True)
     return campaign.run_campaign(settings, resolve(settings), folder, resumes=True, **other)
