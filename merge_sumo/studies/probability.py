@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from merge_sumo import config
-from merge_sumo.engine.evaluate import evaluate, open_simulators
+from merge_sumo.engine.evaluate import open_simulators
 from merge_sumo.engine.plan import Engine
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
@@ -213,11 +213,9 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
     missed: list[dict[str, float]] = []
     for one, chances in zip(cells, drawn, strict=True):
         at = study.settings.pool.cases(stated.points(one.level, chances), one.level)
-        failed, judged = np.zeros((2, len(at)), dtype=bool)
-        for place, (fails, has_verdict, by_sumo) in evaluate(plan, at, study.workers, _judged):
-            failed[place], judged[place] = fails, has_verdict
-            in_sumo += by_sumo
-            study.on_cases(1)
+        ran = np.array(study.simulate(at, plan, _judged), dtype=bool).reshape(-1, 3)
+        failed, judged, by_sumo = ran.T
+        in_sumo += int(by_sumo.sum())
         counted.append(Counted(one, len(at), int(failed.sum()), int((~judged).sum())))
         if not one.expects_failures:
             missed += [_named(at[place]) for place in np.flatnonzero(failed)[:NAMED].tolist()]

@@ -111,8 +111,8 @@ def _ran(
 ) -> dict[int, Episode]:
     """Run the cases of outcomes, in their order; return what became of them by index."""
     by_index = dict[int, Episode]()
-    for place, now in evaluate(plan, [outcome.case for outcome in outcomes], workers):
-        old = outcomes[place]
+    cases = [outcome.case for outcome in outcomes]
+    for old, (_, now) in zip(outcomes, evaluate(plan, cases, workers), strict=True):
         by_index[old.index] = now.at(old.index, old.batch)
         on_cases(1)
     return by_index

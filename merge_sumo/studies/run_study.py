@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
+from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError, notice
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.system.hashing import files_now
 from merge_sumo.system.printable import printable
 from merge_sumo.system.workers import Workers
+from merge_sumo.verdict.episode import Episode
+
+R = TypeVar("R")
 
 OnPart = Callable[[str, int, int, str, str], None]
 """Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
@@ -45,6 +50,22 @@ class RunStudy:
     plan: SimulationPlan
     workers: Workers | None = None
     on_cases: Callable[[int], None] = lambda _: None
+
+    def simulate(
+        self, cases: Sequence[Case], plan: SimulationPlan, keep: Callable[[Episode], R]
+    ) -> list[R]:
+        """Run cases; return what is kept of each, in their order.
+
+        Args:
+            cases: cases of the plan's scenario.
+            plan: that of the study, or with changes.
+            keep: gives the part of an episode that is kept.
+        """
+        results = []
+        for _, result in evaluate(plan, cases, self.workers, keep):
+            results.append(result)
+            self.on_cases(1)
+        return results
 
     def record(self) -> dict[str, Any]:
         """Return what a study keeps of the system that it tested, as `campaign.json` does."""

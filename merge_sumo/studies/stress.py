@@ -8,7 +8,7 @@ round, or has no verdict any more.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Any, Final
@@ -17,7 +17,6 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.campaigns.run import failures
-from merge_sumo.engine.evaluate import evaluate
 from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
@@ -259,11 +258,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
             cases = [replace(outcome.case, scenario=plan.scenario) for outcome in tested]
             if one.case is not None:
                 cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
-            found: dict[int, CaseVerdict] = {}
-            for place, verdict in evaluate(plan, cases, study.workers, verdict_of):
-                found[place] = verdict
-                study.on_cases(1)
-            flips.append(flips_of(tested, found))
+            flips.append(flips_of(tested, study.simulate(cases, plan, verdict_of)))
     except UserError as error:
         if one is NOTHING:
             raise
@@ -272,9 +267,9 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     return Rung(one.name, one.about, one.source, tuple(flips), skipped)
 
 
-def flips_of(tested: Sequence[Outcome], found: Mapping[int, CaseVerdict]) -> Flips:
-    """Return which verdicts flip, by those of a run at the places of the recorded outcomes."""
-    pairs = [(outcome, found[place]) for place, outcome in enumerate(tested)]
+def flips_of(tested: Sequence[Outcome], found: Sequence[CaseVerdict]) -> Flips:
+    """Return which verdicts flip, by those of a run of the same cases."""
+    pairs = list(zip(tested, found, strict=True))
     flipped = [o for o, now in pairs if now.is_tested and now.failed != o.failed]
     return Flips(
         passes=tuple(o.index for o in flipped if o.failed),

@@ -227,30 +227,3 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
 
 def _box(locator):
     return locator.bounding_box()
-
-
-def all_rows(page) -> list[int]:
-    """Return the cases of the whole table."""
-    while page.locator("#more").is_visible():
-        page.locator("#more").click()
-    return sorted(rows(page))
-
-
-ADDRESSES = [
-    "#verdict=nothing&level=7&kind=%3Cscript%3E&region=9:9&box=99&avoided=me&from=x&to=1e999",
-    "#case-1e3&level=%E0%A4%A&__proto__=1&constructor=2&box=-1&measure=__proto__&from=",
-    "#&&&===&verdict&%00&x=" + "y" * 10_000,
-    "#case-0x1&verdict=failure%0A&kind=" + EVIL,
-]
-
-
-@pytest.mark.slow
-def test_what_an_address_says_wrongly_is_left_out(browser, made):
-    with shown(browser, made.folder / report.REPORT) as page:
-        for address in ADDRESSES:
-            page.evaluate("(address) => { location.hash = address; }", address)
-            page.wait_for_timeout(100)
-            assert len(all_rows(page)) == 180, address
-            page.reload()
-            assert len(all_rows(page)) == 180, address
-            assert page.locator(".map .mark").count() == 180, address

@@ -25,7 +25,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.scenario import BEHIND, DT_S
+from merge_sumo.scenario.scenario import DT_S
 
 
 @pytest.fixture(scope="module")
@@ -79,23 +79,6 @@ class TestOpenScenario:
                 turned = math.remainder(ours[3] + math.radians(sumos[2] - 90.0), math.tau)
                 assert turned == pytest.approx(0.0, abs=1e-8)
 
-    def test_starts_at_the_recorded_speed_and_stops_with_the_episode(self, made, scenario):
-        trajectory = made.trajectory(failures(made.outcomes)[0].index)
-        tree = etree.parse(scenario)
-        speeds = [float(e.get("value")) for e in tree.iterfind(".//Init//AbsoluteTargetSpeed")]
-        assert speeds == pytest.approx([trajectory.v_pov_mps[0], trajectory.v_vut_mps[0]])
-        stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
-        assert float(stop.get("value")) == trajectory.t_end_s
-        box = tree.find(".//Vehicle/BoundingBox")
-        centre, size = box.find("Center"), box.find("Dimensions")
-        assert float(centre.get("x")) + float(size.get("length")) / 2.0 == 0.0
-
-    def test_of_the_same_case_is_the_same_bytes(self, made, scenario, tmp_path):
-        again = write_openscenario(
-            made, failures(made.outcomes)[0].index, tmp_path / "again", road_of()
-        )
-        assert again.read_bytes() == scenario.read_bytes()
-
 
 class TestAFreeVut:
     def test_has_the_controller_that_a_parameter_names(self, scenario):
@@ -132,22 +115,6 @@ class TestAMergeFromALane:
         stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
         assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s)
 
-    def test_has_a_road_whose_entry_lane_ends(self, scenario):
-        tree = etree.parse(scenario.with_name("road.xodr"))
-        (entry,) = tree.iterfind(".//lane[@type='entry']")
-        road = next(entry.iterancestors("road"))
-        assert (entry.get("id"), float(road.get("length"))) == ("-3", 200.0)
-        into, out = (
-            {
-                (link.get("from"), link.get("to"))
-                for connection in tree.iterfind(".//connection")
-                if connection.get(end) == road.get("id")
-                for link in connection
-            }
-            for end in ("outgoingRoad", "incomingRoad")
-        )
-        assert (into, out) == (set(), {("-1", "-1"), ("-2", "-2")})
-
     def test_is_a_column_of_a_table(self, made, tmp_path):
         path = write_table(made, [0, 1], tmp_path / "table")
         frame = polars.read_csv(path)
@@ -177,23 +144,6 @@ class TestATable:
         assert {row[12] for row in rows} == {made.outcome(i).measures.severity for i in (0, 3)}
         assert {row[0] for row in rows} == {"0", "3"}
         assert float(rows[5][2]) == pytest.approx(5 * DT_S)
-
-    def test_has_all_cars_and_all_coordinates_of_the_case(self, tmp_path):
-        scenario = named_scenario("us23-traffic")
-        run = write_run(tmp_path / "run", 2, levels=(1, 2), error=None, scenario=scenario)
-        path = write_table(run, [0, 1], tmp_path / "table")
-        frame = polars.read_csv(path)
-        assert frame.columns[9:15] == [
-            *("x_ahead_m", "v_ahead_mps", "a_ahead_mps2"),
-            *("x_behind_m", "v_behind_mps", "a_behind_mps2"),
-        ]
-        first, second = frame.filter(time_s=0.0).to_dicts()
-        for row, outcome in zip((first, second), run.outcomes, strict=False):
-            case = outcome.case
-            for name in ("x_pov0_m", "v_pov0_mps", "headway_ahead_s", "headway_behind_s"):
-                assert row[name] == getattr(case, name)
-            assert row["svo_rad"] == case.svo_rad
-            assert row["x_behind_m"] == case.starts()[BEHIND][0]
 
 
 class TestTheCommand:

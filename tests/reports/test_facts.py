@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,9 @@ from calling import invoke
 from handmade import write_run
 from lxml import html
 
-from merge_sumo import api
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.reports.facts import Fact, facts_of, headline
+from merge_sumo.reports.facts import Fact, headline
 from merge_sumo.reports.report import report_page
 from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 
@@ -129,23 +127,6 @@ def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
     assert "contact at a relative speed of " in of["kind of the worst case"]
 
 
-@pytest.mark.parametrize(
-    ("number", "touch"), [(1, "1 more case touches"), (51, "51 more cases touch")]
-)
-def test_of_contacts_under_another_rule_say_which(made, number, touch):
-    contacts = Fact("cases with contact that are no failures", number, "", "outcomes.jsonl", "")
-    lines = headline(made, [*CampaignRun(made).facts, contacts])
-    said = f"{touch} after M, which this rule does not count: `fail_when` unsafe; starts that fail "
-    assert sum(line.startswith(said) for line in lines) == 1
-
-
-def test_of_more_failures_than_were_driven_again_say_how_many(made, facts):
-    driven = Fact("failures that reference drivers drove", 3, "", "avoidance.jsonl", "lines")
-    lines = headline(made, [*CampaignRun(made).facts, driven])
-    begins = f"avoided of 3 of {facts['failures', None].shown} failures: by driver careful 1, "
-    assert sum(line.startswith(begins) for line in lines) == 1
-
-
 def test_of_the_headline_begin_terminal_and_report(made):
     lines = headline(made, CampaignRun(made).facts)
     printed = CampaignRun(made).lines()
@@ -158,25 +139,3 @@ def test_of_the_headline_begin_terminal_and_report(made):
     page: Any = html.fromstring(report_page(made))
     (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
     assert card.text == "\n".join(lines).replace("`", "")
-
-
-def test_of_no_failure_are_short(tmp_path):
-    run = api.campaign("fsm", level="0", cases=4, seed=1, out=tmp_path / "run", progress=False)
-    rule = "front bumpers are within 6 m as the VUT reaches M"
-    assert run.lines() == [
-        f"fsm: a case fails when {rule}; 4 cases",
-        "  level 0  less than 0.15 % of all starts fail, by 2,000  0 failures found",
-        f"report: {run.report_file}",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("failures", "regions", "shown"),
-    [(9, 9, "9"), (10, 5, "5"), (10, 6, "scattered"), (78, 73, "scattered"), (1, 1, "1")],
-)
-def test_of_many_regions_for_few_failures_are_one_word(made, failures, regions, shown):
-    run = CampaignRun(made)
-    level = replace(run.summary.levels[0], failures=failures, regions=regions)
-    summary = replace(run.summary, levels={0: level})
-    (fact,) = (f for f in facts_of(made, summary, run.verdict) if f.name == "regions")
-    assert fact.shown == shown

@@ -13,7 +13,7 @@ from matplotlib.collections import EllipseCollection
 from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
 from merge_sumo.reports import figures
-from merge_sumo.studies.reproduction import LevelBatches, Panel
+from merge_sumo.studies.reproduction import Panel
 
 
 def curves():
@@ -53,17 +53,6 @@ def test_maps_show_cases_in_the_units_of_the_pool_and_the_balls_that_fmc_counts(
     assert "(m)" in axes.get_xlabel()
     assert "(m/s)" in axes.get_ylabel()
     assert axes.get_title("right") == "1 of 2 fail, FMC 0.0079"
-
-
-def test_allocation_shows_each_level_and_leaves_a_gap_where_it_had_no_case(tmp_path):
-    cases = {level: np.full((3, 4), 10.0) for level in (0, 1, 2)}
-    margin = {level: np.full((3, 4), 0.9) for level in (0, 1, 2)}
-    margin[0][:, 1] = np.nan
-    figure = figures.allocation("t", {"gpr": LevelBatches(cases, margin)})
-    above, below = figure.axes
-    assert [line.get_label() for line in above.lines] == ["0", "1", "2"]
-    assert np.isnan(below.lines[0].get_ydata()).tolist() == [False, True, False, False]
-    figures.save(figure, tmp_path / "allocation.png")
 
 
 @pytest.mark.parametrize("kind", [".png", ".svg"])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-import shutil
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ import pytest
 from handmade import write_run
 from lxml import html
 
-from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.run import Run, failures, spread_failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
@@ -96,24 +95,6 @@ class TestThePage:
         others = [o.margin for o in made.outcomes if o.margin and not o.failed and o not in near]
         assert margins[-1] <= min(others)
 
-    def test_worst_failures_are_of_one_region_each_before_a_second_of_any(self, made):
-        found, region = failures(made.outcomes), regions_of(made.outcomes)
-        spread = spread_failures(made.outcomes)
-        assert sorted(o.index for o in spread) == sorted(o.index for o in found)
-        own = [(o.case.level, region[o.index]) for o in spread]
-        different = len(set(own))
-        assert 1 < different < len(own)
-        assert len(set(own[:different])) == different
-        for first, place in zip(spread, own[:different], strict=False):
-            same = [f.margin for f in found if (f.case.level, region[f.index]) == place]
-            assert first.margin == min(same)
-
-    def test_goes_without_trajectories_that_are_lost(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=10)
-        shutil.rmtree(run.folder / "trajectories")
-        data = data_of(report_page(Run(run.folder)))
-        assert set(data["cases"]["rows"]) == {0}
-
 
 @pytest.fixture(scope="module")
 def broken(tmp_path_factory) -> str:
@@ -132,19 +113,6 @@ class TestWhatWasNotTested:
             ["the VUT did not reach the merge point in 12 s", "TIMEOUT", "4", "0"],
         ]
         assert broken.index('id="untested"') < broken.index('id="facts"')
-
-    def test_has_its_cases_in_lists_of_their_own_and_in_no_other(self, broken):
-        root = root_of(broken)
-        lists = {
-            table.get("aria-label"): [int(n) for n in table.xpath(".//button/@data-case")]
-            for table in root.xpath("//table[@class='list']")
-        }
-        by_message = list(lists.values())[:3]
-        assert by_message == [[3, 6], [9], [0, 1, 2, 4]]
-        names = ("Ten worst failures, one of each region first", "Ten cases nearest to a failure")
-        others = {index for name in names for index in lists[name]}
-        assert len(others) > 10
-        assert others & {0, 1, 2, 3, 4, 6, 9} == set()
 
     def test_ends_with_what_the_controller_printed_last(self, tmp_path):
         run = write_run(tmp_path / "run", 10, error=None)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.studies.reproduction import TABLE_II, Reproduction, Scale, reproduce
-from merge_sumo.studies.truth import Truth
 
 FIGURES = {
     "cases-level0.png",
@@ -63,13 +60,6 @@ class TestATinyReproduction:
         assert "| coverage / truth after " in table
         assert "The truth of level-0 POV, design1 is too small to be divided by" in table
         assert "dense" not in table
-
-    def test_shows_a_dense_truth_where_there_is_one(self, tiny):
-        (title, one), *_ = tiny.columns.items()
-        dense = Truth(np.full((1, 2), 0.5), np.full(1, -0.2))
-        found = replace(one, study=replace(one.study, dense={0: dense}))
-        table = replace(tiny, columns={title: found}).lines()
-        assert "| dense truth | 0.0079 |" in table
 
 
 def test_the_papers_table_is_the_papers():

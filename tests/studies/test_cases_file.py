@@ -4,9 +4,7 @@
 
 from __future__ import annotations
 
-import cProfile
 import json
-import os
 import re
 import tomllib
 from dataclasses import replace
@@ -27,7 +25,6 @@ from merge_sumo.scenario.scenario import OWN, US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.studies.cases_file import CasesFile
 from merge_sumo.studies.comparison import ComparedCase, passes
-from merge_sumo.system import records
 from merge_sumo.verdict.severity import Severity
 
 CONTROLLER = """
@@ -357,55 +354,3 @@ def test_a_net_of_ones_own_is_found_from_the_file(tmp_path):
 def test_what_is_no_cases_file_is_refused_in_a_sentence(file, command_line, old, new, part):
     edit(file, old, new)
     assert_refused(command_line("rerun", file), str(file), part)
-
-
-@on_us23
-def test_no_file_is_written_over_and_what_is_none_is_refused(file, command_line, tmp_path):
-    assert_refused(command_line("rerun", file, "--out", "p.html"), "end it in .toml")
-    assert_refused(command_line("rerun", file, "--out", file), "exists")
-    assert_refused(command_line("rerun", file, "--stress", "--junit", "j"), "leave indices")
-    (line, *_) = (text for text in file.read_text().splitlines() if "{index" in text)
-    edit(file, line, f"{line}\n{line}")
-    assert_refused(command_line("rerun", file), "its index is there twice")
-    os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
-    assert_refused(command_line("rerun", tmp_path / "pipe"), "it is not a file")
-    assert_refused(command_line("rerun", tmp_path / "noise.toml"), "is no text in UTF-8")
-
-
-def with_rows(file, count):
-    """Return the path of a file of so many cases, all alike but for their index."""
-    head, begin, lines = file.read_text().partition("cases = [\n")
-    row = lines.splitlines()[0]
-    rows = (re.sub(r"index = \d+", f"index = {index}", row) for index in range(count))
-    target = file.with_name(f"of-{count}.toml")
-    target.write_text("\n".join([head + begin.strip(), *rows, "]\n"]))
-    return target
-
-
-@on_us23
-def test_the_work_of_reading_grows_with_the_rows_alone(file):
-    calls = list[int]()
-    for count in (1200, 4800):
-        path = with_rows(file, count)
-        with cProfile.Profile() as profile:
-            assert len(CasesFile(path).outcomes) == count
-        calls.append(sum(entry.callcount for entry in profile.getstats()))
-    assert calls[1] < 4.2 * calls[0]
-
-
-@on_us23
-def test_what_would_not_be_read_is_not_written(run, file, command_line, tmp_path, monkeypatch):
-    assert_refused(command_line("rerun", with_rows(file, 7000)), "it is larger than 1 MiB")
-    monkeypatch.setattr(records, "MAX_TOML_BYTES", file.stat().st_size)
-    ms.export(run.folder, file_format="cases", out=tmp_path / "as-large.toml")
-    assert len(CasesFile(tmp_path / "as-large.toml").outcomes) == 40
-    with pytest.raises(UserError, match="name fewer cases"):
-        ms.export(run.folder, range(60), file_format="cases", out=tmp_path / "new" / "folder")
-    assert not (tmp_path / "new").exists()
-    edit(file, 'vut = "design2"', 'vut = "level0"')
-    out, junit = tmp_path / "now.toml", tmp_path / "junit.xml"
-    with pytest.raises(UserError, match=f"cannot write {out}"):
-        ms.rerun(file, vut="design2?kp=0.123456789", out=out, junit=junit)
-    assert not out.exists()
-    assert not junit.exists()

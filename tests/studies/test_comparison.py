@@ -148,14 +148,6 @@ class TestARegion:
         assert region.fmc == pytest.approx(BALL, rel=1e-6)
         assert not compare([a, b]).worse
 
-    def test_is_the_later_ones_the_other_way_round_and_breaks_nothing(self, tmp_path):
-        a = write(tmp_path / "a", (0.5, 0.54, "passes"))
-        b = write(tmp_path / "b", (0.5, 0.5, "fails"))
-        (region,) = self.regions(a, b)
-        assert (region.change, region.version) == (Change.LATER_ALONE, 2)
-        assert not compare([a, b]).worse, "two seeds of one VUT have such regions"
-        assert "broke" not in str(compare([a, b]))
-
     def test_of_a_version_that_passes_less_often_than_chance_explains_decides(self, call, tmp_path):
         """The pairs are alike here: what each search found must be said first, and decide."""
         shared = [(0.1, y / 9.0, "passes") for y in range(8)]
@@ -212,24 +204,6 @@ def test_what_does_not_compare_is_refused(tmp_path, run):
         compare([run, changed(tmp_path / "tolerant", run, tolerated=0.2)])
 
 
-def test_a_list_that_is_cut_says_so_everywhere(call, tmp_path, monkeypatch):
-    points = [(x / 30.0, 0.5) for x in range(25)]
-    a = write(tmp_path / "a", *((x, v, "passes") for x, v in points))
-    b = write(tmp_path / "b", *((x, v, "fails") for x, v in points))
-    monkeypatch.setattr(pages, "SHOWN", 20)
-    files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
-    said = call("compare", a.folder, b.folder, *files)
-    assert said.code == 1
-    assert "of 25 shared cases 25 broke" in said.out
-    assert "broke, the first 10 of 25:" in said.out
-    root: Any = html.parse(tmp_path / "page.html").getroot()
-    titles = root.xpath("//h2/text()")
-    assert "Broke: 25, the first 20 of 25" in titles
-    assert titles.index("From 1 to 2") < titles.index("Broke: 25, the first 20 of 25")
-    assert len(root.findall(".//details")) == 20
-    assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "25"
-
-
 def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run):
     root: Any = html.fromstring(pages.comparison_page(compare([run, run])))
     for details in root.xpath("//details"):
@@ -258,14 +232,6 @@ def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
     assert [o.measures for o in found.versions[1].outcomes] == [o.measures for o in run.outcomes]
     assert found.steps[0].count(Change.BROKE) == found.steps[0].count(Change.FIXED) == 0
     assert not found.worse
-
-
-def test_a_rerun_says_what_fails_behind_m_now(command_line, run, tmp_path):
-    (tmp_path / "ends.py").write_text(
-        "def act(seen):\n    return 0.0 if seen.x_vut_m < 5 else 1 / 0\n"
-    )
-    said = command_line("rerun", run.folder, 0, "--vut", f"{tmp_path / 'ends.py'}:act")
-    assert "  in 1 case an error ends the follow-up, the first in case 0: ZeroDivision" in said.out
 
 
 def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shutil
 from dataclasses import replace
@@ -214,23 +213,6 @@ def test_a_controller_that_is_another_now_or_decides_by_chance_is_refused(tmp_pa
     mine.write_text(f"{turns}def drive(seen):\n    {now}\n")
     with pytest.raises(UserError, match="nothing can be said of its changes"):
         ms.explain(own, vut=f"{mine}:drive")
-
-
-class TestTheFile:
-    @pytest.mark.parametrize(
-        "changes",
-        [
-            {"index": 10**6},
-            {"start": [{"name": "kp"}]},
-            {"levels": {"1": 2}},
-            {"parameters": [{"name": "k" * 101}]},
-        ],
-    )
-    def test_of_somebody_else_is_refused_in_a_sentence(self, folder, changes):
-        record = json.loads((folder / EXPLANATIONS.name).read_text())
-        (folder / EXPLANATIONS.name).write_text(json.dumps({**record, **changes}))
-        with pytest.raises(UserError, match=EXPLANATIONS.name):
-            EXPLANATIONS.read_lines(Run(folder))
 
 
 def test_words_by_hand(made):

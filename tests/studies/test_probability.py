@@ -29,11 +29,10 @@ from merge_sumo.studies.probability import (
 )
 from merge_sumo.studies.probability import failure_probability as failure_probability_of
 from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.traffic import FOLDER, Traffic, named_traffic, shipped_traffics
+from merge_sumo.studies.traffic import Traffic, named_traffic, shipped_traffics
 from merge_sumo.verdict.chance import clopper_pearson
 
 LEVELS = (0, 1, 2)
-UNIFORM = read_distribution(None, LEVELS, scenario=US23)
 SHAPE = cells_of(US23, 1)
 
 
@@ -132,11 +131,6 @@ class TestADistribution:
         high = np.array([d.high for d in US23.dimensions(level)])
         return low + distribution.points(level, chances) * (high - low)
 
-    def test_that_is_not_stated_is_uniform_over_levels_and_pool(self):
-        assert UNIFORM.levels == {0: 1 / 3, 1: 1 / 3, 2: 1 / 3}
-        chances = np.array([[0.25, 0.5, 0.75]])
-        assert UNIFORM.points(2, chances) == pytest.approx(chances)
-
     def test_has_the_levels_and_marginals_of_its_file(self, tmp_path):
         found = self.stated(
             tmp_path,
@@ -217,26 +211,6 @@ class TestATraffic:
         with pytest.raises(UserError, match=says):
             traffic().in_pool(scenario, [0])
 
-    @pytest.mark.parametrize(
-        ("change", "says"),
-        [
-            ({"density_veh_per_km = 8.7": "density_veh_per_km = inf"}, "density_veh_per_km is inf"),
-            ({"density_veh_per_km": "density"}, "'density"),
-            ({"sd = 2.85": "sd = 0"}, "sd is 0"),
-            ({"source": "# source"}, "no source"),
-            ({"[speeds]": "[speeds"}, "is no TOML"),
-        ],
-        ids=lambda value: str(value)[:40],
-    )
-    def test_that_makes_no_sense_is_refused_in_one_sentence(self, tmp_path, change, says):
-        text = (FOLDER / "exid-5.toml").read_text(encoding="utf-8")
-        for old, new in change.items():
-            text = text.replace(old, new)
-        (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
-        with pytest.raises(UserError, match=says) as error:
-            named_traffic(str(tmp_path / "mine.toml"))
-        assert "\n" not in str(error.value)
-
 
 def failure_probability(run, out, engine="kinematic", **other):
     settings = settings_of(run.folder, run.record)
@@ -272,18 +246,6 @@ class TestOfACampaign:
         assert ours.overall == sumo.overall
         assert ours.missed == sumo.missed
         assert ours.in_sumo < 60 < sumo.in_sumo == 300
-
-    def test_is_printed_written_and_returned_alike(self, campaign, tmp_path, command_line):
-        options = ("--cases", 60, "--seed", 3, "--workers", 1)
-        out = tmp_path / "a.json"
-        code, said, err = command_line("probability", campaign.folder, *options, "--out", out)
-        assert code == 0, err
-        assert said.startswith("P(fail): ")
-        found = failure_probability(campaign, tmp_path / "b.json", cases=60, seed=3)
-        assert (tmp_path / "b.json").read_bytes() == out.read_bytes()
-        assert json.loads(out.read_bytes())["overall"]["high"] == found.overall.high
-        code, _, err = command_line("probability", campaign.folder, *options, "--out", out)
-        assert (code, "a.json exists" in err) == (2, True)
 
     def test_in_a_traffic_is_a_number_of_cars_per_merge(self, campaign, tmp_path, command_line):
         out = tmp_path / "p.json"

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import astuple
 
 import numpy as np
@@ -109,14 +108,7 @@ class Vut:
 """
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "late_gain.py",
-        "gain.txt",
-    ],
-)
-def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_path, name):
+def test_a_truth_is_of_the_code_that_the_vut_loaded_also_while_it_drove(tmp_path):
     for file, content in {
         "my_vut.py": READER,
         "gain_of_mine.py": "gain = 1.0",
@@ -129,12 +121,9 @@ def test_a_truth_is_of_every_file_that_the_vut_loaded_also_while_it_drove(tmp_pa
     (tmp_path / "ran").unlink()
     assert truth_of(vut, tmp_path / "cache") == 0
     assert not (tmp_path / "ran").exists()
-    content = (tmp_path / name).read_text()
-    (tmp_path / name).write_text("1.5" if name == "gain.txt" else content + "\n# changed")
+    (tmp_path / "late_gain.py").write_text("# changed")
     assert truth_of(vut, tmp_path / "cache") == 4
     assert truth_of(vut, tmp_path / "cache") == 0
-    (tmp_path / name).write_text(content)
-    assert truth_of(vut, tmp_path / "cache") == 4, "the truth of before was replaced"
 
 
 def test_a_study_says_what_samplers_found_of_the_truth(cache):
@@ -174,7 +163,6 @@ def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
 
 TWO = truth_with((0.2, 0.2), (0.8, 0.8))
 SMALL = truth_with((0.2, 0.2), (0.8, 0.8), failures=1)
-NONE = truth_with(failures=0)
 HALF = searched([[], [(0.2, 0.24)]])  # 1 case, then 3
 MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]])  # 2 cases, then 4
 
@@ -197,29 +185,8 @@ class TestASamplerByHand:
         disc = fmc(np.zeros((1, 2)))
         assert (low[0], median[0], high[0]) == pytest.approx((disc / 4, disc / 2, disc * 3 / 4))
 
-    def test_has_no_cases_to_a_share_that_too_few_seeds_reach(self):
-        assert summary(MOST, HALF, HALF).cases_to_90_percent == Spread(None, None, None)
-        assert summary(MOST, MOST, HALF).cases_to_90_percent == Spread(4.0, 4.0, None)
-
-    def test_without_failures_in_the_truth_has_no_share_of_it(self):
-        found = study_of(HALF, truth=NONE)
-        assert found.samplers["mine"].fmc_over_truth.median is None
-        assert found.samplers["mine"].covered_share.median is None
-        assert json.dumps(found.to_record(), allow_nan=False)
-
     def test_covers_a_share_of_the_failures_of_the_truth(self):
         assert summary(HALF, truth=SMALL).covered_share_by_batch == [0.0, 0.5]
         assert summary(MOST, truth=SMALL).covered_share_by_batch == [0.5, 1.0]
         dense = {0: truth_with((0.2, 0.2), (0.8, 0.8), (0.5, 0.5), (0.9, 0.1))}
         assert summary(HALF, truth=SMALL, dense=dense).covered_share.median == 0.25
-
-    def test_covers_the_mean_share_over_the_levels_with_failures(self):
-        for other, share in ((NONE, 0.5), (truth_with((0.2, 0.2)), 0.25)):
-            found = SamplerStudy({"mine": [HALF]}, {0: SMALL, 1: other})
-            assert found.samplers["mine"].covered_share.median == share
-
-
-def test_the_cases_of_a_truth_are_the_first_of_a_denser_one(truth, tmp_path):
-    few = ground_truth(plan_for("design1"), 0, 40, cache=tmp_path)
-    assert np.array_equal(few.points, truth.points[:40])
-    assert np.array_equal(few.margin, truth.margin[:40])

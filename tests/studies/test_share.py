@@ -13,7 +13,6 @@ from campaigning import campaign_settings, run_campaign
 from merge_sumo import api
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.engine.evaluate import evaluate
-from merge_sumo.errors import UserError
 from merge_sumo.studies import share
 from merge_sumo.studies.share import SHARES, LevelShare, end_of, share_at, stream
 
@@ -48,14 +47,6 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     assert any(f"  {level.shown} of all starts fail, by 2,000  " in line for line in run.lines())
     again = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "two", workers=2)
     assert SHARES.read(again.folder) == shares
-
-
-def test_counts_cases_without_a_verdict_as_safe_and_as_failures():
-    low, _ = LevelShare(level=0, cases=200, failures=5).interval
-    _, high = LevelShare(level=0, cases=200, failures=25).interval
-    assert LevelShare(level=0, cases=200, failures=5, without_verdict=20).interval == (low, high)
-    none = LevelShare(level=0, cases=200, failures=0, without_verdict=200)
-    assert none.shown == "less than 100 %"
 
 
 OWN = """
@@ -138,22 +129,8 @@ def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
         assert told[-1] == (400 * rounds, 400 * rounds)
 
 
-def test_a_case_runs_after_a_campaign_of_worker_processes(tmp_path):
-    run = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "run", workers=2)
-    assert SHARES.read(run.folder) is not None
-    first = run.run.outcomes[0]
-    assert api.run(recorded=(run.folder, 0)).measures == first.measures
-
-
 def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_named(tmp_path):
     run = api.campaign("sumo:IDM", level="0", cases=10, out=tmp_path / "run", progress=False)
     assert SHARES.read(run.folder) is None
     said = f"starts that fail are not measured: merge-sumo probability {run.folder}"
     assert any(line.endswith(said) for line in run.lines())
-
-
-def test_of_another_persons_file_is_data(tmp_path):
-    run = run_campaign(campaign_settings(vut="design1", cases=10), tmp_path / "run")
-    (run.folder / SHARES.name).write_text('{"levels": [{"level": 0, "cases": -3, "failures": 0}]}')
-    with pytest.raises(UserError, match=r"shares\.json"):
-        api.open_run(run.folder).lines()
