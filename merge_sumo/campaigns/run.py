@@ -259,7 +259,16 @@ class Run:
         return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
 
     def read_lines(self, name: str, kind: type[T], indices: Container[int]) -> dict[int, T]:
-        """Return the lines of a file of the folder by their index, which is one of `indices`."""
+        """Return the lines of a file of the folder by their index.
+
+        Args:
+            name: the file.
+            kind: what each line is.
+            indices: those that a line may have.
+
+        Raises:
+            UserError: a line is something else.
+        """
         return read_indexed(self.folder / name, kind, indices)
 
     def earlier(self) -> Run | None:
@@ -355,6 +364,14 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
 
     A last line without its end was being written when the campaign stopped: it is dropped. Any
     other line that is not the outcome of its place is an error that names the line.
+
+    Args:
+        text: the bytes.
+        name: what messages call the file.
+        scenario: the scenario of the campaign.
+
+    Raises:
+        UserError: a line that ends is not the outcome of its place.
     """
     outcomes: list[Outcome] = []
     *lines, rest = text.split(b"\n")

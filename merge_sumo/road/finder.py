@@ -48,12 +48,21 @@ def find_corridor(
 ) -> Corridor:
     """Find the merge of two sequences of edges in a net.
 
-    Both name the edge on which the paths become one, and may go on behind it. Equal sequences are
-    one path, and M is where `edge_at_m` begins, by default the last one. Where the file ends nearer
-    than `room_after_m` behind M, the last lane is continued straight on. `lane_m` is where a
-    scenario has its acceleration lane: that of the road ends with it, and may begin before it.
-    Raises `UserError` when an edge is unknown, a sequence is not connected, the paths never meet,
-    or the road has no such lane.
+    Both name the edge on which the paths become one, and may go on after it. Equal sequences are
+    one path.
+
+    Args:
+        net: the net.
+        mainline: edges of the mainline.
+        ramp: edges of the ramp.
+        room_after_m: where the file ends nearer after M, the last lane is continued straight on.
+        edge_at_m: the edge of a single path that begins at M, by default its last one.
+        lane_m: where a scenario has its acceleration lane: that of the road ends with it, and may
+            begin before it.
+
+    Raises:
+        UserError: an edge is unknown, a sequence is not connected, the paths never meet, or the
+            road has no such lane.
     """
     meeting, before, onward = _paths(net, tuple(mainline), tuple(ramp), edge_at_m)
     apart, along = _acceleration_lane(meeting, before)

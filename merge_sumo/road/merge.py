@@ -35,9 +35,17 @@ def road_of(
 ) -> Corridor:
     """Return the merge of two sequences of edges in a net file, by default the shipped one.
 
-    Where the file ends nearer than `room_after_m` behind M, the road goes straight on; `lane_m` is
-    the acceleration lane of a scenario. What is searched once is kept until the file changes.
-    Raises `UserError` when the file is no plain file, is no SUMO net, or has no such merge.
+    What is searched once is kept until the file changes.
+
+    Args:
+        net: the net file.
+        mainline: edges of the mainline in driving order, past M.
+        ramp: edges of the ramp in driving order, past M.
+        room_after_m: where the file ends nearer after M, the road goes straight on.
+        lane_m: begin and end of the acceleration lane of a scenario.
+
+    Raises:
+        UserError: the file is not a SUMO net, or has no such merge.
     """
     path = net or default_net_path()
     content = read_xml(path, "the net")

@@ -88,7 +88,13 @@ def _check_writable(folder: Path, path: Path) -> None:
 
 
 def check_ending(path: Path, endings: Sequence[str], option: str = "`out`") -> None:
-    """Raise `UserError` where a name does not say to other programs what the file is."""
+    """Raise `UserError` where a name does not say to other programs what the file is.
+
+    Args:
+        path: the file.
+        endings: those that its name may have.
+        option: what names it in the message.
+    """
     if path.suffix not in endings:
         raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
 
@@ -256,7 +262,16 @@ def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
 
 
 def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
-    """Write a new file; `UserError` where something is there or it cannot be written."""
+    """Write a new file.
+
+    Args:
+        path: the file.
+        content: its bytes.
+        option: what names it in the message.
+
+    Raises:
+        UserError: something is there, or it cannot be written.
+    """
     with new_file(path, option) as file:
         file.write(content)
 

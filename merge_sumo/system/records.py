@@ -104,8 +104,13 @@ def read_record(path: Path, kind: type[T]) -> T | None:
 def convert(record: object, kind: type[T], *, strict: bool = True) -> T:
     """Return plain values, as JSON and TOML have them, as a value of a type.
 
-    Where not `strict`, texts may stand for numbers, as in XML. Raises `RecordError` for other
-    values, and for names that a dataclass does not have.
+    Args:
+        record: the values.
+        kind: the type.
+        strict: False where texts stand for numbers, as in XML.
+
+    Raises:
+        RecordError: the values are others, or have names that a dataclass does not have.
     """
     _check_names(record, kind)
     try:

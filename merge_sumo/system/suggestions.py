@@ -15,6 +15,11 @@ def nearest(name: str, known: Iterable[str], alike: float = ALIKE) -> list[str]:
     """Return the known names that are like one, at most three, the most like first.
 
     Upper and lower case are the same; a name that differs in that alone is the only one.
+
+    Args:
+        name: the name.
+        known: the known names.
+        alike: ratio of matching characters that they must have.
     """
     by_folded = {other.casefold(): other for other in known}
     if name.casefold() in by_folded:
@@ -29,6 +34,12 @@ def either(names: Iterable[str]) -> str:
 
 
 def meant(name: str, known: Iterable[str], alike: float = ALIKE) -> str:
-    """Return "did you mean a or b? " where names are like one, else nothing."""
+    """Return "did you mean a or b? " where names are like one, else nothing.
+
+    Args:
+        name: the name.
+        known: the known names.
+        alike: ratio of matching characters that they must have.
+    """
     near = nearest(name, known, alike)
     return f"did you mean {either(near)}? " if near else ""

@@ -22,7 +22,7 @@ from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.system.printable import printable, quoted
+from merge_sumo.system.printable import printable
 
 VUT = "def drive(seen):\n    return 1.0\n"
 NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")
@@ -87,16 +87,6 @@ class TestATerminal:
         assert out.count("\n") == 1
         assert (folder / "scenarios" / "case-00000" / "replay.sumocfg").is_file()
 
-    def test_gets_json_that_says_any_name(self, call, run, tmp_path):
-        folder = Path(shutil.copytree(run.folder, tmp_path / NASTY))
-        code, out, err = call("campaign", "--resume", folder, "--cases", 60, "--json", "-q")
-        assert code == 0, err
-        assert json.loads(out)["run"] == str(folder)
-        assert out.isascii()
-        code, out, err = call("campaign", "--resume", folder, "--cases", 60, "-q")
-        assert code == 0, err
-        assert f"merge-sumo replay {quoted(folder)[:-1]}" in out, "a command that a shell reads"
-
 
 def test_what_is_printed_moves_no_cursor_and_keeps_letters_of_all_languages():
     assert printable("日本 é\xa0Ω😀") == "日本 é\xa0Ω😀"
@@ -116,16 +106,6 @@ class TestSumo:
             check=False,
         )
         assert done.returncode == 0, done.stderr
-
-    @pytest.mark.parametrize("name", ["$HOME", "日本"])
-    def test_starts_with_temporary_files_in_a_folder_of_an_odd_name(
-        self, tmp_path, monkeypatch, name
-    ):
-        (tmp_path / name).mkdir()
-        monkeypatch.setattr("tempfile.tempdir", str(tmp_path / name))
-        with Simulator(plan_for("design1", corridors=1)):
-            pass
-        assert list((tmp_path / name).iterdir()) == []
 
     def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
