@@ -55,7 +55,7 @@ IN_VAIN: Final = "in_vain"
 TALLIES: Final = (RAN_AGAIN, IN_VAIN)
 """What is counted as cases end, and no setting."""
 FILES: Final = ("vut_files", "pov_files")
-"""Keys of `campaign.json`: what the VUT and a POV of a person's own have loaded."""
+"""Keys of `campaign.json`: what the VUT and the user's own POV have loaded."""
 CHECKSUM: Final = "sha256"
 """Key of `campaign.json` of earlier versions, which is not read."""
 FARTHEST: Final = 1e9
@@ -97,8 +97,8 @@ class Run:
         outcomes: the outcomes, in order.
         torn: whether the last line of them was torn, and its case left out.
 
-    Raises `UserError` when the folder is no campaign, a line of it cannot be read, or something is
-    not as it was written.
+    Raises `UserError` when the folder is not a campaign, a line of it cannot be read, or something
+    is not as it was written.
     """
 
     def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
@@ -221,7 +221,7 @@ class Run:
     def trajectory(self, index: int) -> Trajectory:
         """Return the trajectory of a case.
 
-        Raises `LostError` when it is missing or unreadable, `UserError` when it is no motion.
+        Raises `LostError` when it is missing or unreadable, `UserError` when it is not a motion.
         """
         outcome = self.outcome(index)
         whole = self._batch(outcome.batch).get(index)

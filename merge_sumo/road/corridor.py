@@ -92,7 +92,7 @@ class LanePath:
 
     @property
     def after_m(self) -> float:
-        """Length behind M."""
+        """Length after M."""
         return self.pieces[-1].start_m + self.pieces[-1].length_m
 
     def piece(self, x_m: float) -> Piece:
@@ -150,13 +150,13 @@ MAX_LANE_M: Final = 2000.0
 
 @dataclass(frozen=True, slots=True)
 class AccelerationLane:
-    """A lane of the ramp that runs beside one of the mainline up to where the paths become one."""
+    """A lane of the ramp that runs next to one of the mainline up to where the paths become one."""
 
     begin_m: float
     """Lane coordinates of its begin, the gore, and of its end."""
     end_m: float
     lanes: tuple[str, ...]
-    """Its ids in the net file, one for each edge, and those of the lanes beside it."""
+    """Its ids in the net file, one for each edge, and those of the lanes next to it."""
     beside: tuple[str, ...]
     is_marked: bool
     """Whether the net marks it, as netconvert marks those that it makes or is told of."""
@@ -165,7 +165,7 @@ class AccelerationLane:
 
     @property
     def length_m(self) -> float:
-        """Length beside the mainline."""
+        """Length next to the mainline."""
         return self.end_m - self.begin_m
 
     @property
@@ -203,7 +203,7 @@ class Corridor:
     lane_drop: bool
     """Whether one path comes to M from a lane that ends."""
     drawn_after_m: float
-    """Length behind M in the file; from there on the last lane is continued straight on."""
+    """Length after M in the file; from there on the last lane is continued straight on."""
     surroundings: tuple[tuple[Point, ...], ...]
     """Shapes of the other lanes near M, for drawings."""
     lane_m: Bounds | None = None

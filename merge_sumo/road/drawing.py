@@ -20,7 +20,7 @@ WIDTH_PX = 1000
 LANE_M = 3.2
 STEP_M = 5.0
 AFTER_M = 120.0
-"""Length behind M, or the end of the lane, that is drawn."""
+"""Length after M, or the end of the lane, that is drawn."""
 LANE_COLOUR = "#009e73"
 
 

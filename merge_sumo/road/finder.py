@@ -1,7 +1,7 @@
 """Finding the merge in a net: where two sequences of edges come to one lane.
 
 Where the ramp ends in an auxiliary lane from which no connection leads on, the driver changes to
-the lane beside it where the auxiliary lane ends. The path then crosses the junction beside the
+the lane next to it where the auxiliary lane ends. The path then crosses the junction next to the
 connection of that lane, as if the net had a connection of its own for it, and M is behind the
 junction, where it is in a net that has one. The same holds where the lane of the mainline ends.
 
@@ -30,7 +30,7 @@ from merge_sumo.road.netfile import Lane, Link, NetFile, Point
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds
 
 SURROUNDINGS_M: Final = 500.0
-"""Distance to M up to which lanes beside the paths are drawn."""
+"""Distance to M up to which lanes next to the paths are drawn."""
 POINT_M: Final = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
 FOLLOWED_EDGES: Final = 5
@@ -377,7 +377,7 @@ def _met(
 def _lane_drop(
     net: NetFile, mainline: _Layer, ramp: _Layer, edges: _Edges
 ) -> tuple[Link, Link, Link] | None:
-    """Return the links of both paths where a lane of one ends beside a lane of the other.
+    """Return the links of both paths where a lane of one ends next to a lane of the other.
 
     The third one is the link, of these two, of the path whose lane ends. `edges` are the edge on
     which it ends and the one that follows; None where no such lane ends.
@@ -393,7 +393,7 @@ def _lane_drop(
 
 
 def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
-    """Return the link from a lane that ends to the target of a link of the lane beside it."""
+    """Return the link from a lane that ends to the target of a link of the lane next to it."""
     via: tuple[Lane, ...] = ()
     if beside.via:
         crossing = replace(
@@ -403,7 +403,7 @@ def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
         )
         via = (crossing,)
     state = "Z" if net.junction(last)[1] == "zipper" else "m"
-    # A driver on it sees all along the lane beside.
+    # A driver on it sees all along the lane next to it.
     return Link(last, beside.target, via, state, visibility_m=last.length_m)
 
 

@@ -187,7 +187,7 @@ class NetFile:
 
     @contextmanager
     def _numbers(self, what: str) -> Iterator[None]:
-        """Raise the error for what is no number in a block."""
+        """Raise the error for a value in a block that is not a number."""
         try:
             yield
         except ValueError as error:

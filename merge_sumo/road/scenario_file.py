@@ -1,7 +1,7 @@
 """Scenarios by name or as files: TOML that says what differs from the paper's scenario.
 
 name = "my-ramp"
-net = "my-ramp.net.xml"          # beside this file
+net = "my-ramp.net.xml"          # next to this file
 mainline = ["e1", "e2"]          # edges in driving order, past the merge point M
 ramp = ["r1", "e2"]
 x_pov0_m = [-220, -90]
@@ -50,7 +50,7 @@ def named_scenario(name: str) -> Scenario:
 
 
 def spoken_name(scenario: Scenario) -> str | None:
-    """Return what a person names a scenario by here; None where its file is somewhere else."""
+    """Return the name of a scenario for commands in this folder; None where they find none."""
     if scenario.name in shipped_scenarios():
         return scenario.name
     file = f"{scenario.name}{SUFFIX}"
@@ -58,7 +58,7 @@ def spoken_name(scenario: Scenario) -> str | None:
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Return the scenario that a file describes; its net is found beside the file."""
+    """Return the scenario that a file describes; its net is found next to the file."""
     scenario = _read(path)
     if scenario.net is None:
         return scenario
@@ -84,7 +84,7 @@ def _line(text: str, sentence: str) -> str:
 
 
 COMMENTS: Final = {
-    "net": "the SUMO net, beside this file",
+    "net": "the SUMO net, next to this file",
     "mainline": "edges of the mainline in driving order, past the merge point M",
     "ramp": "edges of the ramp in driving order, past M",
     "x_pov0_m": "where the POV may start: low, high; metres of its front bumper before M",
@@ -111,7 +111,7 @@ COMMENTS: Final = {
     "lane_m": "where the acceleration lane begins, at the gore or behind it, and ends",
     "lane_end": 'its end moves a VUT to the mainline; "stop" brakes it to a stand before it',
 }
-"""Comments beside the values of a file that we write."""
+"""Comments on the values of a file that is written."""
 
 
 def to_toml(scenario: Scenario, found: Sequence[str]) -> str:

@@ -62,7 +62,7 @@ _Place = tuple[float, float]
 def _with_paths(made: bytes, road: Corridor) -> bytes:
     """Return OpenDRIVE in which the ways over junctions are those of both paths.
 
-    netconvert draws a way of its own, up to a metre beside the lanes inside of a junction. Here its
+    netconvert draws a way of its own, up to a metre off the lanes inside of a junction. Here its
     reference line becomes the centre of the lane that is driven on. The acceleration lane, which it
     writes as any other, gets the type "entry".
     """

@@ -68,7 +68,7 @@ MAX_TIMESTEPS: Final = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOL
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay(Result):
-    """A headless replay beside its record.
+    """A headless replay, compared with its record.
 
     Attributes:
         rows: rows that were compared.
@@ -256,7 +256,7 @@ def _road(path: Path, outcome: Outcome) -> Road:
 def _placed(path: Path, road: Road, outcome: Outcome) -> dict[At, tuple[RecordedMotion, _Position]]:
     """Return the rows of a record with their places on the paths.
 
-    The VUT has the lanes of the ramp, and that of the mainline beside an acceleration lane.
+    The VUT has the lanes of the ramp, and that of the mainline next to an acceleration lane.
     """
     name = f"the record {path}"
     rows = _record(path, name)

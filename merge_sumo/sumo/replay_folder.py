@@ -40,14 +40,14 @@ NET: Final = "us23.net.xml"
 HOSTED_NET: Final = "road.net.xml"
 """The net of any other road."""
 LANE_EDGE: Final = LANE.replace(COPY, ".0")
-"""Edge of that net with an acceleration lane and the mainline beside it."""
+"""Edge of that net with an acceleration lane and the mainline next to it."""
 TYPES: Final = "vehicles.add.xml"
 LABELS: Final = "labels.add.xml"
 RECORD: Final = "episode.fcd.xml"
 VIEW: Final = "view.settings.xml"
 CASE: Final = "case.json"
 SCENARIO: Final = "scenario"
-"""Key of the scenario in that file, beside those of the outcome."""
+"""Key of the scenario in that file, next to those of the outcome."""
 SPEED_LIMIT_MPS: Final = 200.0
 """Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
 
@@ -66,7 +66,7 @@ REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 PALE: Final = "0.93,0.93,0.90"
 HOLD_STEPS: Final = 10
-"""Steps for which the last picture stays, so that a person sees how it ended."""
+"""Steps for which the last picture stays, so that one sees how it ended."""
 
 NAMES: Final = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
 TEXT: Final = "text"

@@ -1,4 +1,4 @@
-"""Arrays from files that a disk or somebody may have changed."""
+"""Arrays from files that may have been changed."""
 
 from __future__ import annotations
 

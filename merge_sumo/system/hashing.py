@@ -28,7 +28,7 @@ def files_now(recorded: Files, loaded: Files) -> Files:
     """Return recorded files with the hashes that they have now, then what is `loaded` besides.
 
     A name in a record is relative to where it was written, which may be elsewhere: a file that is
-    not there is that of its name among those that are loaded, or beside them.
+    not there is that of its name among those that are loaded, or next to them.
     """
     now: Files = {}
     for name in recorded:
@@ -65,7 +65,7 @@ def sha256_of(path: Path) -> str | None:
         return None
 
 
-# By the time of the last change of the inode: unlike that of the content, nobody can set it.
+# By the time of the last change of the inode: unlike that of the content, it cannot be set.
 @lru_cache(maxsize=4096)
 def _sha256(path: Path, _inode: int, _changed_ns: int, _size: int) -> str:
     with path.open("rb") as file:

@@ -43,7 +43,7 @@ class Interrupt:
     """
 
     def __init__(self, note: str) -> None:
-        """`note` is what a person is told at the first signal."""
+        """`note` is printed at the first signal."""
         self._note = f"\n{note}\n".encode()
         self._number: int | None = None
         self._before: list[Any] = []

@@ -48,7 +48,7 @@ def lower_limits(**most: int) -> None:
 
 
 def exhausted(error: BaseException) -> str | None:
-    """Return advice on an error of the system that is no fault of the program, or None."""
+    """Return advice on an error of the system that is not a fault of the program, or None."""
     if isinstance(error, OSError) and error.errno in EXHAUSTED:
         where = f"{error.filename}: " if isinstance(error.filename, str) else ""
         return where + EXHAUSTED[error.errno]

@@ -24,7 +24,7 @@ def counted(number: int, what: str) -> str:
 
 
 def quoted(argument: str | Path) -> str:
-    """Return an argument of a command that a person may paste into a shell.
+    """Return an argument of a command to paste into a shell.
 
     What cannot be printed is written as bytes in `$'...'`, which bash, zsh and ksh read.
     """

@@ -1,9 +1,9 @@
 """Records by declaration: JSON and TOML into typed values, or one sentence on what is wrong.
 
 What a record may hold is what the annotations of its class say, with bounds as `Meta`. Reading is
-strict: a text is no number, true is no number, and 18 is 18.0 where a number may have a fraction.
+strict: texts and true are not numbers, and 18 is 18.0 where a number may have a fraction.
 Unknown names, numbers beyond float64, half characters and endless nesting are refused, since the
-file may be somebody else's.
+file may be another person's.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ _NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(
 
 
 class RecordError(UserError):
-    """Something that is read and is no record of its type."""
+    """A value that is not a record of its type."""
 
 
 class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

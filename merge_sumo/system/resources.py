@@ -9,7 +9,7 @@ from pathlib import Path
 def resource(name: str) -> Path:
     """Return the shipped folder `name` ("sumo_net" or "policies").
 
-    A wheel carries the folders inside the package; a source tree has them beside it.
+    A wheel carries the folders inside the package; a source tree has them next to it.
     """
     package = Path(__file__).resolve().parents[1]
     shipped = package / "shipped" / name

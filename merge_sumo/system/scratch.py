@@ -50,7 +50,7 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
 def _locked(folder: Path) -> int | None:
     """Return the descriptor that holds the lock of a folder; None where there are no locks.
 
-    Raises BlockingIOError where another has the lock, and OSError where this is no folder.
+    Raises BlockingIOError where another has the lock, and OSError where this is not a folder.
     """
     try:
         import fcntl
@@ -81,7 +81,7 @@ def _remove_remains(above: str) -> None:
 
 
 def _remove_if_left(folder: Path) -> None:
-    """Remove a folder of this user that nobody holds; OSError where it is none."""
+    """Remove a folder of this user that no process holds; OSError where it is none."""
     geteuid: Any = getattr(os, "geteuid", None)
     if geteuid is None or folder.lstat().st_uid != geteuid():
         return
