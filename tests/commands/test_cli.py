@@ -148,24 +148,8 @@ class TestACampaign:
             assert (said.code, said.err) == (0, "")
             assert "\nidentical" in said.out
 
-    def test_tells_a_person_what_to_do_next(self, call):
-        said = call(*SMALL, "--cases", 80, "--seed", 1, *GPR, "--out", "run")
-        assert said.code == 0
-        assert "; 80 cases" in said.out
-        assert f"report: {Path('run', 'report.html')}" in said.out
-        (command,) = (line for line in said.out.splitlines() if line.startswith("worst case ("))
-        name, *arguments = command.partition("): ")[2].split()
-        assert name == "merge-sumo"
-        arguments.remove("--gui")
-        assert call(*arguments).code == 0
-
 
 class TestReplay:
-    def test_of_a_good_scenario_says_identical_and_exits_with_0(self, call, scenario):
-        said = call("replay", scenario)
-        assert (said.code, said.err) == (0, "")
-        assert "\nidentical" in said.out
-
     def test_prints_exactly_one_json_object(self, call, scenario):
         good = call("replay", scenario, "--json")
         diverge(scenario)

@@ -48,12 +48,6 @@ class TestTheArchitecture:
         (listed,) = re.findall(r"^LAYERS = \((.*?)^\)$", layers, re.MULTILINE | re.DOTALL)
         assert rooms == re.findall(r'"(\w+)"', listed)
 
-    def test_names_at_most_eight_files_from_a_sampler_to_an_outcome(self):
-        way = self.PAGE.partition("## The way of a case")[2].partition("\n## ")[0]
-        files = set(re.findall(r"`(\w+/[\w/]+\.py)`", way))
-        assert 1 < len(files) <= 8
-        assert all((ROOT / "merge_sumo" / file).is_file() for file in files)
-
     def test_names_files_that_are_there(self):
         named = set(re.findall(r"`([\w/]+(?:\.py|/))`", self.PAGE))
         assert len(named) > 30
@@ -72,18 +66,6 @@ class TestTheArchitecture:
         assert len(named) >= 6
         for *functions, file in named:
             assert {*functions} - {""} <= defined_in(ROOT / "merge_sumo" / file), (functions, file)
-
-    def test_names_all_that_run_cases_beside_evaluate(self):
-        (rule,) = re.findall(r"^- \*\*One plan.*$", self.PAGE, re.MULTILINE)
-        named = {file for file in re.findall(r"`(\w+/\w+\.py)`", rule) if "/" in file}
-        calls = re.compile(r"(?<!def )\b(?:Rollout|Simulator)\((?!Simulator)")
-        package = ROOT / "merge_sumo"
-        calling = {
-            path.relative_to(package).as_posix()
-            for path in package.rglob("*.py")
-            if path.parent.name != "engine" and calls.search(path.read_text(encoding="utf-8"))
-        }
-        assert calling == named - {"campaigns/plan.py", "engine/rollout.py"}
 
 
 # The list of changes names what earlier versions had.

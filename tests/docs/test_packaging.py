@@ -32,17 +32,6 @@ def test_the_classifiers_begin_with_the_oldest_python_that_it_takes():
     assert versions == ["11", "12", "13"]
 
 
-def test_types_are_checked_everywhere_and_strictly_outside_of_the_tests():
-    mypy = CONFIG["tool"]["mypy"]
-    assert mypy["strict"]
-    assert mypy["files"] == ["merge_sumo", "tools", "tests", "examples"]
-    strict = next(o for o in mypy["overrides"] if "merge_sumo.*" in o["module"])
-    tools = sorted(path.stem for path in (ROOT / "tools").glob("*.py"))
-    contest = {path.stem for path in (ROOT / "tools" / "benchmark").rglob("*.py")} - {"__main__"}
-    assert strict["module"] == ["merge_sumo.*", *tools, *sorted(contest)]
-    assert {name for name, value in mypy.items() if value is False} <= set(strict)
-
-
 def test_a_release_has_the_same_day_in_the_changelog_and_in_the_citation():
     (released,) = re.findall(
         rf"^## {re.escape(PROJECT['version'])} \((.*)\)$",

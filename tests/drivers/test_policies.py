@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
-import make_scenarios
 import numpy as np
 import pytest
 from merges import HALF, SMALLER
 from plans import POVS
 
-from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.levelk import (
     FEATURES,
     LevelKDriver,
@@ -30,7 +28,6 @@ from merge_sumo.engine.povs import PovLibrary, Povs
 from merge_sumo.engine.rollout import Rollout
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.game import Game, greedy, pool_starts
@@ -86,75 +83,12 @@ def test_learned_episodes_are_the_same_in_1_and_in_32_corridors():
         assert np.array_equal(alone.motion, beside.motion)
 
 
-def test_a_row_of_q_does_not_depend_on_the_rows_beside_it():
-    rng = np.random.default_rng(0)
-    layers = [
-        (rng.normal(size=(64, FEATURES)), rng.normal(size=64)),
-        (rng.normal(size=(7, 64)), np.zeros(7)),
-    ]
-    network = QNetwork(layers)
-    inputs = rng.normal(size=(33, FEATURES))
-    together = network.values(inputs)
-    for row in range(33):
-        assert np.array_equal(network.values(inputs[row : row + 1])[0], together[row])
-
-
-@pytest.mark.parametrize("name", ["pov1", "pov2"])
-def test_a_row_of_q_in_float32_does_not_depend_on_the_rows_beside_it(name):
-    network, rng = load_network(name), np.random.default_rng(0)
-    rows = rng.normal(size=(1500, network.layers[0][0].shape[1]))
-    q = network.values_at_once(rows)
-    for count in (1, 7, 40, 171, 300, 513, 600, 1025):
-        some = rng.choice(len(rows), count, replace=False)
-        assert network.values_at_once(rows[some]).tobytes() == q[some].tobytes()
-
-
-def papers_features(x_pov, v_pov, x_vut, v_vut):
-    """Return what a network of the paper's scenario sees, with its numbers written out."""
-    distance = np.maximum(-x_vut, 0.0)
-    t_level0 = np.minimum(
-        level0_time_to(distance, v_vut, US23.level0_a_mps2, US23.level0_v_mps), 20.0
-    )
-    t_constant = np.minimum(distance / np.maximum(v_vut, 0.5), 20.0)
-    t_full = (np.sqrt(v_vut * v_vut + 4.0 * distance) - v_vut) / 2.0
-    t_brake = np.minimum(t_level0, v_pov / 4.0)
-    gaps = (
-        x_pov + v_pov * t_level0,
-        x_pov + (v_pov + t_level0) * t_level0,
-        x_pov + (v_pov - 2.0 * t_brake) * t_brake,
-        x_pov + v_pov * t_constant,
-        x_pov + v_pov * t_full,
-    )
-    v_level0 = np.maximum(v_vut, np.minimum(v_vut + t_level0, 28.0))
-    columns = [
-        x_pov / 100.0 + 1.0,
-        (v_pov - 28.0) / 6.0,
-        x_vut / 100.0 + 1.0,
-        (v_vut - 22.0) / 6.0,
-        t_level0 / 5.0 - 1.0,
-        t_constant / 5.0 - 1.0,
-        t_full / 5.0 - 1.0,
-        *(np.tanh(gap / scale) for gap in gaps for scale in (80.0, 25.0, 8.0)),
-        (v_level0 - 24.6) / 4.0,
-        (v_vut + 2.0 * t_full - 24.6) / 8.0,
-        np.tanh((v_pov - v_level0) / 3.0),
-        (v_pov - 24.6) / 4.0,
-    ]
-    return np.stack(columns, axis=-1)
-
-
 def states(n):
     rng = np.random.default_rng(1)
     return rng.uniform((-900.0, 0.0, -182.0, 0.0), (200.0, 60.0, 20.0, 60.0), (n, 4))
 
 
 class TestOtherScenarios:
-    def test_the_shipped_networks_see_the_paper_s_numbers_to_the_last_bit(self):
-        assert np.array_equal(
-            features(*states(20_000).T, scenario=US23), papers_features(*states(20_000).T)
-        )
-        assert actions_mps2(US23).tolist() == [-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0]
-
     def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
         x_pov, v_pov, x_vut, v_vut = (states(20_000) / 2).T
         half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
@@ -215,34 +149,3 @@ class TestTheLibraryOfPeople:
             found = [measure(t) for t in Rollout(world, pov, vut, cases).run()]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0
-
-
-class TestTheExampleRuns:
-    """Wang et al., Fig. 5, as they ship in scenarios/."""
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def examples(cls):
-        return {name: make_scenarios.play(e) for name, e in make_scenarios.EXAMPLES.items()}
-
-    def test_1_the_level1_pov_slows_and_the_level0_vut_merges_first(self, examples):
-        run = examples["pov-yields"]
-        assert run.v_pov_mps.min() < 33.0 - 0.9
-        assert measure(run).end is End.MERGED
-        assert measure(run).merged_first == "VUT"
-
-    def test_2_the_level1_vut_waits_the_pov_accelerates_and_merges_first(self, examples):
-        run = examples["vut-waits"]
-        assert run.a_vut_mps2[0] <= 0.0
-        assert run.a_vut_mps2.max() >= 1.0
-        assert run.v_pov_mps.max() > 33.0
-        assert measure(run).end is End.MERGED
-        assert measure(run).merged_first == "POV"
-
-    def test_3_both_yield_and_collide(self, examples):
-        run = examples["stalemate"]
-        assert measure(run).is_close
-        assert run.a_pov_mps2.min() <= -1.0
-        assert run.a_vut_mps2[5:20].min() >= 0.5, "at first it accelerates, behind its lag"
-        assert np.abs(run.a_vut_mps2[30:60]).max() <= 0.3, "then it coasts"
-        assert run.a_vut_mps2.min() <= -1.0

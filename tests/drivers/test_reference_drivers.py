@@ -19,10 +19,8 @@ from merge_sumo.drivers.reference import (
     RssVut,
 )
 from merge_sumo.drivers.safety_models import (
-    CarefulModel,
     FsmModel,
     Pair,
-    Reaction,
     rss_distance_m,
     ttc_s,
 )
@@ -87,15 +85,6 @@ class TestModels:
         assert found == pytest.approx(4.0 * proactive)
         assert FsmModel().is_unsafe(Pair(one(30), one(20), one(20)))
         assert not FsmModel().endangers(Pair(one(30), one(20), one(20)))
-
-    def test_the_reaction_waits_brakes_and_holds(self):
-        reaction, yes, no = Reaction(1, CarefulModel()), np.array([True]), np.array([False])
-        found = [float(reaction.acceleration_mps2(yes, one(4.0))[0]) for _ in range(12)]
-        assert found == pytest.approx([-0.4] * 8 + [-1.665, -2.93, -4.0, -4.0])
-        assert reaction.acceleration_mps2(no, one(4.0)) == 0.0
-        assert reaction.acceleration_mps2(yes, one(4.0)) == -4.0
-        reaction.forget(yes)
-        assert reaction.acceleration_mps2(yes, one(4.0)) == -0.4
 
 
 class TestRampDrivers:

@@ -8,13 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from controllers import STOCK_CLIENT, program
-from plans import plan_for
 from vut_contract import factory
 
 import merge_sumo as ms
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.sensing import SensedDriver, far_m
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.imperfection import Actuation, Sensing
@@ -137,22 +135,6 @@ class TestByHand:
         assert far_m(one_lane) == -182.0 + 340.0
 
 
-def test_corridors_are_independent():
-    cases = [case_with(-200.0 - k, noise_x_m=1.0, dropout=0.2, delay_s=0.15) for k in range(3)]
-    inner = Sees(3)
-    driver = SensedDriver(inner, cases[0].scenario)
-    true = np.array([case.starts() for case in cases])  # (K, A, 2)
-    for step in range(6):
-        if step == 0:
-            for k, case in enumerate(cases):
-                driver.begin(k, case)
-        x_m = true[:, :, 0] + 0.1 * step * true[:, :, 1]
-        driver.act(Scene(np.full(3, True), np.full(3, step), x_m.T, true[:, :, 1].T))
-    together = np.array([scene.x_pov_m for scene in inner.scenes])
-    for k, case in enumerate(cases):
-        assert np.array_equal(together[:, k], seen_of(case, steps=6)[0][:, 0])
-
-
 def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
     from merge_sumo.road.scenario_file import named_scenario
 
@@ -175,24 +157,6 @@ def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
     # The car ahead, at -210 m, is 28 m away; the POV and the car behind are not seen.
     assert scene.x_m[:, 0].tolist() == [far_m(scenario), -182.0, -210.0, far_m(scenario)]
     assert scene.facing.tolist() == [2]
-
-
-@pytest.mark.parametrize("vut", ["design2", "level1"])
-def test_zeros_of_a_range_give_the_same_bits(vut):
-    scenario = replace(
-        US23,
-        sense=Sensing(delay_s=(0.0, 1.0), noise_x_m=(0.0, 1.0), dropout=(0.0, 0.5)),
-        act=Actuation(lag_s=(0.0, 1.0), delay_s=(0.0, 1.0)),
-    )
-    start: dict[str, Any] = {"level": 1, "x_pov0_m": -250.0, "v_pov0_mps": 29.0}
-    zeros: dict[str, Any] = dict.fromkeys(scenario.imperfect_fields, 0.0)
-    cases = [MergeCase(**start, scenario=US23), MergeCase(**start, **zeros, scenario=scenario)]
-    motions = []
-    for case in cases:
-        with Simulator(plan_for(vut, scenario=case.scenario)) as simulator:
-            (ran,) = simulator.run([case])
-            motions.append(ran.motion)
-    assert np.array_equal(motions[0], motions[1])
 
 
 class TestEveryKindOfVut:

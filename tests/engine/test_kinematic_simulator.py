@@ -10,14 +10,14 @@ from plans import POVS, key_of, plan_for
 
 from merge_sumo.drivers.levelk import MANY_ROWS, features
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.evaluate import evaluate, simulate
+from merge_sumo.engine.evaluate import simulate
 from merge_sumo.engine.kinematic_simulator import CHECKED_SHARE, drawn
 from merge_sumo.engine.kinematic_world import EquationWorld
 from merge_sumo.engine.plan import Engine, SimulationPlan
 from merge_sumo.engine.povs import own_pov
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, MergeCase, Pool, from_unit
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
 from merge_sumo.studies.truth import ground_truth, known_truth
 from merge_sumo.verdict.criterion import Criterion
@@ -152,20 +152,6 @@ class TestATruth:
         kept = ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_cases=counted.append)
         assert kept.in_sumo == 50
         assert sum(counted) == 100
-
-
-def in_sumo(episode: Episode) -> bool:
-    return episode.in_sumo
-
-
-def test_cases_are_evaluated_in_their_order():
-    points = np.random.default_rng(0).random((700, 2))
-    cases = Pool(levels=(0,), scenario=US23).cases(points, 0)
-    plan = plan_for("design1").with_engine("kinematic")
-    found = dict(evaluate(plan, cases))
-    assert sorted(found) == list(range(700))
-    assert all(found[place].trajectory.case == case for place, case in enumerate(cases))
-    assert sum(by_sumo for _, by_sumo in evaluate(plan, cases, None, in_sumo)) == 7
 
 
 @pytest.mark.parametrize("name", ["pov1", "pov2", "vut1", "vut2"])

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from plans import plan_for
 from test_kinematic_simulator import uniform
 
@@ -14,23 +13,12 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.engine.evaluate import simulate
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import FloatArray, MergeCase
+from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, MergeScenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.sumo.world import World
 from merge_sumo.verdict.score import measure
 
 LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
-LATE = """
-class Late:
-    "Merges at a place of its own, by where the POV starts."
-
-    def reset(self, seen):
-        self.place_m = -90.0 + (-seen.x_pov_m * 7.0) % 240.0
-
-    def act(self, seen):
-        return 0.5, seen.x_vut_m >= self.place_m
-"""
 
 
 class TestAWish:
@@ -76,12 +64,6 @@ class TestAWish:
         assert hardest >= -4.0 - 1e-9
 
 
-@pytest.fixture
-def late(tmp_path):
-    (tmp_path / "late.py").write_text(LATE)
-    return f"{tmp_path / 'late.py'}:Late"
-
-
 class TestSumo:
     @pytest.mark.parametrize("scenario", ["us23-lane", "us23-lane-traffic"])
     @pytest.mark.parametrize("vut", ["design2", "level0"])
@@ -96,26 +78,6 @@ class TestSumo:
             assert one.after is not None
             assert other.after is not None
             np.testing.assert_allclose(one.after, other.after, rtol=0.0, atol=1e-9)
-
-    def test_has_the_vut_on_the_mainline_from_the_merge_on(self, late, monkeypatch):
-        """Anywhere on the lane, also where the step crosses its end."""
-        road = named_scenario("us23-lane")
-        lanes: list[tuple[float, bool]] = []
-        command = World.command
-
-        def noted(world: World, a_mps2: FloatArray, merged: NDArray[np.bool_]) -> None:
-            command(world, a_mps2, merged)
-            wants = world.wants_to_merge()
-            active = world.x_m[VUT] > -100.0
-            lanes.extend(zip(world.x_m[VUT, active], (wants == merged)[active], strict=True))
-
-        monkeypatch.setattr(World, "command", noted)
-        results = simulate(plan_for(late, scenario=road), uniform(60, 0, road))
-        places = [one.motion[-1, VUT, 0] for one in [one.trajectory for one in results]]
-        assert min(places) < -65.0
-        assert max(places) >= 130.0
-        at_end = [agrees for x_m, agrees in lanes if not 125.0 < x_m < 131.0]
-        assert all(at_end)
 
 
 RAISING = """

@@ -55,27 +55,6 @@ def level0() -> Vut:
     return lambda now: (level0_mps2(now.v_vut), None)
 
 
-def design2() -> Vut:
-    """Predict dx at M, coast from 139.1 m on, regulate it to 9.43 m from 22.3 m on, with a lag."""
-    actuator = 0.0
-
-    def act(now: SimpleNamespace) -> tuple[float, None]:
-        nonlocal actuator
-        # Time of the level-0 profile to M; eq. (4) lies on the parabola half a step slower.
-        way_m, fast = max(-now.x_vut, 0.0), max(now.v_vut, CRUISE_MPS) - 0.05
-        slow = now.v_vut - 0.05
-        end = min(math.sqrt(slow**2 + 2.0 * way_m), fast)
-        due_s = end - slow + (way_m - (end**2 - slow**2) / 2.0) / (fast + 0.05)
-        dx = now.x_pov + now.v_pov * due_s - max(now.x_vut, 0.0)
-        command = level0_mps2(now.v_vut)
-        if abs(dx) < 16.2 and way_m <= 139.1:
-            command = min(max(1.4 * (dx - 9.43), A_MIN), A_MAX) if way_m <= 22.3 else 0.0
-        actuator += (command - actuator) * DT_S / 0.355
-        return actuator, None
-
-    return act
-
-
 def gap() -> Vut:
     def act(now: SimpleNamespace) -> tuple[float, bool]:
         if now.merged:
@@ -88,7 +67,7 @@ def gap() -> Vut:
     return act
 
 
-VUTS: dict[str, Callable[[], Vut]] = {"level0": level0, "design2": design2, "gap": gap}
+VUTS: dict[str, Callable[[], Vut]] = {"level0": level0, "gap": gap}
 
 
 def idm_mps2(gap_m: float, v: float, v_leader: float, v_wanted: float) -> float:

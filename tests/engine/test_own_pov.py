@@ -18,16 +18,14 @@ from vut_contract import cases_of, factory
 
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.povs import PovAdapter, Povs, own_pov
+from merge_sumo.engine.povs import Povs, own_pov
 from merge_sumo.engine.simulator import Simulator
-from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import LEVELS, OWN, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.verdict.score import measure
 from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.controller import Start
 
 KEEPS = "def Pov(seen):\n    return 0.0\n"
 YIELDS = """
@@ -106,41 +104,6 @@ def same(one: list[Trajectory], other: list[Trajectory]) -> bool:
         np.array_equal(a.motion, b.motion) and a.end is b.end
         for a, b in zip(one, other, strict=True)
     )
-
-
-class Noting(Driver):
-    """Notes what it is told and shown, and answers by it."""
-
-    def __init__(self, corridors: int) -> None:
-        super().__init__(corridors)
-        self.begun: list[tuple] = []
-        self.scenes: list[Scene] = []
-
-    def begin(self, corridor, case):
-        self.begun.append((corridor, Start.of(case).seen))
-
-    def act(self, scene):
-        self.scenes.append(scene)
-        return scene.x_vut_m / 100.0
-
-
-class TestTheSeat:
-    def test_shows_the_car_of_the_mainline_as_vut_and_the_vut_as_pov(self):
-        noting = Noting(2)
-        seat = PovAdapter(noting)
-        case = MergeCase(
-            level=OWN, x_pov0_m=-273.0, v_pov0_mps=33.0, v_vut0_mps=17.0, scenario=US23
-        )
-        seat.begin(1, case)
-        assert noting.begun == [(1, (0.0, -182.0, 17.0, -273.0, 33.0))]
-        active, step = np.array([False, True]), np.array([0, 7])
-        state = [np.array([1.0, n]) for n in (-200.0, 33.0, -150.0, 18.0)]
-        answer = seat.act(Scene.of_pair(active, step, *state))
-        (seen,) = noting.scenes
-        assert (seen.x_vut_m[1], seen.v_vut_mps[1]) == (-200.0, 33.0)
-        assert (seen.x_pov_m[1], seen.v_pov_mps[1]) == (-150.0, 18.0)
-        assert seen.active.tolist() == [False, True]
-        assert answer[1] == -2.0
 
 
 class TestAPov:

@@ -5,95 +5,21 @@ from __future__ import annotations
 import math
 import re
 
-import numpy as np
 import pytest
 from foreign_nets import FOREIGN, edge, lane, node, plain, straight
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import DRAWN_MIN_M, LanePath, Piece
+from merge_sumo.road.corridor import LanePath, Piece
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
-from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.hosting import hosted_paths
 from merge_sumo.sumo.world import World
-
-EXACT = 1e-9
 
 
 @pytest.fixture(scope="module")
 def straight_net(tmp_path_factory) -> NetFile:
     return NetFile(straight(tmp_path_factory.mktemp("net"), "priority"))
-
-
-class Commander:
-    """Drives the vehicles of a world with random accelerations and integrates eq. (4) itself."""
-
-    def __init__(self, world, seed=0):
-        self.world, self.rng = world, np.random.default_rng(seed)
-        self.paths = (world.road.mainline, world.road.ramp)
-        self.x_m = np.zeros((2, world.corridors))
-        self.v_mps = np.zeros((2, world.corridors))
-        self.left = np.zeros(world.corridors, dtype=int)
-        self.episodes = self.stands = 0
-        self.visited = set()
-
-    def refill(self, k):
-        """Begin an episode anywhere before M or shortly behind, at any speed."""
-        for row, path in enumerate(self.paths):
-            near, far = self.rng.uniform(-30, 60), -path.before_m * self.rng.random()
-            self.x_m[row, k] = max(near if self.rng.random() < 0.3 else far, -path.before_m)
-            self.v_mps[row, k] = self.rng.choice([0.0, self.rng.uniform(0, 45), 90.0])
-        starts = zip(self.x_m[:, k].tolist(), self.v_mps[:, k].tolist(), strict=True)
-        self.world.place(k, list(starts))
-        self.left[k] = self.rng.integers(20, 120)
-        self.episodes += 1
-
-    def step(self):
-        shape = self.x_m.shape
-        drawn = self.rng.uniform(US23.a_min_mps2, US23.a_max_mps2, shape) * self.rng.integers(
-            0, 2, shape
-        )
-        to_a_stand = self.rng.random(shape) < 0.02
-        a = np.where(to_a_stand, -self.v_mps / DT_S, drawn)
-        self.world.step(a)
-        self.x_m = self.x_m + self.v_mps * DT_S
-        self.v_mps = np.maximum(self.v_mps + a * DT_S, 0.0)
-        self.stands += int((self.v_mps == 0.0).sum())
-        self.left -= 1
-
-    def worst(self):
-        """Return how far SUMO's vehicles are from eq. (4), in metres or m/s."""
-        off = np.abs(self.world.x_m - self.x_m).max(), np.abs(self.world.v_mps - self.v_mps).max()
-        return max(off)
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_sumo_drives_300_random_episodes_by_eq_4_over_every_lane_of_the_paths(corridor, name):
-    road = corridor(name)
-    with World(16, road, scenario=US23) as world:
-        commander = Commander(world)
-        for k in range(16):
-            commander.refill(k)
-        while commander.episodes < 300:
-            commander.step()
-            assert commander.worst() < EXACT
-            for k in np.flatnonzero((commander.left <= 0) | (commander.x_m.max(0) > 1700)).tolist():
-                commander.refill(k)
-                assert commander.worst() < EXACT
-            commander.visited |= {world._get_lane(name) for name in world._ids}
-    assert commander.stands > 100
-    hosted = {lane for path in hosted_paths(road) for k in range(16) for lane in path.lanes(k)}
-    kinds = {re.sub(r"\.\d+", "", lane) for lane in hosted}
-    visited = {re.sub(r"\.\d+", "", lane) for lane in commander.visited}
-    short = {
-        re.sub(r"\.\d+", "", lane)
-        for own, path in zip((road.mainline, road.ramp), hosted_paths(road), strict=True)
-        for lane, piece in zip(path.lanes(0), own.pieces, strict=True)
-        if piece.length_m < 1.0 or piece.start_m > 500.0
-    }
-    assert visited <= kinds
-    assert kinds - visited <= short
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -120,16 +46,6 @@ def test_a_point_of_a_path_is_where_sumo_draws_its_lane(corridor, name):
     assert compared >= 20
 
 
-@pytest.mark.parametrize("name", FOREIGN)
-def test_coordinates_and_the_drawing_go_on_from_lane_to_lane(corridor, name):
-    for path in (corridor(name).mainline, corridor(name).ramp):
-        for one, other in zip(path.pieces, path.pieces[1:], strict=False):
-            assert one.start_m + one.length_m == pytest.approx(other.start_m, abs=1e-9)
-            end, begin = one.point(one.length_m)[:2], other.point(0.0)[:2]
-            assert math.dist(end, begin) < 1e-3
-        assert path.pieces[-1].start_m + path.pieces[-1].length_m == pytest.approx(2000.0)
-
-
 def test_a_lane_point_by_hand():
     bend = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, 40.0, 0.0))
     piece = Piece("a_0", -140.0, 140.0, 30.0, bend)  # 70 m drawn for 140 m driven
@@ -146,27 +62,6 @@ def test_the_nearest_place_of_a_path_by_hand():
     assert path.nearest(33.0, 20.0) == pytest.approx((3.0, -40.0))
     assert path.nearest(-3.0, 4.0) == pytest.approx((5.0, -140.0))
     assert path.nearest(31.0, -1.0) == pytest.approx((math.sqrt(2.0), -80.0))
-
-
-@pytest.mark.parametrize("name", FOREIGN)
-def test_the_nearest_place_to_a_point_of_a_path_is_the_points(corridor, name):
-    road = corridor(name)
-    for path in (road.mainline, road.ramp):
-        x_m = np.arange(-path.before_m, path.after_m, 0.7)
-        away_m, nearest_m = np.transpose([path.nearest(*path.point(x)[2:4]) for x in x_m])
-        assert max(away_m) < 1e-9
-        off_m = np.sort(np.abs(nearest_m - x_m))
-        # Lanes that are drawn as one point have one place.
-        assert off_m[-1] < DRAWN_MIN_M
-        assert off_m[-3] < 1e-6
-
-
-def test_behind_the_end_of_the_file_the_road_goes_straight_on(corridor):
-    road = corridor("zipper")
-    at, far = (road.lane_point(x_m, on_ramp=True) for x_m in (1200.0, 1900.0))
-    assert at.lane == far.lane == "out2_0"
-    assert far.angle_deg == at.angle_deg
-    assert math.dist(at[2:4], far[2:4]) == pytest.approx(700.0, abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -294,18 +189,14 @@ def edited(old: str, new: str):
         (lambda text: "<routes/>", "is no SUMO net: it does not begin with <net>"),
         (lambda text: "<osm/>", "make one of it: `netconvert --osm-files .* -o NAME.net.xml`"),
         (
-            edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="far"'),
-            "r1_0 whose length is",
-        ),
-        (
             edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'),
-            "r1_0 whose length is",
+            "lane r1_0 is no number",
         ),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="1,1 1,1"'), "r1_0 has no length"),
         (
             edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="here"'),
-            "r1_0 whose shape is",
+            "lane r1_0 is no number",
         ),
         (edited(r'(id="r1_0" index="0" )', r'\1disallow="all" '), "no lane of edge r1 is open"),
         (edited(r'(<connection from="r1" [^>]*)via="[^"]*"', r'\1via=":x_0"'), "over lane :x_0"),
@@ -314,7 +205,7 @@ def edited(old: str, new: str):
         (edited('(<junction id="m" .*)incLanes="[^"]*"', r"\1"), "no junction at the end of lane"),
         (
             edited('(<junction id="m" .*) x="[^"]*"', r'\1 x="far"'),
-            "junction m whose x is",
+            "junction m is no number",
         ),
     ],
 )

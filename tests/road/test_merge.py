@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 from pathlib import Path
@@ -33,13 +32,3 @@ class TestTheShippedRoad:
         for path in (road.mainline, road.ramp):
             before, behind = path.pieces
             assert before.shape[-1][:2] == behind.shape[0][:2] == (0.0, 0.0)
-
-    @pytest.mark.parametrize("on_ramp", [False, True])
-    def test_puts_a_lane_coordinate_at_its_distance_from_the_merge_point(self, road, on_ramp):
-        for x_m in (-340.0, -182.0, -1e-6, 0.0, 1e-6, 25.0):
-            lane, position, x, y, _ = road.lane_point(x_m, on_ramp=on_ramp)
-            assert math.hypot(x, y) == pytest.approx(abs(x_m), abs=1e-9)
-            before = "ramp_0" if on_ramp else "main_in_0"
-            assert lane == (before if x_m < 0 else "main_out_0")
-            length = {"ramp_0": 425.0, "main_in_0": 1000.0, "main_out_0": 0.0}[lane]
-            assert position == pytest.approx(length + x_m, abs=1e-9)

@@ -86,16 +86,6 @@ def test_cars_are_drawn_to_scale_where_they_are_in_the_colours_of_the_player():
     assert f"--road: {picture.ROAD};" in css
 
 
-def test_a_vector_environment_has_a_picture_for_each_game():
-    games = gymnasium.make_vec(ENV_ID, num_envs=3, role="vut", render_mode="rgb_array")
-    games.reset(seed=1)
-    first, second, third = games.render()
-    assert not np.array_equal(first, second)
-    assert not np.array_equal(second, third)
-    assert MergeEnv().render() is None
-    assert MergeVectorEnv(2).render() is None
-
-
 @pytest.mark.usefixtures("no_screen")
 def test_a_window_shows_each_state_in_real_time(monkeypatch):
     import pygame

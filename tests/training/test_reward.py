@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from merges import HALF, LIKE_A_ROUNDABOUT
+from merges import LIKE_A_ROUNDABOUT
 
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.training import reward
@@ -62,17 +62,6 @@ def test_orientation_turns_from_egoistic_to_altruistic():
     assert reward.RewardParts(*parts).of("pov", np.array([math.pi / 6])) == pytest.approx(
         [-1.0 - 2.0 * math.sqrt(0.75) - 1.5]
     )
-
-
-def test_a_merge_of_half_the_size_pays_the_same_to_the_last_bit():
-    rng = np.random.default_rng(0)
-    dx, dv = rng.normal(0.0, 30.0, 500), rng.normal(0.0, 5.0, 500)
-    v, a = rng.uniform(0.0, 45.0, 500), rng.uniform(-4.0, 2.0, 500)
-    whole, half = reward.Reward.of(US23), reward.Reward.of(HALF)
-    assert np.array_equal(whole.safety(dx, dv), half.safety(dx / 2, dv / 2))
-    for name in ("pov_step", "vut_step"):
-        assert np.array_equal(getattr(whole, name)(v, a), getattr(half, name)(v / 2, a / 2))
-    assert np.array_equal(whole.vut_end(v), half.vut_end(v / 2))
 
 
 def test_the_weights_of_a_short_and_slow_merge_by_hand():

@@ -108,13 +108,6 @@ class TestDdqn:
             assert np.array_equal(b1, b2)
         assert not np.array_equal(one.layers[0][0], other.layers[0][0])
 
-    def test_squash_keeps_order_and_is_undone(self):
-        q = torch.linspace(-30.0, 3.0, 200, dtype=torch.float64)
-        squashed = ddqn.squash(q)
-        assert (squashed.diff() > 0).all()
-        assert torch.equal(squashed[q >= -2], q[q >= -2])
-        assert torch.allclose(ddqn.unsquash(squashed), q)
-
     def test_the_numpy_network_equals_the_torch_network(self):
         torch.manual_seed(0)
         network = ddqn.make_network(FEATURES, 32)
@@ -177,27 +170,6 @@ class TestGame:
         torch.manual_seed(1)
         return ddqn.export(ddqn.make_network(FEATURES, 32))
 
-    @pytest.fixture
-    def policy(self, network):
-        return greedy(network, US23)
-
-    def test_a_decision_is_half_a_second_of_eq_4(self):
-        game = Game("vut", None, REWARD)
-        state, rewards, over = game.advance(
-            np.array([[-300.0, 33.0, -100.0, 20.0]]), np.zeros(1), np.array([-2.0])
-        )
-        # x: 20 + 19.8 + 19.6 + 19.4 + 19.2 = 98 steps of 0.1 s
-        assert state[0] == pytest.approx([-283.5, 33.0, -90.2, 19.0], abs=1e-9)
-        assert rewards[0] == pytest.approx(-0.5 * 4.0 * WEIGHTS.vut_acc)
-        assert not over[0]
-
-    def test_the_level0_vut_stops_accelerating_at_28_in_the_middle_of_a_decision(self):
-        game = Game("pov", None, REWARD)
-        state, _, _ = game.advance(
-            np.array([[-300.0, 33.0, -100.0, 27.85]]), np.zeros(1), np.zeros(1)
-        )
-        assert state[0, 3] == 28.0
-
     @pytest.mark.parametrize("role", ["pov", "vut"])
     @pytest.mark.parametrize("scenario", [US23, LIKE_A_ROUNDABOUT], ids=lambda s: s.name)
     def test_its_returns_are_those_of_the_game_in_sumo(self, role, network, scenario):
@@ -211,17 +183,6 @@ class TestGame:
         returns = returns_of(trajectories, played).of(role, np.zeros(8))
         assert returns[ended] == pytest.approx(expected[ended], abs=1e-9)
         assert any(ended)
-
-    def test_the_plan_of_a_beam_search_has_the_return_that_it_states(self, policy):
-        torch.manual_seed(2)
-        agent = ddqn.export(ddqn.make_network(FEATURES, 16))
-        game = Game("vut", None, REWARD)
-        start, svo_rad = pool_starts(5, np.random.default_rng(4), scenario=US23), np.zeros(5)
-        found = best_response.beam_search(game, start, svo_rad, agent, width=16)
-        for n in range(5):
-            actions = iter(found.plans[n])
-            returns = game.play(start[[n]], np.zeros(1), lambda *_, a=actions: np.array([next(a)]))
-            assert returns[0] == pytest.approx(found.returns[n], abs=1e-9)
 
 
 class TestRefinement:

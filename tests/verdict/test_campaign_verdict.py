@@ -19,7 +19,7 @@ from test_chance import CASE, outcomes
 import merge_sumo as ms
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
-from merge_sumo.reports.junit import check_junit, write_junit
+from merge_sumo.reports.junit import write_junit
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.system.interrupt import Stopped
 from merge_sumo.system.printable import counted
@@ -154,20 +154,6 @@ class TestJUnit:
         write_junit(tmp_path / "junit.xml", run, [], judge(run.outcomes), [])
         (failure,) = read_junit(tmp_path / "junit.xml").iter("failure")
         assert failure.text.startswith("nothing was tested")
-
-    def test_is_refused_where_something_is_or_nothing_can_be(self, tmp_path):
-        folder = tmp_path / "run"
-        (tmp_path / "file.xml").write_text("mine")
-        (tmp_path / "link.xml").symlink_to(tmp_path / "nowhere")
-        for name in ("file.xml", "link.xml"):
-            with pytest.raises(UserError, match="exists"):
-                check_junit(tmp_path / name, folder)
-        with pytest.raises(UserError, match="the folder of the campaign"):
-            check_junit(tmp_path / "run.xml", tmp_path / "run.xml")
-        with pytest.raises(UserError, match="there is no folder"):
-            check_junit(tmp_path / "no" / "junit.xml", folder)
-        check_junit(folder / "junit.xml", folder)  # the campaign makes that folder
-        check_junit(tmp_path / "junit.xml", folder)
 
 
 def test_a_case_that_ran_too_seldom_to_tell_is_no_failure_and_meets_the_gate():

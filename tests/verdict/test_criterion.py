@@ -188,11 +188,6 @@ class TestMeasures:
         assert of('severity == "contact"', ending(0.0)) == -1.0
         assert of('severity != "contact"', ending(0.0, end=End.TIMEOUT)) == -1.0
 
-    def test_an_impact_speed_needs_an_impact(self):
-        assert measure(ending(5.5, v_pov=20.0, v_vut=22.0)).impact_speed_mps is None
-        assert measure(ending(-4.0, v_pov=22.0, v_vut=26.0)).impact_speed_mps == pytest.approx(4.0)
-        assert measure(ending(-25.0, v_pov=36.0, v_vut=26.0)).impact_speed_mps is None
-
 
 class TestRecords:
     def test_hold_every_measure_that_a_criterion_may_name(self):

@@ -150,13 +150,6 @@ def over_the_pool(fails, level: int = 1) -> list[Outcome]:
 
 
 class TestRegions:
-    def test_of_a_box_are_that_box(self):
-        outcomes = over_the_pool(lambda x, v: -270 <= x <= -240 and v > 31)
-        failed = sum(o.failed for o in outcomes)
-        boxes = failure_boxes(outcomes, 1)
-        assert sum(box.failures for box in boxes) >= 0.9 * failed
-        assert all(box.failures >= 0.5 * box.cases for box in boxes)
-
     def test_of_a_band_of_equal_arrival_speak_of_the_time(self):
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)
         (box,) = failure_boxes(outcomes, 1)
