@@ -65,19 +65,6 @@ class TestTheNames:
         assert dir(ms) == sorted(ms.__all__)
         assert all(getattr(ms, name) is not None for name in ms.__all__)
 
-    def test_have_docstrings(self):
-        nameless = [
-            n for n in ms.__all__ if n != "__version__" and not inspect.getdoc(getattr(ms, n))
-        ]
-        assert nameless == []
-
-    @pytest.mark.parametrize("name", FUNCTIONS)
-    def test_have_help_that_fits_a_screen(self, name):
-        shown = pydoc.plain(pydoc.render_doc(getattr(ms, name))).splitlines()
-        # One line for each parameter, as later versions of Python write a long signature.
-        more = len(inspect.signature(getattr(ms, name)).parameters)
-        assert len(shown) + more <= 80
-
     def test_are_on_the_page(self):
         functions = re.findall(r"^\| `(\w+)\(", PAGE.read_text(), re.MULTILINE)
         assert set(ms.__all__) - {"__version__"} <= {*functions, *shown_classes()}

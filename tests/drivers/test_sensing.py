@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from controllers import STOCK_CLIENT, program
-from vut_contract import factory
 
 import merge_sumo as ms
 from merge_sumo.drivers.base import Driver, Scene
@@ -17,29 +15,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import POV, US23, VUT
-from merge_sumo.testing.contracts import assert_sees_late
 
 FAR_M = -522.0
 """340 m, where a POV may start, behind -182 m, where the VUT starts."""
-LAW = """
-class Reset:
-    def reset(self, seen):
-        self.offset = 0.001 * seen.x_pov_m
-    def act(self, seen):
-        return 0.05 * (seen.v_pov_mps - 27.0) + 0.001 * (seen.x_vut_m - seen.x_pov_m) + self.offset
-"""
-TRACI_LAW = (
-    STOCK_CLIENT
-    + """
-traci.simulationStep()
-while traci.simulation.getMinExpectedNumber() > 0:
-    if {"vut", "pov"} <= set(traci.vehicle.getIDList()):
-        command = 0.05 * (traci.vehicle.getSpeed("pov") - 27.0)
-        traci.vehicle.setSpeedMode("vut", 0)
-        traci.vehicle.setSpeed("vut", traci.vehicle.getSpeed("vut") + 0.1 * command)
-    traci.simulationStep()
-"""
-)
 
 
 class Sees(Driver):
@@ -161,15 +139,6 @@ def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
 
 class TestEveryKindOfVut:
     """Beside those of `VutContract`."""
-
-    def test_in_python_with_a_reset(self, tmp_path):
-        (tmp_path / "law.py").write_text(LAW)
-        assert_sees_late(factory(f"{tmp_path / 'law.py'}:Reset"))
-
-    @pytest.mark.slow
-    def test_behind_traci(self, tmp_path):
-        pytest.importorskip("traci")
-        assert_sees_late(factory("traci:" + program(tmp_path, TRACI_LAW)))
 
     def test_but_for_those_that_see_in_sumo(self):
         with pytest.raises(UserError, match="sees other cars in SUMO itself"):

@@ -81,22 +81,6 @@ def run(vut, scenario):
 
 
 class TestSeverity:
-    @pytest.mark.parametrize(
-        ("states", "severity"),
-        [
-            # 5 m long: bodies overlap in the second row, by half a metre.
-            ([(-10.0, 30.0, 0.0, 20.0), (-4.5, 30.0, 0.0, 20.0)], "contact"),
-            ([(-5.5, 30.0, 0.0, 30.0)], "conflict"),
-            ([(-20.0, 30.0, 0.0, 30.0)], "safe"),
-        ],
-    )
-    def test_is_of_the_motion(self, states, severity):
-        after = followed(*states).after
-        motion = replace(ending(20.0), motion=after[:1]).motion
-        measures = measure(replace(followed(*states), motion=motion))
-        assert measures.severity == severity
-        assert (measures.impact_speed_mps == 10.0) is (severity == "contact")
-
     @pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])
     def test_is_harsh_where_a_car_behind_did_brake(self, braking, severity):
         episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))

@@ -95,19 +95,31 @@ def test_the_tutorial_shows_the_code_that_its_commands_run():
     assert all(block in code for block in blocks)
 
 
+def trained(seed):
+    game = Game("pov", None, REWARD)
+    return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
+
+
+def unrefined():
+    torch.manual_seed(0)
+    return ddqn.export(ddqn.make_network(FEATURES, 32))
+
+
+def refined(seed, settings=QUICK):
+    return refine.refine(Game("pov", None, REWARD), unrefined(), seed, settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [trained, refined])
+def test_same_seed_same_weights_and_another_seed_other_weights(make):
+    one, two, other = make(0), make(0), make(1)
+    for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
+        assert np.array_equal(w1, w2)
+        assert np.array_equal(b1, b2)
+    assert not np.array_equal(one.layers[0][0], other.layers[0][0])
+
+
 class TestDdqn:
-    def train(self, seed=0):
-        game = Game("pov", None, REWARD)
-        return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
-
-    @pytest.mark.slow
-    def test_same_seed_same_weights_and_another_seed_other_weights(self):
-        one, two, other = self.train(), self.train(), self.train(seed=1)
-        for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
-            assert np.array_equal(w1, w2)
-            assert np.array_equal(b1, b2)
-        assert not np.array_equal(one.layers[0][0], other.layers[0][0])
-
     def test_the_numpy_network_equals_the_torch_network(self):
         torch.manual_seed(0)
         network = ddqn.make_network(FEATURES, 32)
@@ -186,11 +198,6 @@ class TestGame:
 
 
 class TestRefinement:
-    def refined(self, seed, settings=QUICK):
-        torch.manual_seed(0)
-        network = ddqn.export(ddqn.make_network(FEATURES, 32))
-        return network, refine.refine(Game("pov", None, REWARD), network, seed, settings)
-
     def test_it_lowers_the_regret(self):
         game, psi = Game("pov", None, REWARD), np.zeros(100)
         start = pool_starts(100, np.random.default_rng(3), US23)
@@ -198,17 +205,9 @@ class TestRefinement:
         enough = dataclasses.replace(QUICK, starts=40, searched=10, beam=8, updates=200)
         before, after = (
             (best - game.play(start, psi, greedy(network, US23))).mean()
-            for network in self.refined(seed=0, settings=enough)
+            for network in (unrefined(), refined(0, enough))
         )
         assert after < 0.5 * before
-
-    @pytest.mark.slow
-    def test_same_seed_same_weights_and_another_seed_other_weights(self):
-        one, two, other = (self.refined(seed)[1] for seed in (0, 0, 1))
-        for (w1, b1), (w2, b2) in zip(one.layers, two.layers, strict=True):
-            assert np.array_equal(w1, w2)
-            assert np.array_equal(b1, b2)
-        assert not np.array_equal(one.layers[0][0], other.layers[0][0])
 
 
 class TestHelix:

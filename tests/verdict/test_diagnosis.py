@@ -104,30 +104,10 @@ class TestWhichVehicleBrakes:
 
 
 class TestTheKind:
-    def test_is_a_stalemate_where_both_brake(self):
-        assert kind(meeting(BRAKES, EASES)) is Kind.STALEMATE
-
     def test_is_a_squeeze_where_neither_does(self):
         assert kind(meeting(KEEP, LEVEL0)) is Kind.SQUEEZE
         assert kind(meeting(KEEP + 0.5, LEVEL0)) is Kind.SQUEEZE
         assert kind(meeting(KEEP, COASTS)) is Kind.SQUEEZE
-
-    def test_says_where_only_the_pov_brakes(self):
-        assert kind(meeting(BRAKES, LEVEL0)) is Kind.POV_BRAKES
-
-    def test_is_a_weak_brake_where_the_vut_begins_in_time(self):
-        trajectory = meeting(KEEP, EASES)
-        assert measure(trajectory).last_avoidable_s > 2.0
-        assert kind(trajectory) is Kind.WEAK_BRAKE
-
-    def test_is_a_late_brake_where_the_vut_begins_without_a_way_out(self):
-        trajectory = meeting(KEEP, phases((7.5, 1.0), (0.5, -4.0)), gap_m=0.0)
-        assert measure(trajectory).last_avoidable_s < 7.5
-        assert kind(trajectory) is Kind.LATE_BRAKE
-
-    def test_is_a_late_brake_where_the_pov_brakes_too(self):
-        late = phases((7.5, 1.0), (0.5, -4.0))
-        assert kind(meeting(BRAKES, late, gap_m=0.0)) is Kind.LATE_BRAKE
 
     def test_is_none_where_the_cars_are_6_m_apart(self):
         assert kind(meeting(BRAKES, COASTS, gap_m=30.0)) is None
