@@ -37,6 +37,14 @@ class TestATypeChecker:
         names = 'import merge_sumo as ms\nms.campagn("design2")\nms.Nonsense\nms.campaign("a")\n'
         assert mypy(tmp_path, names, *options) == ['ms.campagn("design2")', "ms.Nonsense"]
 
+    @pytest.mark.slow
+    def test_sees_the_keywords_of_a_verb(self, tmp_path):
+        wrong = ['ms.campaign("a", case=200)', 'ms.campaign("a", cases="many")']
+        good = ['ms.campaign("a", cases=200)', 'ms.explain(ms.open_run("run"), 3)']
+        source = "\n".join(["import merge_sumo as ms", *good, *wrong, ""])
+        config = str(ROOT / "pyproject.toml")
+        assert mypy(tmp_path, source, "--config-file", config) == wrong
+
 
 def shown_classes() -> set[str]:
     """Return the names of the classes that mkdocstrings describes on the page; all are there."""
