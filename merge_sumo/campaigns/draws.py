@@ -75,13 +75,6 @@ class RepeatingSampler(Sampler):
         super().pend(cases)
         self._sampler.pend(self._pending)
 
-    def skip(self, cases: Iterable[Case]) -> None:
-        """Count cases as proposed whose outcomes will not be told."""
-        skipped = list(cases)
-        super().skip(skipped)
-        self._sampler.skip(skipped)
-        _count(self._drawn, skipped)
-
 
 def _count(drawn: dict[Case, int], cases: Iterable[Case]) -> None:
     """Count the draws up to those of the cases: draws are proposed in their order."""

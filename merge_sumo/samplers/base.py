@@ -107,10 +107,6 @@ class Sampler(ABC):
         cases = (case for case in self._pending if case.level == level)
         return to_unit(cases, level, self.pool.scenario)
 
-    def skip(self, cases: Iterable[Case]) -> None:
-        """Count cases as proposed whose outcomes will not be told."""
-        self._proposed.update(case.level for case in cases)
-
     def observed(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
         if self._observed is None:
