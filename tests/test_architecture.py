@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -107,6 +108,34 @@ def imports_a_variable(source: str) -> bool:
     )
 
 
+def import_graph() -> dict[str, set[str]]:
+    """Return the files of the package that each imports, by their dotted names.
+
+    Every import of a file is one of the package, too, which is no file of a room.
+    """
+    modules = {name: file for file in FILES if (name := module_of(file)) != "merge_sumo"}
+    return {
+        module: {name for name in imports_of(file) if name in modules} - {module}
+        for module, file in modules.items()
+    }
+
+
+def circle_in(graph: dict[str, set[str]]) -> list[str]:
+    """Return files of which each imports the next and the last the first; [] where none do."""
+    done: set[str] = set()
+
+    def search(path: list[str]) -> list[str]:
+        for name in sorted(graph.get(path[-1], ())):
+            if name in path:
+                return path[path.index(name) :]
+            if name not in done and (circle := search([*path, name])):
+                return circle
+        done.add(path[-1])
+        return []
+
+    return next((circle for name in sorted(graph) if (circle := search([name]))), [])
+
+
 def called(node: ast.Call) -> str:
     """Return the last name of what is called."""
     return getattr(node.func, "attr", getattr(node.func, "id", ""))
@@ -124,10 +153,15 @@ def imports_of(file: Path) -> set[str]:
 
 
 def unsafe_calls(source: str) -> list[str]:
-    """Return the calls that would run code that hides in data; ruff sees those of a shell."""
+    """Return the calls that would run a shell, or code that hides in data."""
     found = []
     for node in calls_in(source):
         options = {option.arg: option.value for option in node.keywords}
+        shell = options.get("shell")
+        if shell is not None and not (isinstance(shell, ast.Constant) and shell.value is False):
+            found.append(f"line {node.lineno}: shell")
+        if called(node) in ("eval", "exec", "system", "popen"):
+            found.append(f"line {node.lineno}: {called(node)}")
         if ast.unparse(node.func) in ("np.load", "numpy.load"):
             allowed = options.get("allow_pickle")
             if not (isinstance(allowed, ast.Constant) and allowed.value is False):
@@ -230,6 +264,9 @@ class TestImports:
                 above[module_of(file)] = wrong
         assert above == {}
 
+    def test_of_files_make_no_circle(self):
+        assert circle_in(import_graph()) == []
+
     def test_of_what_a_variable_names_are_known(self):
         files = {module_of(f) for f in FILES if imports_a_variable(f.read_text(encoding="utf-8"))}
         assert files == set(IMPORTED_BY_A_VARIABLE)
@@ -285,9 +322,27 @@ class TestImports:
 @pytest.mark.parametrize(
     "check", [unsafe_calls, entity_calls, open_listeners], ids=lambda check: check.__name__
 )
-def test_no_file_runs_hidden_code_follows_an_entity_or_listens_beyond_loopback(check):
+def test_no_file_runs_a_shell_or_hidden_code_follows_an_entity_or_listens_beyond_loopback(check):
     found = {module_of(file): check(file.read_text(encoding="utf-8")) for file in FILES}
     assert {module: calls for module, calls in found.items() if calls} == {}
+
+
+def set_on_others(source: str, room: str) -> set[str]:
+    """Return the attributes that a source sets on what it imports from another room."""
+    nodes = nodes_of(source)
+    froms = [n for n in nodes if isinstance(n, ast.ImportFrom) and n.module]
+    others = [n for n in froms if layer_of(str(n.module)) not in {room, ""}]
+    names = {alias.asname or alias.name for n in others for alias in n.names}
+    set_here = [n for n in nodes if isinstance(n, ast.Attribute) and isinstance(n.ctx, ast.Store)]
+    return {ast.unparse(n) for n in set_here if ast.unparse(n.value) in names}
+
+
+def test_what_a_room_has_is_whole_before_another_is_imported():
+    added = "from merge_sumo.scenario.scenario import MergeScenario\nMergeScenario.measures = None"
+    assert set_on_others(added, "verdict") == {"MergeScenario.measures"}
+    assert set_on_others(added, "scenario") == set()
+    found = {f: set_on_others(f.read_text("utf-8"), layer_of(module_of(f))) for f in FILES}
+    assert {file: names for file, names in found.items() if names} == {}
 
 
 LINES_OF_A_FILE = 800
@@ -308,6 +363,51 @@ def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
     assert long == {}
 
 
+def test_no_two_classes_have_one_name():
+    files = defaultdict(list)
+    for file in FILES:
+        for node in nodes_of(file.read_text(encoding="utf-8")):
+            if isinstance(node, ast.ClassDef):
+                files[node.name].append(module_of(file))
+    assert {name: known for name, known in files.items() if len(known) > 1} == {}
+
+
+FLAG = re.compile(r"^[^-].*[ (`]--[a-z]")
+"""A flag behind a word: what begins with one is an argument of a program."""
+A_COMMAND = re.compile(r"(?:merge-sumo|pip|netconvert) ")
+
+
+def flags_in_messages(source: str) -> list[str]:
+    """Return the texts of a source that name a flag, but for those that give a command to copy."""
+    prose = {node.value for node in nodes_of(source) if isinstance(node, ast.Expr)}
+    parts = {
+        part for node in nodes_of(source) if isinstance(node, ast.JoinedStr) for part in node.values
+    }
+    texts = [
+        ast.unparse(node)
+        for node in nodes_of(source)
+        if isinstance(node, ast.JoinedStr)
+        or (isinstance(node, ast.Constant) and isinstance(node.value, str) and node not in parts)
+        if node not in prose
+    ]
+    return [
+        text for text in texts if FLAG.search(text.lstrip("f'\" ")) and not A_COMMAND.search(text)
+    ]
+
+
+def test_no_message_below_the_commands_names_a_flag():
+    """A message names a field in backticks; a command turns it into its flag."""
+    others = [
+        file
+        for file in FILES
+        if file.relative_to(PACKAGE).parts[0] not in ("commands", "sumo") and file.parent != PACKAGE
+    ]
+    found = {
+        module_of(file): flags_in_messages(file.read_text(encoding="utf-8")) for file in others
+    }
+    assert {module: texts for module, texts in found.items() if texts} == {}
+
+
 def test_what_removes_files_is_in_one_place():
     removing = {module_of(file) for file in FILES if removals(file.read_text(encoding="utf-8"))}
     assert removing == MAY_REMOVE
@@ -320,6 +420,8 @@ class TestTheChecksThemselves:
             (removals, "shutil.rmtree(p)"),
             (removals, "new.rename(old)"),
             (imports_a_variable, "import_module(name)"),
+            (unsafe_calls, "subprocess.run('ls', shell=True)"),
+            (unsafe_calls, "os.system('ls')"),
             (unsafe_calls, "np.load(path)"),
             (unsafe_calls, "numpy.load(path, allow_pickle=flag)"),
             (entity_calls, "etree.XMLParser(resolve_entities=True)"),
@@ -333,3 +435,35 @@ class TestTheChecksThemselves:
     )
     def test_see_what_no_file_may_do(self, check, source):
         assert check(source)
+
+    @pytest.mark.parametrize(
+        ("check", "source"),
+        [
+            (imports_a_variable, "import_module('libsumo')"),
+            (unsafe_calls, "np.load(p, allow_pickle=False)\nrun(['ls'], shell=False)"),
+            (open_listeners, "s.bind(('127.0.0.1', 0))"),
+            (open_listeners, "HOST: Final = '127.0.0.1'\ns.bind((HOST, port))"),
+        ],
+    )
+    def test_let_the_rest_pass(self, check, source):
+        assert not check(source)
+
+    def test_see_a_circle(self):
+        graph = {"a": {"b"}, "b": {"c", "d"}, "c": set(), "d": {"b"}}
+        assert circle_in(graph) == ["b", "d"]
+        assert circle_in({"a": {"b"}, "b": {"c"}, "c": set()}) == []
+
+
+CLOCKS = frozenset({"monotonic", "perf_counter", "time", "monotonic_ns", "perf_counter_ns"})
+
+
+def test_no_test_compares_a_clock():
+    """A machine may be busy: CPU time is measured, and work is counted (`processes.py`)."""
+    comparing = [
+        f"{path.name}, line {node.lineno}"
+        for path in sorted(Path(__file__).parent.rglob("*.py"))
+        for node in nodes_of(path.read_text(encoding="utf-8"))
+        if isinstance(node, ast.Compare)
+        and CLOCKS & {called(call) for call in ast.walk(node) if isinstance(call, ast.Call)}
+    ]
+    assert comparing == []
