@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from calling import commands, invoke
 
-from merge_sumo import api, cli, config
+import merge_sumo as ms
+from merge_sumo import cli, config
 from merge_sumo.errors import UserError
 
 COMMANDS = commands()
@@ -82,7 +83,7 @@ class TestOptions:
             seen.update(options)
             raise UserError("enough")
 
-        monkeypatch.setattr(api, "truth", truth)
+        monkeypatch.setattr(ms, "truth", truth)
         for words, workers in ((), None), (("--workers", "2"), 2), (("--workers", "auto"), None):
             invoke("truth", "design1", *words)
             assert seen["workers"] == workers
