@@ -345,8 +345,8 @@ def test_what_a_room_has_is_whole_before_another_is_imported():
     assert {file: names for file, names in found.items() if names} == {}
 
 
-LINES_OF_A_FILE = 800
-LINES_OF_A_FUNCTION = 80
+LINES_OF_A_FILE = 700
+LINES_OF_A_FUNCTION = 60  # without its docstring, which has a line for each argument
 
 
 def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
@@ -357,7 +357,8 @@ def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
             long[module_of(file)] = lines
         for node in nodes_of(source):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                lines = (node.end_lineno or 0) - node.lineno + 1
+                docstring = len((ast.get_docstring(node) or "").splitlines())
+                lines = (node.end_lineno or 0) - node.lineno + 1 - docstring
                 if lines > LINES_OF_A_FUNCTION:
                     long[f"{module_of(file)}.{node.name}"] = lines
     assert long == {}
