@@ -63,7 +63,7 @@ def no_case(*_: object, **_options: object) -> None:
 
 @pytest.fixture
 def no_cases(monkeypatch) -> None:
-    monkeypatch.setattr(Workers, "_submit", no_case)
+    monkeypatch.setattr(Workers, "submit", no_case)
     monkeypatch.setattr(Simulator, "__init__", no_case)
 
 

@@ -88,6 +88,7 @@ def place(tmp_path, monkeypatch) -> Path:
     (tmp_path / "my_vut.py").write_text(SOURCE)
     (tmp_path / "client.py").write_text(CLIENT)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_vut", raising=False)  # of another test
     return tmp_path
 
 
