@@ -17,6 +17,7 @@ import merge_sumo as ms
 from merge_sumo import config as c
 from merge_sumo.console import (
     flag_of,
+    names_of_samplers,
     notices_printed,
     print_json,
     print_result,
@@ -25,13 +26,11 @@ from merge_sumo.console import (
     stoppable,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system.folders import dated
 from merge_sumo.system.interrupt import Stopped, stopping_in_order
 from merge_sumo.system.limits import check_limits, exhausted
 from merge_sumo.system.printable import quoted
 from merge_sumo.system.streams import prepare_streams
-from merge_sumo.system.suggestions import either
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection
@@ -111,8 +110,8 @@ class Commands(App):
             more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
             more = Parameter.combine(more, FIELDS.get(name))
             if name == "sampler":  # installed packages add some
-                names = f"Sampler that proposes the cases: {either(SAMPLERS)}."
-                more = Parameter.combine(more, Parameter(help=names))
+                text = f"Sampler that proposes the cases: {names_of_samplers()}."
+                more = Parameter.combine(more, Parameter(help=text))
             for kind, group in GROUPS.items():
                 if argument.keys and name in kind.__annotations__:
                     more = Parameter.combine(more, Parameter(group=group))

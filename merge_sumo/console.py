@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from merge_sumo import config
 from merge_sumo.errors import Notice, UserError, WorkersLostError
+from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.system.interrupt import Interrupt, Stopped
 from merge_sumo.system.printable import printable
+from merge_sumo.system.suggestions import either
 
 if TYPE_CHECKING:
     from merge_sumo.system.result import Result
@@ -69,6 +71,11 @@ def _with_flags(sentence: str) -> str:
         return flag_of(keyword[1]) if keyword[1] in _field_names() else keyword[0]
 
     return re.sub(r"`(\w+)`", in_place, sentence)
+
+
+def names_of_samplers() -> str:
+    """Return the names of the samplers, those of installed packages included, as help has them."""
+    return either(SAMPLERS)
 
 
 def print_json(record: dict[str, Any]) -> None:
