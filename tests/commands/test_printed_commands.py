@@ -89,6 +89,7 @@ def place(tmp_path, monkeypatch) -> Path:
     (tmp_path / "client.py").write_text(CLIENT)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_vut", raising=False)  # of another test
+    monkeypatch.syspath_prepend(tmp_path)  # before folders of other tests
     return tmp_path
 
 
