@@ -18,7 +18,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -40,6 +40,7 @@ TRIED: Final = 8
 CHUNKS_AHEAD: Final = 16
 """Chunks for each worker that `Workers.run` submits before it collects the first."""
 
+LOOK_S: Final = 5.0
 LOST: Final = "lost the connection to the Dask workers; check the cluster"
 
 T = TypeVar("T")
@@ -86,6 +87,7 @@ class Workers(AbstractContextManager["Workers"]):
         gone: tuple[type[Exception], ...] = (CancelledError,),
         here_s: float = 0.0,
         on_close: Callable[[], None] = lambda: None,
+        is_lost: Callable[[], bool] = lambda: False,
     ) -> None:
         """Open an executor.
 
@@ -96,7 +98,9 @@ class Workers(AbstractContextManager["Workers"]):
             gone: what a future raises when no worker can be reached.
             here_s: seconds of work in this process before the executor is opened.
             on_close: called when the executor is closed.
+            is_lost: returns whether the connection to all workers has ended.
         """
+        self._is_lost = is_lost
         self.count = count
         self._open, self._on_close = open_executor, on_close
         self._died, self._gone = died, gone
@@ -156,6 +160,10 @@ class Workers(AbstractContextManager["Workers"]):
                 continue
             self._start(job)
             try:
+                # A cluster that goes away just now may leave a future without an end.
+                while not wait([job.futures[number]], timeout=LOOK_S).done:
+                    if self._is_lost():
+                        raise WorkersLostError(LOST)
                 results += job.futures[number].result()
             except self._died:
                 job.retried |= set(range(len(results), len(results) + len(chunk)))
@@ -327,6 +335,7 @@ def dask_workers(address: str) -> Workers:
             count,
             died=(KilledWorker,),
             gone=(CancelledError, ClosedClientError),
+            is_lost=lambda: client.status in ("closing", "closed"),
             on_close=opened.pop_all().close,
         )
 
