@@ -26,11 +26,11 @@ from merge_sumo.console import (
     stoppable,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.system.folders import dated
-from merge_sumo.system.interrupt import Stopped, stopping_in_order
-from merge_sumo.system.limits import check_limits, exhausted
-from merge_sumo.system.printable import quoted
-from merge_sumo.system.streams import prepare_streams
+from merge_sumo.folders import dated
+from merge_sumo.interrupt import Stopped, stopping_in_order
+from merge_sumo.limits import check_limits, exhausted
+from merge_sumo.printable import quoted
+from merge_sumo.streams import prepare_streams
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
+    from merge_sumo.controllers.in_memory import AnyVut
+    from merge_sumo.metrics.score import Outcome
     from merge_sumo.scenario.imperfection import Actuation, Sensing
     from merge_sumo.scenario.scenario import AnyLevels, Scenario
-    from merge_sumo.verdict.score import Outcome
-    from merge_sumo.vuts.in_memory import AnyVut
 
     class Opened(Protocol):
         """A campaign that was opened: `CampaignRun`."""

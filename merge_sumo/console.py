@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from merge_sumo import config
 from merge_sumo.errors import Notice, UserError, WorkersLostError
+from merge_sumo.interrupt import Interrupt, Stopped
+from merge_sumo.printable import printable
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.system.interrupt import Interrupt, Stopped
-from merge_sumo.system.printable import printable
-from merge_sumo.system.suggestions import either
+from merge_sumo.suggestions import either
 
 if TYPE_CHECKING:
-    from merge_sumo.system.result import Result
+    from merge_sumo.result import Result
 
 FLAGS: Final[Mapping[str, str]] = {
     "deadline_s": "--deadline",

@@ -12,15 +12,15 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import pytest
-from calling import Said
-from campaigning import campaign_settings, run_campaign
-from foreign_nets import corridor_of
+from support.calling import Said
+from support.campaigning import campaign_settings, run_campaign
+from support.foreign_nets import corridor_of
 from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine import evaluate
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.simulation import evaluate
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 

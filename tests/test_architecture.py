@@ -28,9 +28,8 @@ HEAVY_MODULES = {"numpy", "scipy", "sklearn", "libsumo", "torch"}
 
 
 LAYERS = (
-    *("system", "scenario", "coverage", "verdict", "road", "samplers", "sumo", "drivers"),
-    *("vuts", "engine", "twin", "campaigns", "studies", "training", "reports", "api"),
-    "testing",
+    *("scenario", "metrics", "road", "drivers", "sumo", "controllers", "simulation", "samplers"),
+    *("campaigns", "analysis", "training", "reports", "api", "testing"),
 )
 """The rooms, from the ground up: each imports from itself and from those before it."""
 
@@ -38,7 +37,7 @@ LAYERS = (
 def layer_of(module: str) -> str:
     """Return the folder of a module in the package; nothing for a file beside the folders."""
     parts = module.split(".")
-    return parts[1] if len(parts) > 1 and (PACKAGE / parts[1]).is_dir() else ""
+    return parts[1] if len(parts) > 1 and (PACKAGE / parts[1] / "__init__.py").exists() else ""
 
 
 def module_of(file: Path) -> str:
@@ -93,9 +92,9 @@ def imports(source: str, module: str = "merge_sumo.here", *, is_package: bool = 
 IMPORTERS = ("import_module", "__import__")
 IMPORTED_BY_A_VARIABLE = {
     "merge_sumo": "the room of a public name that is asked for",
-    "merge_sumo.system.spawning": "the function that a new process of this package is to run",
-    "merge_sumo.vuts.built_in": "the files of `drivers/`, which may have VUTs",
-    "merge_sumo.vuts.python": "the module of a user's VUT",
+    "merge_sumo.spawning": "the function that a new process of this package is to run",
+    "merge_sumo.controllers.built_in": "the files of `drivers/`, which may have VUTs",
+    "merge_sumo.controllers.python": "the module of a user's VUT",
 }
 """Files that import what a variable names, and what that is."""
 
@@ -170,7 +169,7 @@ def unsafe_calls(source: str) -> list[str]:
 
 
 REMOVERS = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
-MAY_REMOVE = {"merge_sumo.system.folders", "merge_sumo.system.scratch"}
+MAY_REMOVE = {"merge_sumo.folders", "merge_sumo.scratch"}
 """The first asks what is ours; the second removes temporary folders of ours that no process locks;
 the third removes what was unpacked for it."""
 
@@ -235,14 +234,14 @@ def offenders(files: list[Path], modules: set[str]) -> dict[str, set[str]]:
     return {module: names for module, names in found.items() if names}
 
 
-SIMULATING = ("sumo", "drivers", "vuts", "engine", "twin", "training")
+SIMULATING = ("sumo", "drivers", "controllers", "simulation", "training")
 """The rooms that take part in a simulation. Reports read: what they need of these are values."""
 REPORTS_READ = {
     "merge_sumo.drivers.reference.REFERENCES",  # names of the reference drivers
     "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
     "merge_sumo.sumo.replay_folder.write_scenario",
-    "merge_sumo.vuts.process.LOG",  # the end of what a controller printed
-    "merge_sumo.vuts.process.end_of",
+    "merge_sumo.controllers.process.LOG",  # the end of what a controller printed
+    "merge_sumo.controllers.process.end_of",
 }
 
 
@@ -298,11 +297,11 @@ class TestImports:
 
     def test_of_a_command_are_the_api_and_what_prints(self):
         rooms = {layer_of(name) for name in imports_of(PACKAGE / "cli.py")}
-        assert rooms == {"api", "system", ""}
+        assert rooms == {"api", ""}
 
     def test_of_a_vut_are_of_sumo_in_its_own_models_and_its_traci_server_alone(self):
-        of_sumo = ("merge_sumo.vuts.sumo_model", "merge_sumo.vuts.traci")
-        importing = offenders(files_below("vuts"), {"merge_sumo.sumo"})
+        of_sumo = ("merge_sumo.controllers.sumo_model", "merge_sumo.controllers.traci")
+        importing = offenders(files_below("controllers"), {"merge_sumo.sumo"})
         assert importing
         assert {module for module in importing if not module.startswith(of_sumo)} == set()
 
@@ -339,7 +338,7 @@ def set_on_others(source: str, room: str) -> set[str]:
 
 def test_what_a_room_has_is_whole_before_another_is_imported():
     added = "from merge_sumo.scenario.scenario import MergeScenario\nMergeScenario.measures = None"
-    assert set_on_others(added, "verdict") == {"MergeScenario.measures"}
+    assert set_on_others(added, "metrics") == {"MergeScenario.measures"}
     assert set_on_others(added, "scenario") == set()
     found = {f: set_on_others(f.read_text("utf-8"), layer_of(module_of(f))) for f in FILES}
     assert {file: names for file, names in found.items() if names} == {}

@@ -33,15 +33,15 @@ from merge_sumo.campaigns.campaign import FIRST_BATCH, twin_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.coverage.fmc import radius_for
-from merge_sumo.engine.evaluate import evaluate
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
+from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
-from merge_sumo.twin.pair import TwinPair
-from merge_sumo.verdict.episode import Episode
+from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.plan import SimulationPlan
 
 sys.path.append(str(Path(__file__).parent / "benchmark"))
 from oracle import greedy_cover

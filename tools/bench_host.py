@@ -26,19 +26,19 @@ import numpy as np
 import traci
 from bench_record import add_record_option, append_record
 
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.povs import PovLibrary, Povs
-from merge_sumo.engine.rollout import Rollout
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.simulation.povs import PovLibrary, Povs
+from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_program
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
 from merge_sumo.sumo.world import MAX_SPEED_MPS, World
-from merge_sumo.vuts.factory import VutFactory
 
 KS = (1, 8, 32, 64)
 STEPS = 80

@@ -26,18 +26,18 @@ from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
-from merge_sumo.engine.kinematic_world import EquationWorld
-from merge_sumo.engine.rollout import Rollout
+from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Bounds, as_merge
 from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.check import returns_of
 from merge_sumo.training.game import Game
 from merge_sumo.training.reward import Reward
-from merge_sumo.verdict.merge import brake_after_mps2
 
 
 class MergesAt(Level0Vut):

@@ -17,13 +17,8 @@ from pathlib import Path
 import numpy as np
 from bench_record import add_record_option, append_record
 
-from merge_sumo.api import truth as truth_of
-from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.exposure import read_distribution
-from merge_sumo.studies.probability import (
+from merge_sumo.analysis.exposure import read_distribution
+from merge_sumo.analysis.probability import (
     STREAM,
     Counted,
     cells_of,
@@ -31,8 +26,13 @@ from merge_sumo.studies.probability import (
     estimate,
     expected_cells,
 )
-from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.verdict.chance import clopper_pearson
+from merge_sumo.analysis.run_study import RunStudy
+from merge_sumo.api import truth as truth_of
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.metrics.chance import clopper_pearson
+from merge_sumo.scenario.scenario import US23
 
 SEEDS = range(1000, 1200)
 CAMPAIGN = CampaignSettings(vut="design1", levels=(0,), cases=400, seed=5, scenario=US23)

@@ -38,21 +38,21 @@ from typing import Any
 import numpy as np
 from bench_record import add_record_option, append_record
 
+from merge_sumo.analysis.truth import DENSE_CASES, Truth, ground_truth
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.coverage.fmc import RADIUS, fmc
-from merge_sumo.engine.evaluate import simulate
-from merge_sumo.engine.plan import Engine, SimulationPlan
+from merge_sumo.metrics.fmc import RADIUS, fmc
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers import gpr
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.samplers.twin import Twin
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.studies.truth import DENSE_CASES, Truth, ground_truth
-from merge_sumo.twin.twin import Twin
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Measures, Outcome
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.plan import Engine, SimulationPlan
 
 sys.path.append(str(Path(__file__).parent / "benchmark"))
 from oracle import greedy_cover

@@ -46,23 +46,23 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from threadpoolctl import threadpool_limits
 
+from merge_sumo.analysis.truth import _margin_of, ground_truth
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.loop import SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.coverage.fmc import fmc, regions
-from merge_sumo.engine.evaluate import evaluate, simulate
-from merge_sumo.engine.kinematic_simulator import CHUNK
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.fmc import fmc, regions
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.truth import _margin_of, ground_truth
-from merge_sumo.system.workers import Job, LocalProcesses, Workers
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome
+from merge_sumo.simulation.evaluate import evaluate, simulate
+from merge_sumo.simulation.kinematic_simulator import CHUNK
+from merge_sumo.workers import Job, LocalProcesses, Workers
 
 VUT = "design1"
 ROUNDS = 5

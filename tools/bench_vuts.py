@@ -34,13 +34,13 @@ from bench_record import add_record_option, append_record
 from build_fmu import build_fmu
 from export_policy import export_onnx
 
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
-from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.factory import VutFactory
 
 STEPS = 80
 """Of an episode."""

@@ -14,8 +14,8 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+from merge_sumo.folders import check_new_file, replace_own
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.system.folders import check_new_file, replace_own
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
 

@@ -30,12 +30,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import RADIUS, fmc, regions
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.gap_acceptance import GapAcceptanceVut, GapDesign
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver, policies_of
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
+from merge_sumo.metrics.fmc import RADIUS, fmc, regions
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, MergeCase, from_unit, to_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario

@@ -31,16 +31,16 @@ import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.engine.evaluate import evaluate
-from merge_sumo.engine.kinematic_world import EquationWorld
-from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.simulator import Simulator, corridors_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.simulator import Simulator, corridors_of
 from merge_sumo.sumo.world import MAX_SPEED_MPS
 
 AGREED: Final = 1e-6

@@ -54,8 +54,8 @@ def cli_page() -> str:
 
 def measures_page() -> str:
     """Return the measures of an episode as a table."""
-    from merge_sumo.verdict.measures import MEASURES
-    from merge_sumo.verdict.score import Measures
+    from merge_sumo.metrics.measures import MEASURES
+    from merge_sumo.metrics.score import Measures
 
     rows = ""
     for name, measure in MEASURES.items():
@@ -77,7 +77,7 @@ WRITTEN: dict[str, Callable[[], str]] = {
 
 def vut_kinds_table() -> str:
     """Return the registered kinds of VUT as a table."""
-    from merge_sumo.vuts.registry import KINDS
+    from merge_sumo.controllers.registry import KINDS
 
     kinds = [kind for kind in KINDS.values() if kind.form]
     rows = [f"| `{kind.form}` | {kind.what} | `{kind.example}` |" for kind in kinds]
@@ -94,7 +94,7 @@ def samplers_table() -> str:
 
 def criteria_table() -> str:
     """Return the registered criteria as a table."""
-    from merge_sumo.verdict.criteria import CRITERIA
+    from merge_sumo.metrics.criteria import CRITERIA
 
     rows = [f"| `{name}` | `{one.condition}` | {one.about} |" for name, one in CRITERIA.items()]
     return "\n".join(("| `--fail-when` | condition | failure |", "|---|---|---|", *rows))

@@ -16,12 +16,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
+from merge_sumo.controllers.onnx import PERIOD, STATE
 from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
 from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest, scenario_of
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new_file, write_new
 from merge_sumo.scenario.scenario import DT_S, Scenario
-from merge_sumo.system.folders import check_new_file, write_new
-from merge_sumo.vuts.onnx import PERIOD, STATE
 
 OPSET: Final = 17
 IR_VERSION: Final = 8

@@ -34,7 +34,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.settings import settings_of as settings_in
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.system.workers import open_workers
+from merge_sumo.workers import open_workers
 
 PLACES = ("moment", "sync", "torn", "worker")
 SAMPLERS = ("gpr", "coverage", "uniform")

@@ -16,9 +16,9 @@ from pathlib import Path
 
 from lxml import etree
 
+from merge_sumo.folders import check_new_file
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.replay_folder import CONFIG, VIEW
-from merge_sumo.system.folders import check_new_file
 
 
 def take(scenario: Path, time_s: float, picture: Path) -> None:

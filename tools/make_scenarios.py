@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.simulator import Simulator
+from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
@@ -24,8 +24,8 @@ from merge_sumo.scenario.case import Case, MergeCase
 from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.verdict.score import Outcome, measure
 
 STYLES: dict[str, dict[str, Any]] = {
     "POV": {"color": COLOURS["pov"]},

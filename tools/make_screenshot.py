@@ -17,8 +17,8 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 from merge_sumo.campaigns.run import Run
+from merge_sumo.folders import check_new_file
 from merge_sumo.reports.report import write_report
-from merge_sumo.system.folders import check_new_file
 
 WIDTH_PX, HEIGHT_PX = 1280, 1880
 """Of the window, at whose foot the case is that was clicked last."""

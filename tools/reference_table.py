@@ -15,15 +15,15 @@ import statistics
 import tempfile
 from pathlib import Path
 
+from merge_sumo.analysis.counterfactuals import CAREFUL, TAKES_OVER, avoidance
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.metrics.summary import summarise
 from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.studies.counterfactuals import CAREFUL, TAKES_OVER, avoidance
-from merge_sumo.system.workers import open_workers
-from merge_sumo.verdict.summary import summarise
+from merge_sumo.workers import open_workers
 
 MODELS = ("Krauss", "IDM", "EIDM", "ACC", "CACC")
 VUTS = (

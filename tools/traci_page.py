@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from merge_sumo.controllers.traci.session import QUESTIONS, Effect, effect_of, is_answered
 from merge_sumo.sumo.traci_names import functions
-from merge_sumo.vuts.traci.session import QUESTIONS, Effect, effect_of, is_answered
 
 HEADINGS = ("Answered", "Not answered", *(effect.value for effect in Effect))
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"

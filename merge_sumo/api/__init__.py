@@ -21,6 +21,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from merge_sumo import config as c
+from merge_sumo.analysis import (
+    comparison,
+    explanation,
+    own_scenario,
+    reproduction,
+    sampler_study,
+    vut_check,
+)
+from merge_sumo.analysis import probability as estimates
+from merge_sumo.analysis import rerun as rerunning
+from merge_sumo.analysis import stress as ladder
+from merge_sumo.analysis.cases_file import CasesFile
+from merge_sumo.analysis.comparison import Comparison
+from merge_sumo.analysis.explanation import EXPLANATIONS, ExplanationResult
+from merge_sumo.analysis.probability import PROBABILITY, ProbabilityResult
+from merge_sumo.analysis.reproduction import Reproduction
+from merge_sumo.analysis.run_study import notice_changes
+from merge_sumo.analysis.sampler_study import SamplerStudy
+from merge_sumo.analysis.stress import STRESS, StressResult
+from merge_sumo.analysis.truth import TruthResult
+from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.api.campaigns import notice_povs, run_and_report
 from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.api.settings import (
@@ -39,46 +60,13 @@ from merge_sumo.campaigns.one_case import run_one
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.controllers.controller import Car, Seen
+from merge_sumo.controllers.in_memory import AnyVut, drivers_of
+from merge_sumo.controllers.parameters import Range
+from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
-from merge_sumo.engine.plan import Engine
-from merge_sumo.engine.povs import parse_levels, policies_folder
 from merge_sumo.errors import UserError, notice
-from merge_sumo.reports import exports, figures
-from merge_sumo.reports.cases_toml import with_file
-from merge_sumo.reports.comparison_page import PAGE, comparison_page
-from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
-from merge_sumo.reports.progress import Bars
-from merge_sumo.reports.reproduction_page import write_reproduction
-from merge_sumo.road.merge import road_for
-from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.coordinates import outside_of_the_pool
-from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.studies import (
-    comparison,
-    explanation,
-    own_scenario,
-    reproduction,
-    sampler_study,
-    vut_check,
-)
-from merge_sumo.studies import probability as estimates
-from merge_sumo.studies import rerun as rerunning
-from merge_sumo.studies import stress as ladder
-from merge_sumo.studies.cases_file import CasesFile
-from merge_sumo.studies.comparison import Comparison
-from merge_sumo.studies.explanation import EXPLANATIONS, ExplanationResult
-from merge_sumo.studies.probability import PROBABILITY, ProbabilityResult
-from merge_sumo.studies.reproduction import Reproduction
-from merge_sumo.studies.run_study import notice_changes
-from merge_sumo.studies.sampler_study import SamplerStudy
-from merge_sumo.studies.stress import STRESS, StressResult
-from merge_sumo.studies.truth import TruthResult
-from merge_sumo.studies.vut_check import VutCheck
-from merge_sumo.sumo import replay as replayer
-from merge_sumo.sumo.binding import scratch_folder
-from merge_sumo.sumo.replay import Replay, check_display
-from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.system.folders import (
+from merge_sumo.folders import (
     check_new,
     check_new_file,
     check_own,
@@ -86,15 +74,27 @@ from merge_sumo.system.folders import (
     make_folder,
     write_new,
 )
-from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.records import check_toml_size, to_plain
-from merge_sumo.system.result import Shown
-from merge_sumo.system.workers import open_workers
-from merge_sumo.verdict.conflict import check_from
-from merge_sumo.vuts.controller import Car, Seen
-from merge_sumo.vuts.in_memory import AnyVut, drivers_of
-from merge_sumo.vuts.parameters import Range
-from merge_sumo.vuts.python import SeenBatch
+from merge_sumo.metrics.conflict import check_from
+from merge_sumo.printable import printable, quoted
+from merge_sumo.records import check_toml_size, to_plain
+from merge_sumo.reports import exports, figures
+from merge_sumo.reports.cases_toml import with_file
+from merge_sumo.reports.comparison_page import PAGE, comparison_page
+from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
+from merge_sumo.reports.progress import Bars
+from merge_sumo.reports.reproduction_page import write_reproduction
+from merge_sumo.result import Shown
+from merge_sumo.road.merge import road_for
+from merge_sumo.road.scenario_file import SUFFIX
+from merge_sumo.scenario.coordinates import outside_of_the_pool
+from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.simulation.plan import Engine
+from merge_sumo.simulation.povs import parse_levels, policies_folder
+from merge_sumo.sumo import replay as replayer
+from merge_sumo.sumo.binding import scratch_folder
+from merge_sumo.sumo.replay import Replay, check_display
+from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
+from merge_sumo.workers import open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.library import PolicyChecks

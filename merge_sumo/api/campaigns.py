@@ -8,14 +8,21 @@ from pathlib import Path
 from time import perf_counter
 
 from merge_sumo import config as c
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance
+from merge_sumo.analysis.explanation import note_explanation
+from merge_sumo.analysis.share import note_shares
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.settings import opened
 from merge_sumo.campaigns.again import call_again
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import WorkersLostError, notice
+from merge_sumo.folders import check_new, link_latest
+from merge_sumo.interrupt import Stopped
+from merge_sumo.metrics.campaign_verdict import parse_gates
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import quoted
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars
 from merge_sumo.reports.report import RunningReport, check_report, write_report
@@ -29,15 +36,8 @@ from merge_sumo.scenario.scenario import (
     lane_of,
     level_name,
 )
-from merge_sumo.studies.counterfactuals import AVOIDANCE, avoidance
-from merge_sumo.studies.explanation import note_explanation
-from merge_sumo.studies.share import note_shares
-from merge_sumo.system.folders import check_new, link_latest
-from merge_sumo.system.interrupt import Stopped
-from merge_sumo.system.printable import quoted
-from merge_sumo.system.workers import Workers, workers_or_here
-from merge_sumo.verdict.campaign_verdict import parse_gates
-from merge_sumo.verdict.score import Outcome
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import Workers, workers_or_here
 
 
 def run_and_report(

@@ -8,24 +8,13 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.analysis.cases_file import CasesFile
+from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.config import AnyRun
-from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import Fact, facts_of, headline
-from merge_sumo.reports.motion import lines_of
-from merge_sumo.reports.text import comparison_headline, transitions
-from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.studies.cases_file import CasesFile
-from merge_sumo.studies.comparison import Change, Comparison, compare_against
-from merge_sumo.system.printable import printable
-from merge_sumo.system.records import to_plain
-from merge_sumo.system.result import Result
-from merge_sumo.verdict.campaign_verdict import (
+from merge_sumo.metrics.campaign_verdict import (
     MESSAGE_CHARACTERS,
     GateResult,
     Verdict,
@@ -33,11 +22,22 @@ from merge_sumo.verdict.campaign_verdict import (
     parse_gates,
     shortened,
 )
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.plausibility import doubts, in_vain, mostly_clipped
-from merge_sumo.verdict.score import Measures, Outcome
-from merge_sumo.verdict.summary import Summary, summarise
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.plausibility import doubts, in_vain, mostly_clipped
+from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.metrics.summary import Summary, summarise
+from merge_sumo.printable import printable
+from merge_sumo.records import to_plain
+from merge_sumo.reports.comparison_page import AGAINST_PAGE
+from merge_sumo.reports.facts import Fact, facts_of, headline
+from merge_sumo.reports.motion import lines_of
+from merge_sumo.reports.text import comparison_headline, transitions
+from merge_sumo.result import Result
+from merge_sumo.road.scenario_file import SUFFIX
+from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End, Trajectory
 
 MOST_ROWS: Final = 20
 """Rows that a notebook shows of a table."""

@@ -9,24 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo import config as c
+from merge_sumo.analysis.run_study import RunStudy
+from merge_sumo.analysis.sampler_study import Study
 from merge_sumo.api.results import recorded
 from merge_sumo.campaigns.one_case import ONE, case_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.engine.plan import Engine, SimulationPlan
-from merge_sumo.engine.povs import one_level, parse_levels, policies_folder
+from merge_sumo.controllers.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.errors import UserError
 from merge_sumo.reports.progress import Bars, Counter
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.studies.run_study import RunStudy
-from merge_sumo.studies.sampler_study import Study
-from merge_sumo.system.scratch import ScratchFolder
-from merge_sumo.system.workers import HERE_S, Workers, open_workers
-from merge_sumo.vuts.in_memory import AnyVut, drivers_of, is_here
+from merge_sumo.scratch import ScratchFolder
+from merge_sumo.simulation.plan import Engine, SimulationPlan
+from merge_sumo.simulation.povs import one_level, parse_levels, policies_folder
+from merge_sumo.workers import HERE_S, Workers, open_workers
 
 
 def opened(where: c.Execution, plan: SimulationPlan, *, at_once: bool = False) -> Workers:

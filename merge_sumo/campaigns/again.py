@@ -14,13 +14,13 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.controllers.base import HERE, PYTHON
+from merge_sumo.controllers.here import object_of
+from merge_sumo.controllers.python import is_code
+from merge_sumo.controllers.spec import names_code, parse
+from merge_sumo.printable import quoted
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.system.printable import quoted
-from merge_sumo.vuts.base import HERE, PYTHON
-from merge_sumo.vuts.here import object_of
-from merge_sumo.vuts.python import is_code
-from merge_sumo.vuts.spec import names_code, parse
 
 CONTROLLERS: Final = ("vut", "pov", "against")
 OPTIONS: Final = {"run": ("run", "case"), "resume": ("campaign", "resume")}

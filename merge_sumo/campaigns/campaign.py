@@ -14,23 +14,23 @@ from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.repeats import repeat
 from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failures
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
-from merge_sumo.engine.evaluate import open_simulators
-from merge_sumo.engine.plan import SimulationPlan, differences
+from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
+from merge_sumo.folders import TakenError, check_new, check_own
+from merge_sumo.hashing import files_now
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.samplers.twin import Twin
+from merge_sumo.simulation.evaluate import open_simulators
+from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.system.folders import TakenError, check_new, check_own
-from merge_sumo.system.hashing import files_now
-from merge_sumo.system.workers import Workers, workers_or_here
-from merge_sumo.twin.pair import TwinPair
-from merge_sumo.twin.twin import Twin
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.process import LOG
+from merge_sumo.workers import Workers, workers_or_here
 
 EXPORTED_FAILURES: Final = 10
 SCENARIOS: Final = "scenarios"

@@ -11,10 +11,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Outcome
 
 
 class RepeatingSampler(Sampler):

@@ -29,11 +29,11 @@ from merge_sumo.campaigns.run import (
     batch_file,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_own, make_place, replace_own, sync_folder, write_folder
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.records import to_json
 from merge_sumo.scenario.signals import to_record
-from merge_sumo.system.folders import check_own, make_place, replace_own, sync_folder, write_folder
-from merge_sumo.system.records import to_json
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome
 
 MOST_SYNCS: Final = 8
 """Files that are synced at the same time."""

@@ -21,16 +21,16 @@ from functools import partial
 from itertools import groupby
 from typing import Final
 
-from merge_sumo.engine.evaluate import lost, simulate
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.regression import regression
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.system.workers import MAX_CHUNK, Job, Workers
-from merge_sumo.twin.pair import TwinPair
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.regression import regression
-from merge_sumo.verdict.score import Outcome
+from merge_sumo.simulation.evaluate import lost, simulate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import MAX_CHUNK, Job, Workers
 
 GROUPS: Final = 3
 """Groups in flight: the sampler is asked for one while the cases of others keep workers busy."""

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from merge_sumo.config import COORDINATES
-from merge_sumo.engine.evaluate import simulate
-from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.episode import Episode
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario, level_name
-from merge_sumo.system.workers import open_workers
-from merge_sumo.verdict.episode import Episode
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import open_workers
 
 ONE: Final[dict[str, Any]] = {
     "cases": 1,

@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Final
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import Povs, own_pov, policies_folder
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.road.merge import road_for
-from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.povs import Povs, own_pov, policies_folder
 
 DEBUG_DEADLINE_S: Final = 86_400.0
 """A person at a breakpoint takes their time."""

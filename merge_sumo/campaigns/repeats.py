@@ -23,17 +23,17 @@ import numpy as np
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import close_simulator, evaluate, simulate
-from merge_sumo.engine.plan import SimulationPlan
+from merge_sumo.controllers.spec import is_built_in, waits_for_client
+from merge_sumo.folders import replace_own
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.records import Record, replaced, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.system.folders import replace_own
-from merge_sumo.system.records import Record, replaced, to_json
-from merge_sumo.system.workers import Workers
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.spec import is_built_in, waits_for_client
+from merge_sumo.simulation.evaluate import close_simulator, evaluate, simulate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import Workers
 
 REPEATS: Final = "repeats.jsonl"
 MOST: Final = 20

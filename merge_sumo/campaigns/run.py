@@ -21,23 +21,23 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from merge_sumo.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search
-from merge_sumo.coverage.fmc import regions
 from merge_sumo.errors import UserError
+from merge_sumo.folders import regular
+from merge_sumo.metrics.chance import one_per_case
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.fmc import regions
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import counted, printable
+from merge_sumo.records import Record, convert, decode, read_indexed
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
-from merge_sumo.system.arrays import UNREADABLE_NPZ, read_arrays
-from merge_sumo.system.folders import regular
-from merge_sumo.system.printable import counted, printable
-from merge_sumo.system.records import Record, convert, decode, read_indexed
-from merge_sumo.verdict.chance import one_per_case
-from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome
 
 T = TypeVar("T", bound=Record)
 

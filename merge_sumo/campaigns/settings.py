@@ -12,10 +12,15 @@ from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search, changed
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.spec import is_built_in, names_code, waits_for_client
 from merge_sumo.drivers.policies import policies_in, policies_name
-from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import POLICIES
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.chance import check_tolerated
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import printable
+from merge_sumo.records import RecordError, check_fields, to_plain
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.prediction_skill import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -28,13 +33,8 @@ from merge_sumo.scenario.scenario import (
     Scenario,
     level_name,
 )
-from merge_sumo.system.printable import printable
-from merge_sumo.system.records import RecordError, check_fields, to_plain
-from merge_sumo.verdict.chance import check_tolerated
-from merge_sumo.verdict.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.spec import is_built_in, names_code, waits_for_client
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.povs import POLICIES
 
 
 @dataclass(frozen=True, kw_only=True)

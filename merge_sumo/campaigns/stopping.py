@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from merge_sumo.coverage.fmc import fmc
+from merge_sumo.metrics.chance import failing_cases
+from merge_sumo.metrics.fmc import fmc
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.case import to_unit
-from merge_sumo.verdict.chance import failing_cases
-from merge_sumo.verdict.score import Outcome
 
 WINDOW: Final = 100
 """Cases of all levels together that are looked at."""

@@ -12,20 +12,20 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
+from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
+from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
 from merge_sumo.campaigns.run import Run, spread_failures
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.folders import check_ending, make_place, write_new
+from merge_sumo.metrics.campaign_verdict import judge
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.chance import one_per_case
+from merge_sumo.metrics.criterion import condition_of
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import printable
+from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
-from merge_sumo.studies.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
-from merge_sumo.studies.comparison import GOT_WORSE, Comparison, passes, short
-from merge_sumo.system.folders import check_ending, make_place, write_new
-from merge_sumo.system.printable import printable
-from merge_sumo.system.records import check_toml_size, toml_value
-from merge_sumo.verdict.campaign_verdict import judge
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.chance import one_per_case
-from merge_sumo.verdict.criterion import condition_of
-from merge_sumo.verdict.score import Outcome
 
 MOST: Final = 40
 """Cases of a file for which nobody names any."""

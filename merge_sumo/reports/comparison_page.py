@@ -9,16 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.campaigns.run import AGAINST, Run
+from merge_sumo.folders import replace_own
+from merge_sumo.metrics.campaign_verdict import judge
+from merge_sumo.metrics.cause import cause
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
-from merge_sumo.studies.comparison import Change, Comparison, Step, compare_against, cut
-from merge_sumo.system.folders import replace_own
-from merge_sumo.verdict.campaign_verdict import judge
-from merge_sumo.verdict.cause import cause
 
 SHOWN: Final = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""

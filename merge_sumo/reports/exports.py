@@ -20,15 +20,15 @@ import numpy as np
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new, check_place, make_place, new_file, write_folder
+from merge_sumo.metrics.bodies import WIDTH_M
+from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.reports.cases_toml import write_cases
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.system.folders import check_new, check_place, make_place, new_file, write_folder
-from merge_sumo.verdict.bodies import WIDTH_M
-from merge_sumo.verdict.merge import merged_rows
 
 EXPORTS: Final = "exports"
 TABLE: Final = "trajectories"

@@ -12,21 +12,21 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Final
 
+from merge_sumo.analysis.counterfactuals import AVOIDANCE
+from merge_sumo.analysis.probability import PROBABILITY
+from merge_sumo.analysis.share import SHARES
+from merge_sumo.analysis.stress import STRESS
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
-from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.metrics.campaign_verdict import Verdict
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.chance import by_case, undecided
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.severity import Severity
+from merge_sumo.metrics.summary import LevelSummary, Summary
+from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import lane_of, level_name
-from merge_sumo.studies.counterfactuals import AVOIDANCE
-from merge_sumo.studies.probability import PROBABILITY
-from merge_sumo.studies.share import SHARES
-from merge_sumo.studies.stress import STRESS
-from merge_sumo.system.printable import printable
-from merge_sumo.verdict.campaign_verdict import Verdict
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.chance import by_case, undecided
-from merge_sumo.verdict.severity import Severity
-from merge_sumo.verdict.summary import LevelSummary, Summary
 
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import RADIUS
+from merge_sumo.analysis.reproduction import LevelBatches, Panel, PredictedMargins
+from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_new_file, write_new
+from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import OWN, US23, level_name
-from merge_sumo.studies.reproduction import LevelBatches, Panel, PredictedMargins
-from merge_sumo.studies.sampler_study import SamplerStudy
-from merge_sumo.system.folders import check_new_file, write_new
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -16,19 +16,19 @@ from typing import Final
 
 from lxml import etree
 
+from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
+from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_ending, check_new, check_new_file, write_new
+from merge_sumo.metrics.campaign_verdict import GateResult, Verdict
+from merge_sumo.metrics.chance import by_case, undecided
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.text import change_in_words, step_headline
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
-from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.system.folders import check_ending, check_new, check_new_file, write_new
-from merge_sumo.system.printable import printable
-from merge_sumo.verdict.campaign_verdict import GateResult, Verdict
-from merge_sumo.verdict.chance import by_case, undecided
-from merge_sumo.verdict.score import Outcome
 
 CLASS: Final = "merge-sumo"
 FAILED: Final = "failed"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from merge_sumo.metrics.cause import cause, met
+from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.score import Outcome, measures_in
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.verdict.cause import cause, met
-from merge_sumo.verdict.conflict import Conflict
-from merge_sumo.verdict.score import Outcome, measures_in
 
 LABEL: Final = 31
 """Characters of the name of a measure; more where one is longer."""

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from markupsafe import Markup
 
+from merge_sumo.printable import counted, printable, quoted
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.system.printable import counted, printable, quoted
 
 if TYPE_CHECKING:
     from jinja2 import Environment

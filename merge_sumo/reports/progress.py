@@ -13,13 +13,13 @@ from typing import Final, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
+from merge_sumo.metrics.campaign_verdict import judge
+from merge_sumo.metrics.chance import one_per_case
+from merge_sumo.metrics.diagnosis import failure_boxes
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.system.printable import counted, printable
-from merge_sumo.verdict.campaign_verdict import judge
-from merge_sumo.verdict.chance import one_per_case
-from merge_sumo.verdict.diagnosis import failure_boxes
-from merge_sumo.verdict.score import Outcome
 
 PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""

@@ -21,14 +21,14 @@ from markupsafe import Markup
 
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_ours, replace_own
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import Summary
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.report_sections import sections_of, shared
-from merge_sumo.system.folders import check_ours, replace_own
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.verdict.summary import Summary
 
 REPORT: Final = "report.html"
 """By this a report is known as ours, and may be replaced by a newer one."""

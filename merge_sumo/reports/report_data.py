@@ -9,7 +9,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import fmc, radius_for
+from merge_sumo.analysis.counterfactuals import causes
+from merge_sumo.analysis.surface import Grid, Surface, nodes
+from merge_sumo.metrics.campaign_verdict import shortened
+from merge_sumo.metrics.chance import RunsOfCase
+from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.measures import Measure
+from merge_sumo.metrics.score import Outcome, measures_in
+from merge_sumo.metrics.severity import Severity
+from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import changes, name_and_unit
@@ -27,15 +36,6 @@ from merge_sumo.scenario.scenario import (
 )
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.studies.surface import Grid, Surface, nodes
-from merge_sumo.system.records import to_plain
-from merge_sumo.verdict.campaign_verdict import shortened
-from merge_sumo.verdict.chance import RunsOfCase
-from merge_sumo.verdict.conflict import Conflict
-from merge_sumo.verdict.measures import Measure
-from merge_sumo.verdict.score import Outcome, measures_in
-from merge_sumo.verdict.severity import Severity
 
 NEAR_SHARE: Final = 1.0 / 16.0
 STEPS: Final = 20

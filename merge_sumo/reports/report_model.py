@@ -6,27 +6,27 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+from merge_sumo.analysis.comparison import compare_against
+from merge_sumo.analysis.counterfactuals import AVOIDANCE
+from merge_sumo.analysis.explanation import EXPLANATIONS
+from merge_sumo.analysis.stress import STRESS
+from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.again import again, call, command
 from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.campaign_verdict import Trouble, judge
+from merge_sumo.metrics.chance import by_case, undecided
+from merge_sumo.metrics.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.plausibility import doubts, mostly_clipped
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import Summary, summarise
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.scenario.coordinates import Coordinate, coordinates
 from merge_sumo.scenario.scenario import LEVELS
-from merge_sumo.studies.comparison import compare_against
-from merge_sumo.studies.counterfactuals import AVOIDANCE
-from merge_sumo.studies.explanation import EXPLANATIONS
-from merge_sumo.studies.stress import STRESS
-from merge_sumo.studies.surface import Surface, learn_surface
-from merge_sumo.verdict.campaign_verdict import Trouble, judge
-from merge_sumo.verdict.chance import by_case, undecided
-from merge_sumo.verdict.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.verdict.plausibility import doubts, mostly_clipped
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.verdict.summary import Summary, summarise
-from merge_sumo.vuts.process import LOG, end_of
 
 LISTED: Final = 10
 """Cases in a list, and messages of errors and timeouts."""

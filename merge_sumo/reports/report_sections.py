@@ -6,16 +6,16 @@ from typing import Any, Final
 
 from markupsafe import Markup
 
-from merge_sumo.coverage.fmc import radius_for
 from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.metrics.diagnosis import BRAKED_MPS
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.severity import meanings
 from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_data import pairs_of
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import comparison_headline, robustness
 from merge_sumo.scenario.scenario import MergeScenario, lane_of
-from merge_sumo.verdict.diagnosis import BRAKED_MPS
-from merge_sumo.verdict.severity import meanings
 
 
 def shared(model: ReportModel) -> dict[str, Any]:

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from merge_sumo.analysis.reproduction import Reproduction
+from merge_sumo.folders import write_new
+from merge_sumo.records import to_json
 from merge_sumo.reports import figures
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.text import table_ii
-from merge_sumo.studies.reproduction import Reproduction
-from merge_sumo.system.folders import write_new
-from merge_sumo.system.records import to_json
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,12 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from merge_sumo.campaigns.again import again, command
-from merge_sumo.coverage.fmc import fmc, radius_for
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.coordinates import coordinates, described
-from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.comparison import (
+from merge_sumo.analysis.comparison import (
     LISTED,
     Change,
     ComparedCase,
@@ -21,25 +16,30 @@ from merge_sumo.studies.comparison import (
     passes,
     short,
 )
-from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.studies.explanation import (
+from merge_sumo.analysis.counterfactuals import causes
+from merge_sumo.analysis.explanation import (
     PSI,
     Axis,
     Explanation,
     ExplanationResult,
 )
-from merge_sumo.studies.probability import Estimate, PerMerge, ProbabilityResult
-from merge_sumo.studies.reproduction import ADAPTIVE, SAMPLERS, Reproduction
-from merge_sumo.studies.sampler_study import SamplerStudy, SamplerSummary, Spread
-from merge_sumo.studies.stress import StressResult
-from merge_sumo.studies.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
-from merge_sumo.studies.vut_check import VutCheck
-from merge_sumo.system.printable import counted
-from merge_sumo.system.result import lines_of
-from merge_sumo.system.suggestions import either
-from merge_sumo.verdict.campaign_verdict import judge
-from merge_sumo.verdict.criterion import Criterion
-from merge_sumo.verdict.plausibility import behind
+from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
+from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
+from merge_sumo.analysis.sampler_study import SamplerStudy, SamplerSummary, Spread
+from merge_sumo.analysis.stress import StressResult
+from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
+from merge_sumo.analysis.vut_check import VutCheck
+from merge_sumo.campaigns.again import again, command
+from merge_sumo.metrics.campaign_verdict import judge
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.plausibility import behind
+from merge_sumo.printable import counted
+from merge_sumo.result import lines_of
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.scenario import level_name
+from merge_sumo.suggestions import either
 
 FRAGILE: Final = 10
 """Failures that are not robust that a sentence names."""

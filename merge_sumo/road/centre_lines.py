@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.verdict.bodies import CentreLines
 
 _found: Final[dict[tuple[object, ...], CentreLines]] = {}
 

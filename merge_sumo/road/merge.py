@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from merge_sumo.resources import resource
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
-from merge_sumo.system.resources import resource
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
 RAMP_EDGES: Final = ("ramp", "main_out")

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
+from merge_sumo.metrics.chance import RunsOfCase, by_case
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
-from merge_sumo.verdict.chance import RunsOfCase, by_case
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Outcome
 
 if TYPE_CHECKING:
     from merge_sumo.samplers.prediction_skill import Predictor

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.samplers.belief import is_far
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.verdict.prediction import Prediction
 
 SAME: Final = 1e-6
 """Distance below which a case is a point of the sequence: rounding is below 1e-12."""

@@ -31,11 +31,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit
 
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.prediction import NO_GAP
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.surrogate import Branches, Margin, most_telling
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.verdict.prediction import NO_GAP
 
 MAX_LEARNED: Final = 500
 """Cases that a process learns from; bounds the time per batch in a long campaign. The FMC

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.samplers.belief import Belief
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray

@@ -12,11 +12,11 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.score import Measures, Outcome
 
 HALF_WIDTH: Final = 0.03
 """Of the band of failures in the unit square; about 7 % of the square."""

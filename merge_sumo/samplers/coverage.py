@@ -13,7 +13,8 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
@@ -25,7 +26,6 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.prediction_skill import PredictionSkill, Predictor
 from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
-from merge_sumo.verdict.prediction import Prediction
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60

@@ -15,7 +15,7 @@ from typing import Final, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from merge_sumo.coverage.fmc import RADIUS, IntArray, ball_volume, radius_for
+from merge_sumo.metrics.fmc import RADIUS, IntArray, ball_volume, radius_for
 from merge_sumo.scenario.case import FloatArray
 
 CELL: Final = {2: 0.01, 3: 0.0125}

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.verdict.prediction import Prediction
 
 PICKED: Final = 0.8
 """Least share of a pick's ball that counts as covered for the later picks of the batch, and the

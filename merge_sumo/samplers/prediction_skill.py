@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
+from merge_sumo.metrics.prediction import NO_GAP, Prediction
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.verdict.prediction import NO_GAP, Prediction
-from merge_sumo.verdict.score import Outcome
 
 Known = Sequence[tuple[Outcome, Prediction]]
 

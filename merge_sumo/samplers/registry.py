@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from merge_sumo.system.registry import Registry
+from merge_sumo.registry import Registry
 
 if TYPE_CHECKING:
     from merge_sumo.samplers.base import Sampler

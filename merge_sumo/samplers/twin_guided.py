@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import radius_for
+from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.samplers.base_rate import BaseRate
 from merge_sumo.samplers.belief import Belief, Calibration
 from merge_sumo.samplers.candidates import (

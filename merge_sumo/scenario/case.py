@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
+from merge_sumo.pickling import quickly_pickled
 from merge_sumo.scenario.imperfection import (
     ACT,
     PERFECT_ACTUATION,
@@ -43,7 +44,6 @@ from merge_sumo.scenario.scenario import (
     MergeScenario,
     Scenario,
 )
-from merge_sumo.system.pickling import quickly_pickled
 
 FloatArray = NDArray[np.float64]
 _IMPERFECTIONS: Final = attrgetter(*COORDINATES)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from merge_sumo.errors import UserError
+from merge_sumo.records import convert
 from merge_sumo.scenario.scenario import MergeScenario, Scenario
-from merge_sumo.system.records import convert
 
 
 def scenario_of_record(record: Any) -> Scenario:

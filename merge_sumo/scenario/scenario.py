@@ -199,7 +199,7 @@ class Scenario:
     measures: ClassVar[Callable[..., Any] | None]
     """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
     lines of the road (None: nothing is measured before M), and whether the last way out is searched
-    for. None where it is a merge, which `verdict/score.py` measures."""
+    for. None where it is a merge, which `metrics/score.py` measures."""
     levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
     """POV levels that the kind has."""
     notation: ClassVar[Mapping[str, Notation]]

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.printable import printable
+from merge_sumo.printable import printable
 
 Left = dict[str, float | str]
 """What is left at one step, by name."""

@@ -9,11 +9,11 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.pickling import quickly_pickled
+from merge_sumo.printable import printable
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VUT
 from merge_sumo.scenario.signals import Signals
-from merge_sumo.system.pickling import quickly_pickled
-from merge_sumo.system.printable import printable
 
 
 class End(StrEnum):

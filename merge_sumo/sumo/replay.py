@@ -18,6 +18,12 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.errors import UserError, notice
+from merge_sumo.interrupt import stopping_in_order
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.records import Record, convert, read_record, to_json
+from merge_sumo.result import Result
 from merge_sumo.road.corridor import LanePath
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import FARTHEST_M
@@ -49,12 +55,6 @@ from merge_sumo.sumo.replay_folder import (
     files_of,
     motion_record,
 )
-from merge_sumo.system.interrupt import stopping_in_order
-from merge_sumo.system.records import Record, convert, read_record, to_json
-from merge_sumo.system.result import Result
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.conflict import Conflict
-from merge_sumo.verdict.score import Outcome
 
 REPLAYED: Final = "replayed.fcd.xml"
 COMPARED: Final = ("x", "y", "pos", "speed")

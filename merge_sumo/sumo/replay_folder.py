@@ -18,6 +18,11 @@ from typing import Final
 
 from lxml import etree
 
+from merge_sumo.folders import write_folder
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.merge import merged_rows
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.records import to_json
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
@@ -28,11 +33,6 @@ from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
-from merge_sumo.system.folders import write_folder
-from merge_sumo.system.records import to_json
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.merge import merged_rows
-from merge_sumo.verdict.score import Outcome
 
 CONFIG: Final = "replay.sumocfg"
 NET: Final = "us23.net.xml"

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from merge_sumo import api
+from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.api.verb import verb
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import failures
 from merge_sumo.config import NoFailures
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import printable
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.system.printable import printable
-from merge_sumo.verdict.score import Outcome
 
 
 @verb(NoFailures)

@@ -21,11 +21,11 @@ import numpy as np
 
 from merge_sumo import api
 from merge_sumo.campaigns.run import Run
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.plan import SimulationPlan
-from merge_sumo.engine.povs import Povs
-from merge_sumo.engine.simulator import Simulator
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.measures import Measure
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
@@ -33,11 +33,11 @@ from merge_sumo.scenario.case import Case, FloatArray, MergeCase, Pool, ToldCase
 from merge_sumo.scenario.imperfection import Sensing
 from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.scratch import ScratchFolder
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.povs import Povs
+from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.world import World
-from merge_sumo.system.scratch import ScratchFolder
-from merge_sumo.verdict.criterion import Criterion
-from merge_sumo.verdict.measures import Measure
-from merge_sumo.vuts.factory import VutFactory
 
 __all__ = [
     "MeasureContract",

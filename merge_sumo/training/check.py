@@ -12,16 +12,16 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.engine.rollout import Rollout
+from merge_sumo.metrics.score import is_close
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
-from merge_sumo.verdict.score import is_close
 
 CHECK_CASES: Final = 300
 CHECK_SEED: Final = 20_201

@@ -33,24 +33,24 @@ from merge_sumo.drivers.policies import (
     scenario_record,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import road_for
-from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.system.folders import (
+from merge_sumo.folders import (
     cannot_write,
     check_own,
     make_place,
     replace_own,
     write_new,
 )
-from merge_sumo.system.printable import quoted
-from merge_sumo.system.records import to_json, to_plain
-from merge_sumo.system.spawning import forget_safe_path, without_cwd
-from merge_sumo.system.workers import is_daemonic, leave_signals_to_parent
+from merge_sumo.printable import quoted
+from merge_sumo.records import to_json, to_plain
+from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.spawning import forget_safe_path, without_cwd
 from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network
 from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
 from merge_sumo.training.reward import Reward, RewardWeights, Role
+from merge_sumo.workers import is_daemonic, leave_signals_to_parent
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),

@@ -9,8 +9,8 @@ from pathlib import Path
 from merge_sumo import config
 from merge_sumo.drivers.policies import NETWORKS, plays_as, policies_of, read_manifest, scenario_of
 from merge_sumo.errors import UserError
+from merge_sumo.result import Result
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.system.result import Result
 from merge_sumo.training.check import PolicyCheck, check_policy
 from merge_sumo.training.ddqn import TrainingProgress
 from merge_sumo.training.helix import train_library

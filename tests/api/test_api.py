@@ -7,13 +7,13 @@ import sys
 
 import pandas
 import pytest
-from handmade import write_run
 from lxml import html
+from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
-from merge_sumo.system.folders import DATED, dated
-from merge_sumo.verdict.summary import summarise
+from merge_sumo.folders import DATED, dated
+from merge_sumo.metrics.summary import summarise
 
 
 @pytest.fixture(scope="module")

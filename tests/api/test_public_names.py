@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from calling import commands
+from support.calling import commands
 
 import merge_sumo as ms
 

@@ -13,23 +13,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calling import assert_refused
 from conftest import some
-from handmade import write_run
 from lxml import etree
-from plans import key_of, plan_for
-from writers import PLACES
+from support.calling import assert_refused
+from support.handmade import write_run
+from support.plans import key_of, plan_for
+from support.writers import PLACES
 
 import merge_sumo as ms
+from merge_sumo.analysis.truth import Truth, ground_truth, read_truth
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.severity import Severity
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.truth import Truth, ground_truth, read_truth
-from merge_sumo.verdict.severity import Severity
-from merge_sumo.vuts.process import LOG
 
 
 @pytest.fixture

@@ -10,13 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from attacks import World
-from campaigning import campaign_settings, run_campaign
-from plans import plan_for
+from support.attacks import World
+from support.campaigning import campaign_settings, run_campaign
+from support.plans import plan_for
 
+from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
-from merge_sumo.studies.truth import ground_truth
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell of POSIX is needed")
 

@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaigning import campaign_settings, run_campaign
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.journal import to_line
 from merge_sumo.campaigns.run import (
@@ -32,12 +32,12 @@ from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
+from merge_sumo.resources import resource
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import replay
 from merge_sumo.sumo.hosting import hosted_net
 from merge_sumo.sumo.replay_folder import CASE, RECORD
-from merge_sumo.system.resources import resource
 
 HARSH = [
     *(b"null", b"NaN", b"-Infinity", b"1e999", b"true", b"[]", b"{}", b'"\\ud800"', b"-0", b"\n"),

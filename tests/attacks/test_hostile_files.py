@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import cpu_s
+from support.processes import cpu_s
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path, road_of

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS, Misbehaviour
-from processes import none_left
-from vut_contract import cases_of, factory, run_cases
+from support.misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS, Misbehaviour
+from support.processes import none_left
+from support.vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case

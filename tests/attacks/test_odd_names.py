@@ -10,19 +10,19 @@ import sys
 from pathlib import Path
 
 import pytest
-from calling import assert_refused
-from campaigning import campaign_settings, run_campaign
-from handmade import write_run
-from plans import plan_for
+from support.calling import assert_refused
+from support.campaigning import campaign_settings, run_campaign
+from support.handmade import write_run
+from support.plans import plan_for
 
 from merge_sumo.campaigns import campaign as conductor
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
+from merge_sumo.printable import printable
 from merge_sumo.reports.report import write_report
+from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.system.printable import printable
 
 VUT = "def drive(seen):\n    return 1.0\n"
 NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")

@@ -14,22 +14,22 @@ from pathlib import Path
 from unicodedata import category
 
 import pytest
-from campaigning import resume_campaign
 from conftest import some
-from writers import INTO_FOLDERS, PLACES, WRITERS
+from support.campaigning import resume_campaign
+from support.writers import INTO_FOLDERS, PLACES, WRITERS
 
 import merge_sumo as ms
+from merge_sumo import folders
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.errors import UserError
+from merge_sumo.printable import printable, quoted
 from merge_sumo.road.merge import default_net_path
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
-from merge_sumo.system import folders
-from merge_sumo.system.printable import printable, quoted
-from merge_sumo.system.workers import Workers
+from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.training import helix
+from merge_sumo.workers import Workers
 
 NAMELESS = ["", ".", "theirs/..", "/", "/.."]
 BELOW = ["file/new", "dangling/new", "loop/new", "pipe/new"]
@@ -160,7 +160,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from merge_sumo import api
-from merge_sumo.system import folders
+from merge_sumo import folders
 
 def killed(*_):
     if [*Path(sys.argv[2]).glob(f"*/{sys.argv[3]}")]:

@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigning import campaign_settings, resume_campaign, run_campaign
 from scipy.spatial import cKDTree
+from support.campaigning import campaign_settings, resume_campaign, run_campaign
 
+from merge_sumo.analysis.comparison import Change, compare_against
 from merge_sumo.campaigns.run import AGAINST, OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.coverage.fmc import RADIUS
 from merge_sumo.errors import UserError
+from merge_sumo.interrupt import Stopped
+from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import DT_S, US23, V_VUT0_MPS
-from merge_sumo.studies.comparison import Change, compare_against
-from merge_sumo.system.interrupt import Stopped
 
 OLD = "def f(seen):\n    return 0.0\n"
 NEW = "def f(seen):\n    return 0.5 if seen.t_s < 3.0 else 0.0\n"

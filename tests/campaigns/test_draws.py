@@ -10,20 +10,20 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from campaigning import run_campaign
+from support.campaigning import run_campaign
 
 from merge_sumo import api
 from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.chance import by_case, failing_cases
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import counted
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.imperfection import Sensing
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.system.printable import counted
 from merge_sumo.testing.contracts import SamplerContract, play_case
-from merge_sumo.verdict.chance import by_case, failing_cases
-from merge_sumo.verdict.score import Outcome
 
 POOL = Pool(levels=(0,), scenario=US23)
 

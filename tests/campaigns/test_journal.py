@@ -19,15 +19,15 @@ from hypothesis import strategies as st
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_settings
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.measures import further_measures
+from merge_sumo.metrics.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
+from merge_sumo.metrics.severity import Severity
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.measures import further_measures
-from merge_sumo.verdict.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
-from merge_sumo.verdict.severity import Severity
 
 SPEC_FIELDS = [
     *("index", "batch", "level", "x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad", "end"),

@@ -9,22 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaigning import campaign_settings, resume_campaign, run_campaign
-from plans import plan_for
+from support.campaigning import campaign_settings, resume_campaign, run_campaign
+from support.plans import plan_for
 
 from merge_sumo.campaigns.journal import to_line
 from merge_sumo.campaigns.loop import AGE, GROUPS, SearchLoop
 from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.criterion import PAPER_CRITERION
+from merge_sumo.metrics.episode import Episode
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.system.workers import Job, Workers, open_workers
 from merge_sumo.testing.contracts import episode
-from merge_sumo.verdict.criterion import PAPER_CRITERION
-from merge_sumo.verdict.episode import Episode
+from merge_sumo.workers import Job, Workers, open_workers
 
 POOL = Pool(levels=(0, 1), scenario=US23)
 LEARNING = sorted(name for name, kind in SAMPLERS.items() if kind.learns)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from calling import assert_refused
+from support.calling import assert_refused
 
 STALEMATE = ("--level", "2", "--x", "-294.5", "--v", "34.125", "--psi", "0.6")
 SAFE = ("--level", "0", "--x", "-300", "--v", "34")

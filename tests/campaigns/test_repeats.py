@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from calling import invoke
-from campaigning import campaign_settings, run_campaign
+from support.calling import invoke
+from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
 from merge_sumo.campaigns.repeats import (
@@ -20,11 +20,11 @@ from merge_sumo.campaigns.repeats import (
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.records import to_plain
 from merge_sumo.reports.report import write_report
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.system.records import to_plain
-from merge_sumo.system.workers import open_workers
+from merge_sumo.workers import open_workers
 
 SHY = """
     def act(self, seen):

@@ -13,15 +13,15 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from calling import contents
-from campaigning import campaign_settings, resume_campaign, run_campaign
+from support.calling import contents
+from support.campaigning import campaign_settings, resume_campaign, run_campaign
 
+from merge_sumo import interrupt
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.system import interrupt
-from merge_sumo.system.interrupt import Interrupt, Stopped
+from merge_sumo.interrupt import Interrupt, Stopped
 
 BATCH = 8
 MOUNT = shutil.which("mount")

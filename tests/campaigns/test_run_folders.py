@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any, Final
 
 import pytest
-from calling import Said, assert_refused
-from campaigning import campaign_settings, run_campaign
 from conftest import require
+from support.calling import Said, assert_refused
+from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.spec import names_code
 from merge_sumo.errors import UserError
-from merge_sumo.system.hashing import files_now
-from merge_sumo.vuts.factory import VutFactory
-from merge_sumo.vuts.spec import names_code
+from merge_sumo.hashing import files_now
 
 VUT = """
 import pathlib

@@ -5,16 +5,16 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from campaigning import run_campaign
+from support.campaigning import run_campaign
 
 from merge_sumo import api
 from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, has_converged
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.score import Measures, Outcome
 
 
 def outcomes(*failing: int, cases: int) -> list[Outcome]:

@@ -28,9 +28,9 @@ from problems import (
     shipped_truth,
 )
 
-from merge_sumo.coverage.fmc import RADIUS, fmc
+from merge_sumo.analysis.truth import Truth
 from merge_sumo.errors import UserError
-from merge_sumo.studies.truth import Truth
+from merge_sumo.metrics.fmc import RADIUS, fmc
 from merge_sumo.testing import SamplerContract
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import pytest
 from docs_pages import DOCS, ROOT, SHOWN, TABLE, TABLES, WRITTEN, on_page_markdown
 
+from merge_sumo.controllers.registry import KINDS
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.vuts.registry import KINDS
 
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 NAMED_FILE = re.compile(r"(?<![\w/])((?:merge_sumo|tests|tools)/[\w/-]+\.py)\b")

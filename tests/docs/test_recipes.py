@@ -27,7 +27,7 @@ class Recipe:
 RECIPES = {
     "a measure": Recipe(
         more={
-            "verdict/measures.py": {
+            "metrics/measures.py": {
                 "OURS: Final = (": "def _last_m(trajectory: Trajectory, _lines: object) -> float:\n"
                 "    return float(trajectory.motion[-1, 1, 0])\n\n\n",
                 '    Measure("end", ': '    Measure("last_m", "of the VUT at last", unit="m", '
@@ -74,8 +74,8 @@ RECIPES = {
     ),
     "a kind of controller with two parameters": Recipe(
         new={
-            "vuts/hold.py": "from merge_sumo.vuts.base import ControllerKind\n"
-            "from merge_sumo.vuts.controller import Controller\n\n\n"
+            "controllers/hold.py": "from merge_sumo.controllers.base import ControllerKind\n"
+            "from merge_sumo.controllers.controller import Controller\n\n\n"
             "class HoldKind(ControllerKind):\n"
             '    form, what = "hold:START?a_mps2=A&until_s=T", "accelerates for a while"\n\n'
             "    def __init__(self, spec, options):\n"
@@ -90,8 +90,8 @@ RECIPES = {
             "        return self.a_mps2 if seen.t_s < self.until_s else 0.0\n"
         },
         more={
-            "vuts/registry.py": {
-                '        HERE: "merge': '        "hold": "merge_sumo.vuts.hold:HoldKind",\n'
+            "controllers/registry.py": {
+                '        HERE: "merge': '        "hold": "merge_sumo.controllers.hold:HoldKind",\n'
             }
         },
     ),

@@ -17,12 +17,12 @@ import pytest
 from docs_pages import ROOT
 
 import merge_sumo as ms
+from merge_sumo.analysis.truth import REAL_REGION
 from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, FEATURES
 from merge_sumo.drivers.policies import load_network
+from merge_sumo.metrics.score import measure
 from merge_sumo.scenario.scenario import DT_S, US23
-from merge_sumo.studies.truth import REAL_REGION
 from merge_sumo.training.reward import RewardWeights
-from merge_sumo.verdict.score import measure
 
 LIBRARIES = ("", "human/", "roundabout/")
 DEFAULT, HUMAN, ROUNDABOUT = (f"policies/{library}README.md" for library in LIBRARIES)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from vut_contract import LANE, ON_LANE, begin, factory, run_on
+from support.vut_contract import LANE, ON_LANE, begin, factory, run_on
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut

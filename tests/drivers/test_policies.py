@@ -6,9 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from merges import HALF, SMALLER
-from plans import POVS
+from support.merges import HALF, SMALLER
+from support.plans import POVS
 
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.levelk import (
     FEATURES,
     LevelKDriver,
@@ -24,16 +25,15 @@ from merge_sumo.drivers.policies import (
     policies_of,
     read_manifest,
 )
-from merge_sumo.engine.povs import PovLibrary, Povs
-from merge_sumo.engine.rollout import Rollout
+from merge_sumo.metrics.score import measure
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.simulation.povs import PovLibrary, Povs
+from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.game import Game, greedy, pool_starts
 from merge_sumo.training.reward import Reward, RewardWeights
-from merge_sumo.verdict.score import measure
-from merge_sumo.vuts.factory import VutFactory
 
 REGRET_BOUNDS = {
     "pov1": (0.01, 0.05),

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from plans import POVS
+from support.plans import POVS
 
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.reference import (
@@ -24,11 +24,11 @@ from merge_sumo.drivers.safety_models import (
     rss_distance_m,
     ttc_s,
 )
-from merge_sumo.engine.povs import PovLibrary
+from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import DT_S, US23, MergeScenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.verdict.merge import brake_after_mps2
+from merge_sumo.simulation.povs import PovLibrary
 
 CASE = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
 TABLES = Path(__file__).parents[1] / "data" / "reference"

@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
+from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.controllers.controller import Controller, Seen
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.metrics.measures import Measure
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import POV, VUT
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.verdict.bodies import CentreLines
-from merge_sumo.verdict.measures import Measure
-from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
-from merge_sumo.vuts.controller import Controller, Seen
 
 
 class MiddleSampler(LevelwiseSampler):

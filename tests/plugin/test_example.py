@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from merge_sumo_example import CLOSEST, MiddleSampler
 
+from merge_sumo.controllers.registry import KINDS
 from merge_sumo.testing import MeasureContract, SamplerContract, VutContract
-from merge_sumo.vuts.registry import KINDS
 
 installed = pytest.mark.skipif(
     "constant" not in KINDS, reason="the example package is not installed"

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import pytest
 from conftest import require
-from handmade import write_run
+from support.handmade import write_run
 
+from merge_sumo.analysis.explanation import EXPLANATIONS, Axis, Explanation
 from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.records import to_plain
 from merge_sumo.reports import report
 from merge_sumo.reports.text import changes
-from merge_sumo.studies.explanation import EXPLANATIONS, Axis, Explanation
-from merge_sumo.system.records import to_plain
-from merge_sumo.verdict.conflict import Conflict
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 

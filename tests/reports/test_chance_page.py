@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaigning import run_campaign
 from lxml import html
+from reports.test_browser import browser, shown  # noqa: F401 (a fixture)
 from scipy.stats import beta, binomtest
-from test_browser import browser, shown  # noqa: F401 (a fixture)
+from support.campaigning import run_campaign
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings

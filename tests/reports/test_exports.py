@@ -14,10 +14,10 @@ import warnings
 import numpy as np
 import polars
 import pytest
-from calling import invoke
-from handmade import write_run
 from lxml import etree
 from scenariogeneration import xosc
+from support.calling import invoke
+from support.handmade import write_run
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures

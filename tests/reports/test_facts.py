@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calling import invoke
-from handmade import write_run
 from lxml import html
+from support.calling import invoke
+from support.handmade import write_run
 
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports.facts import Fact, headline
 from merge_sumo.reports.report import report_page
-from merge_sumo.studies.counterfactuals import AVOIDANCE, Avoidance
 
 
 @pytest.fixture(scope="module")

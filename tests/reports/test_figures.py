@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.collections import EllipseCollection
 
-from merge_sumo.coverage.fmc import RADIUS
+from merge_sumo.analysis.reproduction import Panel
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.reports import figures
-from merge_sumo.studies.reproduction import Panel
 
 
 def curves():

@@ -8,9 +8,9 @@ import io
 from dataclasses import replace
 
 import pytest
-from handmade import write_run
 from lxml import html
 from rich.console import Console
+from support.handmade import write_run
 
 from merge_sumo.reports.progress import CampaignBars, rate_text
 from merge_sumo.reports.report import EVERY_S, FIRST_S, REPORT, RunningReport

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from handmade import write_run
 from lxml import html
+from support.handmade import write_run
 
+from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.controllers.process import LINES, LOG
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import DT_S, US23
-from merge_sumo.studies.surface import learn_surface
-from merge_sumo.vuts.process import LINES, LOG
 
 EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
+from merge_sumo.analysis.reproduction import TABLE_II, Reproduction, Scale, reproduce
 from merge_sumo.errors import UserError
 from merge_sumo.reports.reproduction_page import write_reproduction
-from merge_sumo.studies.reproduction import TABLE_II, Reproduction, Scale, reproduce
 
 FIGURES = {
     "cases-level0.png",

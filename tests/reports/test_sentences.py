@@ -13,21 +13,21 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from campaigning import run_campaign
 from lxml import etree
+from support.campaigning import run_campaign
 
 import merge_sumo as ms
+from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import US23, as_merge, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.studies.counterfactuals import causes
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.score import Outcome
 
 TRIALS = Path(__file__).parents[2] / "tools" / "trial_vuts.py"
 OWN = {

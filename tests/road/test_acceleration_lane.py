@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import (
+from support.foreign_nets import (
     FOREIGN,
     LANE_M,
     LANES,

@@ -6,7 +6,7 @@ import math
 import re
 
 import pytest
-from foreign_nets import FOREIGN, edge, lane, node, plain, straight
+from support.foreign_nets import FOREIGN, edge, lane, node, plain, straight
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import LanePath, Piece

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import FOREIGN, LANES, lane_corridor_of
-from handmade import write_run
 from lxml import etree
+from support.foreign_nets import FOREIGN, LANES, lane_corridor_of
+from support.handmade import write_run
 
 from merge_sumo import api
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import default_net_path, road_of
@@ -35,7 +36,6 @@ from merge_sumo.sumo.replay_folder import (
     write_scenario,
 )
 from merge_sumo.sumo.world import World
-from merge_sumo.verdict.score import Outcome, measure
 
 LANE_WIDTH_M = 3.2
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.allocation import (
     even_shares,
     last_failure_share,
@@ -13,7 +14,6 @@ from merge_sumo.samplers.allocation import (
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.score import Measures, Outcome
 
 
 @st.composite

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers import coverage
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Measures, Outcome
 
 EXPERTS, GROUPS = 2, 4
 

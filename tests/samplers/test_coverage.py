@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from conftest import some
 
-from merge_sumo.coverage.fmc import fmc, radius_for
+from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.belief import (
     _calibrated,
@@ -27,7 +28,6 @@ from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.score import Measures, Outcome
 
 
 def outcome(index: int, batch: int, case: Case, *, blind: bool, fails: bool = True) -> Outcome:

@@ -10,15 +10,15 @@ import pytest
 from merge_sumo.campaigns.campaign import twin_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.engine.evaluate import evaluate
+from merge_sumo.metrics.criteria import PAPER
+from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.history import bounded
+from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.twin.pair import TwinPair
-from merge_sumo.verdict.criteria import PAPER
-from merge_sumo.verdict.regression import regression
+from merge_sumo.simulation.evaluate import evaluate
 
 HARSH = "brake_after_mps2 > 3"
 LIMITS = [(limit_m, fail_when) for limit_m in (3.0, 12.0) for fail_when in (PAPER, HARSH)]

@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Measures, Outcome
 
 LIMIT_M = 6.0
 AGREE, DISAGREE = np.array([[0.5, 0.5]]), np.array([[0.5, 5.0]])

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.belief import Belief
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import MergeCase, Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.verdict.score import Measures, Outcome
 
 CASE = MergeCase(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
 OTHER = replace(CASE, v_pov0_mps=31.0)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.testing.contracts import SamplerContract, play
-from merge_sumo.verdict.score import Measures, Outcome
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
 POOLS = {

@@ -6,19 +6,19 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from calling import invoke
-from foreign_nets import FOREIGN
-from merges import SMALLER
+from support.calling import invoke
+from support.foreign_nets import FOREIGN
+from support.merges import SMALLER
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.score import measure
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
 from merge_sumo.scenario.case import MergeCase, Pool, to_unit
 from merge_sumo.scenario.scenario import RANGES, US23, MergeScenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.verdict.score import measure
 
 
 def test_the_shipped_scenario_has_the_numbers_of_the_paper():

@@ -7,12 +7,13 @@ import json
 
 import numpy as np
 import pytest
-from campaigning import run_campaign
+from support.campaigning import run_campaign
 
 import merge_sumo as ms
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
+from merge_sumo.records import decode
 from merge_sumo.reports.report import write_report
 from merge_sumo.scenario.scenario import POV, US23, VUT
 from merge_sumo.scenario.signals import (
@@ -24,8 +25,7 @@ from merge_sumo.scenario.signals import (
     from_runs,
     to_record,
 )
-from merge_sumo.system.records import decode
-from merge_sumo.system.workers import open_workers
+from merge_sumo.workers import open_workers
 
 LEAVES = """
 class Vut:

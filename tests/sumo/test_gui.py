@@ -17,11 +17,11 @@ from PIL import Image
 import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.conflict import Conflict
 from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo.replay_folder import LABELS, VIEW
-from merge_sumo.verdict.cause import cause
-from merge_sumo.verdict.conflict import Conflict
 
 PICTURE_TIMES_S = (2.0, 7.0)
 LABELS_SHARE = 0.2

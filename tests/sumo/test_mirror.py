@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from foreign_nets import LANE_M, LANES, lane_corridor_of
-from traci_pair import ToSession, close_mirror, mirror
+from support.foreign_nets import LANE_M, LANES, lane_corridor_of
+from support.traci_pair import ToSession, close_mirror, mirror
 
+from merge_sumo.controllers.traci.session import Session
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES
-from merge_sumo.vuts.traci.session import Session
 
 
 @pytest.fixture(autouse=True)

@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from foreign_nets import LANE_M, lane_corridor_of
 from lxml import etree
+from support.foreign_nets import LANE_M, lane_corridor_of
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
@@ -43,7 +44,6 @@ from merge_sumo.sumo.replay_folder import (
     VIEW,
     write_scenario,
 )
-from merge_sumo.verdict.score import Outcome, measure
 
 SHIPPED = sorted(path.parent for path in Path(__file__).parents[2].glob(f"scenarios/*/{CONFIG}"))
 FILES = {CONFIG, NET, TYPES, LABELS, RECORD, VIEW, CASE}

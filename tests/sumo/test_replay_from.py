@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from calling import assert_refused
-from campaigning import campaign_settings, run_campaign
 from lxml import etree
+from support.calling import assert_refused
+from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.campaign import export_case
+from merge_sumo.metrics.conflict import Conflict
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.replay import REPLAYED, Replay, replay
 from merge_sumo.sumo.replay_folder import RECORD
-from merge_sumo.verdict.conflict import Conflict
 
 STALEMATE = Path(__file__).parents[2] / "scenarios" / "roundabout-stalemate"
 """VUT and POV touch as the VUT reaches M, at 11.5 s, and both have crossed junctions by then."""

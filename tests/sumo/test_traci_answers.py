@@ -7,11 +7,19 @@ from __future__ import annotations
 import subprocess
 from contextlib import contextmanager
 
-from traci_pair import Pair, ToSession, answer, close_mirror, end_program, mirror, open_program
+from support.traci_pair import (
+    Pair,
+    ToSession,
+    answer,
+    close_mirror,
+    end_program,
+    mirror,
+    open_program,
+)
 
+from merge_sumo.controllers.traci.session import Session
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.mirror import NET
-from merge_sumo.vuts.traci.session import Session
 
 
 @contextmanager

@@ -7,8 +7,8 @@ from __future__ import annotations
 import pytest
 import traci
 import traci_page
+from support.traci_pair import Pair, answer, questions, shown
 from traci.storage import Storage
-from traci_pair import Pair, answer, questions, shown
 
 from merge_sumo.sumo.traci_names import name_of
 

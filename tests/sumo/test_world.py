@@ -6,16 +6,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from plans import POVS
+from support.plans import POVS
 
 from merge_sumo.drivers.level0 import Level0Vut
-from merge_sumo.engine.povs import PovLibrary
-from merge_sumo.engine.rollout import Rollout
+from merge_sumo.metrics.score import measure
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
+from merge_sumo.simulation.povs import PovLibrary
+from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.world import SimulationError, World
-from merge_sumo.verdict.score import measure
 
 
 def random_cases(count: int, seed: int = 0) -> list[Case]:

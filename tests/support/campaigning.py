@@ -10,8 +10,8 @@ from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.verdict.score import Outcome
 
 
 def campaign_settings(**settings: Any) -> CampaignSettings:

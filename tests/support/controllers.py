@@ -7,15 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from vut_contract import factory, run_cases
+from support.vut_contract import factory, run_cases
 
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.scenario.case import Case
-from merge_sumo.vuts.factory import VutFactory
 
 SUPPORT = Path(__file__).parent
 RAW_CLIENT = f"""import os, sys, time
 sys.path.insert(0, {str(SUPPORT)!r})
-from raw_traci import Client
+from support.raw_traci import Client
 client = Client(int(sys.argv[1]))
 """
 """Begins a program that drives by our own client."""

@@ -11,12 +11,12 @@ import numpy as np
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run
-from merge_sumo.engine.plan import versions
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.verdict.episode import Episode
-from merge_sumo.verdict.score import Outcome, measure
+from merge_sumo.simulation.plan import versions
 
 BATCH = 20
 

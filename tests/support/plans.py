@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from merge_sumo.analysis.truth import TruthKey
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.engine.plan import MAX_CORRIDORS, SimulationPlan
-from merge_sumo.engine.povs import Povs
+from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.studies.truth import TruthKey
-from merge_sumo.verdict.criterion import Criterion
-from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.simulation.plan import MAX_CORRIDORS, SimulationPlan
+from merge_sumo.simulation.povs import Povs
 
 PAPERS = Criterion()
 POVS = Povs(policies=policies_of(US23))

@@ -18,6 +18,8 @@ import traci
 from traci.connection import Connection
 from traci.storage import Storage
 
+from merge_sumo.controllers.traci import protocol as tp
+from merge_sumo.controllers.traci.session import Session
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
@@ -32,8 +34,6 @@ from merge_sumo.sumo.mirror import (
     edges_of,
     write_files,
 )
-from merge_sumo.vuts.traci import protocol as tp
-from merge_sumo.vuts.traci.session import Session
 
 IDS = {
     "vehicle": "vut",

@@ -7,15 +7,15 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from plans import plan_for
+from support.plans import plan_for
 
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.engine.simulator import Simulator
 from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.vuts.base import VutOptions
-from merge_sumo.vuts.factory import VutFactory
+from merge_sumo.simulation.simulator import Simulator
 
 LEVEL0_CLASS = """
 class Level0:
@@ -53,7 +53,7 @@ def factory(spec: object, **options: Any) -> VutFactory:
 
 
 def in_process(spec: object, **options: Any) -> VutFactory:
-    """Return a VUT that drives in this process; `vuts/test_hosted.py` is of those in another."""
+    """Return a VUT that drives in this process; `test_hosted.py` has those in another one."""
     return factory(spec, in_process=True, **options)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from build_fmu import build_fmu, compiler
 from conftest import require, some
-from networks import constant_network
+from support.networks import constant_network
 
 from merge_sumo.testing import VutContract
 

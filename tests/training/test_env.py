@@ -5,21 +5,20 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import merge_sumo.reports
 from merge_sumo.errors import UserError
+from merge_sumo.reports.pages import TEMPLATES
 from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.training import picture
 from merge_sumo.training.env import MergeEnv, MergeVectorEnv
 from merge_sumo.training.registration import ENV_ID
 
-CSS = Path(merge_sumo.reports.__file__).with_name("templates") / "report.css"
+CSS = TEMPLATES / "report.css"
 
 
 def pixels(colour):

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from merges import LIKE_A_ROUNDABOUT
+from support.merges import LIKE_A_ROUNDABOUT
 
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.training import reward

@@ -12,9 +12,9 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from calling import invoke
 from export_policy import export_onnx
-from merges import LIKE_A_ROUNDABOUT
+from support.calling import invoke
+from support.merges import LIKE_A_ROUNDABOUT
 
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut

@@ -20,9 +20,9 @@ from entrants import LIMIT_S, check_spec
 from problems import named_problems
 
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_ours, replace_own
 from merge_sumo.reports.progress import Bars
-from merge_sumo.system.folders import check_ours, replace_own
-from merge_sumo.system.workers import LocalProcesses, Workers, workers_or_cores
+from merge_sumo.workers import LocalProcesses, Workers, workers_or_cores
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

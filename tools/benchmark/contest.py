@@ -38,18 +38,18 @@ from problems import (
 )
 
 from merge_sumo.campaigns.loop import Groups, SearchLoop
-from merge_sumo.coverage.fmc import fmc
-from merge_sumo.engine.plan import SimulationPlan
 from merge_sumo.errors import UserError
+from merge_sumo.folders import check_own, make_place, regular, replace_own
+from merge_sumo.metrics.fmc import fmc
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import counted
+from merge_sumo.records import decode
+from merge_sumo.result import Result
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.samplers.twin import Twin
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.system.folders import check_own, make_place, regular, replace_own
-from merge_sumo.system.printable import counted
-from merge_sumo.system.records import decode
-from merge_sumo.system.result import Result
-from merge_sumo.system.workers import Workers
-from merge_sumo.twin.twin import Twin
-from merge_sumo.verdict.score import Outcome
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import Workers
 
 COUNTED: Final = (50, 100, 400)
 """Numbers of cases N after which the share counts."""

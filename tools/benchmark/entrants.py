@@ -17,17 +17,17 @@ from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any, Final, TypeVar
 
+from merge_sumo.analysis.sampler_study import COMPARED_BATCH
+from merge_sumo.controllers.deadline import Deadline, DeadlineExceeded, text_of
 from merge_sumo.errors import UserError
+from merge_sumo.hashing import sha256_of
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.contract import SamplerContract
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import Case, FloatArray, Pool
-from merge_sumo.studies.sampler_study import COMPARED_BATCH
-from merge_sumo.system.hashing import sha256_of
-from merge_sumo.system.source_files import module_of_file
-from merge_sumo.verdict.prediction import Prediction
-from merge_sumo.verdict.score import Outcome
-from merge_sumo.vuts.deadline import Deadline, DeadlineExceeded, text_of
+from merge_sumo.source_files import module_of_file
 
 T = TypeVar("T")
 

@@ -12,13 +12,13 @@ from typing import Final
 
 import numpy as np
 
+from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.controllers.registry import KINDS
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.system.suggestions import meant
-from merge_sumo.vuts.base import ControllerKind, VutOptions, VutSpec
-from merge_sumo.vuts.registry import KINDS
+from merge_sumo.suggestions import meant
 
 CRUISE_MPS: Final = 28.0
 

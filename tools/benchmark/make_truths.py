@@ -26,7 +26,7 @@ from problems import (
 )
 
 from merge_sumo.errors import UserError
-from merge_sumo.system.records import read_record
+from merge_sumo.records import read_record
 
 
 def main() -> None:

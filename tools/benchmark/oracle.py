@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.coverage.fmc import fmc
+from merge_sumo.analysis.truth import Truth
+from merge_sumo.metrics.fmc import fmc
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.studies.truth import Truth
 
 ORACLE_STEP: Final = 5
 """Cases between two points of the oracle's curve; divides all batch sizes that samplers choose."""

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.verdict.score import Outcome
 
 POPULATION: Final = 6
 """Solutions of an emitter in a generation, at least: 4 + 3 ln d, the default of CMA-ES."""

@@ -93,7 +93,7 @@ def _straddle(history: LevelHistory) -> AcquisitionFunction:
     told = _fitted(history.points, (history.margin - mean) / deviation)
 
     # The classes of botorch have no types for the checker.
-    class Straddle(AcquisitionFunction):  # type: ignore[misc]
+    class Straddle(AcquisitionFunction):
         """kappa sigma - |mu - limit|, for one point at a time."""
 
         def __init__(self) -> None:

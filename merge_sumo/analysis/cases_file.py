@@ -1,0 +1,127 @@
+"""Cases in one small file to commit: it is all that runs them elsewhere, and names no code."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from msgspec import Meta
+
+from merge_sumo.analysis.comparison import Change, ComparedCase, passes, short
+from merge_sumo.campaigns.run import Run
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.score import Measures, Outcome, record_fields
+from merge_sumo.metrics.severity import Severity
+from merge_sumo.records import (
+    Record,
+    convert,
+    read_toml,
+    to_json,
+)
+from merge_sumo.scenario.coordinates import outside_of_the_pool
+from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.simulation.povs import POLICIES
+
+TOLERANCE: Final = 0.01
+
+
+class Head(Record, frozen=True):
+    """What a cases file holds, by the names of `campaign.json`, with a record a case."""
+
+    vut: str
+    scenario: dict[str, Any]
+    cases: list[dict[str, Any]]
+    pov: str | None = None
+    policies: str | None = None
+    fail_when: str = PAPER_CRITERION.fail_when
+    require: str | None = None
+    net_sha256: str | None = None
+    policies_sha256: dict[str, str] | None = None
+    pov_files: dict[str, str] | None = None
+    tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] = TOLERANCE
+
+
+class CasesFile(Run):
+    """A cases file, as a campaign of which only what decided its cases is known."""
+
+    def __init__(self, path: Path) -> None:
+        _, record = read_toml(path, "cases file")
+        line: dict[str, Any] = {}
+        try:
+            head = convert(record, Head)
+            scenario = scenario_of_record(head.scenario)
+            if "/" in (scenario.net or ""):
+                scenario = replace(scenario, net=str((path.parent / str(scenario.net)).resolve()))
+            self.criterion = Criterion(head.fail_when, head.require)
+            self.criterion.check(scenario)
+            del record["cases"]
+            self._take(path, {**record, "scenario": scenario.to_record()}, path)
+            self.tolerance, self.torn = head.tolerance, False
+            self._by_index = dict[int, Outcome]()
+            self.accepted = dict[int, str]()
+            for line in head.cases:
+                self._add(line)
+            self.outcomes = list(self._by_index.values())
+        except UserError as error:
+            at = f"case {line.get('index')!r:.40}: " if line else ""
+            raise UserError(f"the cases file {path}: {at}{error}") from error
+        self.record["levels"] = self.levels
+
+    def _add(self, line: dict[str, Any]) -> None:
+        """Add the case of a line; raise `UserError` where it is none."""
+        if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
+            raise UserError("it has a number that is not finite")
+        usual = Measures(end=End(self.scenario.ends_as), t_end_s=0.0)
+        names = (name for of in record_fields(self.scenario)[:2] for name in of)
+        unsaid = {name: getattr(usual, name, None) for name in names} | {"batch": 0}
+        unsaid["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]
+        verdict, accepted = line.pop("verdict", None), line.pop("accepted", None)
+        outcome = Outcome.from_json(to_json(unsaid | line), self.scenario)
+        judged = verdict_of(outcome)
+        if verdict != judged or (outcome.margin is None) != (judged == "error"):
+            raise UserError(f"verdict is {verdict!r:.60}, but by margin and end it is {judged}")
+        if accepted is not None and not (isinstance(accepted, str) and accepted.strip()):
+            raise UserError(f"accepted is {accepted!r:.60}: it must be a reason")
+        if outcome.index in self._by_index:
+            raise UserError("its index is there twice")
+        if sentences := outside_of_the_pool(outcome.case):
+            raise UserError(sentences[0].removeprefix("note: "))
+        self._by_index[outcome.index] = outcome
+        self.accepted |= {outcome.index: accepted} if accepted else {}
+
+    def outcome(self, index: int) -> Outcome:
+        """Return the outcome of a case; `UserError` when the file has no such case."""
+        if index not in self._by_index:
+            raise UserError(f"{self.folder} has no case {index}")
+        return self._by_index[index]
+
+    def change_of(self, one: ComparedCase) -> Change:
+        """Return what the file calls a change; it excuses neither a new error nor a new contact."""
+        a, b = one.a.measures, one.b.measures
+        if b.error is not None and a.error is None:
+            return Change.BROKE
+        if passes(one.a) and passes(one.b):
+            less = short(one.a.margin) - short(one.b.margin) > self.tolerance
+            touches = b.severity == Severity.CONTACT != a.severity
+            return Change.WORSE if less or touches else Change.BOTH
+        is_known = one.a.index in self.accepted and not b.end.is_error
+        return Change.ACCEPTED if is_known and not passes(one.b) else one.change
+
+
+def verdict_of(outcome: Outcome) -> str:
+    """Return the verdict on a case in a word."""
+    if outcome.is_tested:
+        return "fail" if outcome.failed else "pass"
+    return "error" if outcome.measures.end.is_error else "timeout"
+
+
+def policies_of(run: Run, outcomes: Iterable[Outcome]) -> dict[str, str] | None:
+    """Return the hashes of the learned POVs of some cases, as a campaign records them."""
+    learned = {POLICIES.get(outcome.case.level) for outcome in outcomes}
+    known = run.record.get("policies_sha256") or {}
+    return {name: sha256 for name, sha256 in known.items() if name in learned} or None

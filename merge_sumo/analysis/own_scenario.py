@@ -1,0 +1,84 @@
+"""Scenarios of a person's own: written for a merge in a net, and checked before they are run."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+from merge_sumo import config
+from merge_sumo.campaigns.scenario_suggestion import (
+    about,
+    kind_of_merge,
+    lane_warnings,
+    suggested,
+    suggested_lane_m,
+    unseen,
+)
+from merge_sumo.folders import check_ending, check_new_file, write_new
+from merge_sumo.printable import quoted
+from merge_sumo.result import Shown
+from merge_sumo.road.drawing import road_svg
+from merge_sumo.road.merge import road_for, road_of
+from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
+from merge_sumo.scenario.scenario import MergeScenario, Scenario
+
+
+def shipped() -> Shown:
+    """Return the scenarios that the package brings, by name."""
+    known = {name: named_scenario(name) for name in shipped_scenarios()}
+    lines = []
+    for name, scenario in known.items():
+        x, v = scenario.dimensions(0)[:2]
+        line = f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
+        if isinstance(scenario, MergeScenario) and scenario.lane_m is not None:
+            line += "; acceleration lane from {:g} to {:g} m".format(*scenario.lane_m)
+        lines.append(line)
+    return Shown({name: scenario.to_record() for name, scenario in known.items()}, lines)
+
+
+def write_scenario(asked: config.NewScenario) -> Shown:
+    """Write a scenario for a merge in a net, and a picture of the road.
+
+    Raises `UserError` for a net without such a merge, and where something is there.
+    """
+    file, net = Path(asked.file), Path(asked.net)
+    check_ending(file, (SUFFIX,), "FILE")
+    picture = file.with_suffix(".svg")
+    for path in (file, picture):
+        check_new_file(path, "FILE")
+    edges = tuple(asked.mainline.split()), tuple(asked.ramp.split())
+    road = road_of(net, *edges)
+    if not asked.point:
+        road = road_of(net, *edges, lane_m=suggested_lane_m(road))
+    scenario, found = suggested(road, file.stem), [*about(road), *kind_of_merge(road)]
+    relative = os.path.relpath(net.resolve(), file.parent.resolve())
+    write_new(picture, road_svg(road, scenario), "FILE")
+    write_new(file, to_toml(replace(scenario, net=relative), found).encode(), "FILE")
+    lines = [*found, f"written: {file}, and its picture {picture}"]
+    return Shown({"about": found, "written": [str(file), str(picture)]}, lines)
+
+
+def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Shown:
+    """Say whether a scenario can be hosted, and whether the learned drivers were trained on it.
+
+    Args:
+        scenario: the scenario.
+        name: what a person calls it.
+        policies: folder of the learned drivers, by default of the shipped ones.
+    """
+    found = road_for(scenario)
+    road, differing = about(found), unseen(scenario, policies)
+    warnings, lines = lane_warnings(scenario, found), list[str]()
+    if isinstance(scenario, MergeScenario) and differing:
+        made = quoted(f"{scenario.name}-policies")
+        lines = [
+            "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
+            *(f"  {sentence}" for sentence in differing),
+            f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
+            f"then name it to campaigns with `policies`: {made}",
+        ]
+    elif isinstance(scenario, MergeScenario):
+        lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or like ones"]
+    said = [*road, *(f"warning: {sentence}" for sentence in warnings), *lines]
+    return Shown({"about": road, "warnings": warnings, "unseen": differing}, said)

@@ -1,0 +1,111 @@
+"""What every study of a recorded campaign begins with: the campaign, and how its cases run now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from merge_sumo.campaigns.run import FILES, Run
+from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
+from merge_sumo.errors import UserError, notice
+from merge_sumo.hashing import files_now
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.printable import printable
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import level_name
+from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import Workers
+
+R = TypeVar("R")
+
+OnPart = Callable[[str, int, int, str, str], None]
+"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
+
+
+def check_least(asked: object, **least: int) -> None:
+    """Raise `UserError` for a number of what is asked, by its name, that is less than the least."""
+    for name, number in least.items():
+        given = getattr(asked, name)
+        if given is not None and given < number:
+            raise UserError(f"`{name}` is {given}: it must be {number} or more")
+
+
+@dataclass(frozen=True, slots=True)
+class RunStudy:
+    """A recorded campaign, and how a study runs cases of it.
+
+    Attributes:
+        run: the campaign.
+        settings: those of the campaign, except for policies that are elsewhere and how a VUT is
+            hosted.
+        plan: that of the settings, with the engine of the study.
+        workers: where cases run, by default in this process; they decide no result.
+        on_cases: told how many cases have just ended.
+    """
+
+    run: Run
+    settings: CampaignSettings
+    plan: SimulationPlan
+    workers: Workers | None = None
+    on_cases: Callable[[int], None] = lambda _: None
+
+    def simulate(
+        self, cases: Sequence[Case], plan: SimulationPlan, keep: Callable[[Episode], R]
+    ) -> list[R]:
+        """Run cases; return what is kept of each, in their order.
+
+        Args:
+            cases: cases of the plan's scenario.
+            plan: that of the study, or with changes.
+            keep: gives the part of an episode that is kept.
+        """
+        results = []
+        for _, result in evaluate(plan, cases, self.workers, keep):
+            results.append(result)
+            self.on_cases(1)
+        return results
+
+    def record(self) -> dict[str, Any]:
+        """Return what a study keeps of the system that it tested, as `campaign.json` does."""
+        return record_of(self.settings, self.plan)
+
+    def check_same_system(
+        self, levels: Iterable[int] | None = None, *, may_change: bool = False
+    ) -> None:
+        """Raise `UserError` where the campaign had another net, or other POVs at some levels.
+
+        By default they are all levels. A controller that has changed is a `Notice`, unless that is
+        what the study is of.
+        """
+        run, road, today = self.run, self.plan.road, self.record()
+        if run.settings.net_sha256 not in (None, road.sha256):
+            raise UserError(
+                f"{run.folder} was run on another net than {road.path} is now: put that back"
+            )
+        for level in self.settings.levels if levels is None else levels:
+            if not same_pov(run.record, today, level):
+                raise UserError(
+                    f"{run.folder} was run against another POV of level {level_name(level)} than "
+                    "today's: give its `policies`, or the same `pov`"
+                )
+        if not may_change:
+            notice_changes(run, self.plan)
+
+
+def notice_changes(run: Run, plan: SimulationPlan) -> None:
+    """Warn with a `Notice` where a controller that a campaign ran is not as it was then."""
+    pov = plan.povs.own
+    specs = str(plan.vut.spec), None if pov is None else str(pov.spec)
+    loaded = plan.vut.files or {}, plan.povs.files or {}
+    for name, setting, spec, files in zip(FILES, ("vut", "pov"), specs, loaded, strict=True):
+        known = getattr(run.settings, name)
+        if spec is None or spec != getattr(run.settings, setting) or known is None:
+            continue
+        now = files_now(known, files)
+        if differing := [file for file, sha256 in known.items() if now[file] != sha256]:
+            notice(
+                f"note: {printable(differing[0])} is not as it was in {run.folder}: {spec} may "
+                "drive otherwise than it did there"
+            )

@@ -1,0 +1,173 @@
+"""The share of all starts that fail, by uniform cases that are none of the campaign's.
+
+A search looks for failures, so the share of its cases that fail says nothing of the pool. By the
+equations of motion thousands of uniform cases take less than a second; a share of them runs in
+SUMO, too (`simulation/kinematic_simulator.py`). A controller of a user is asked step by step, and
+takes as long without SUMO as in it: its cases run as those of the campaign do, in rounds, as many
+as fit into a part of the time of the campaign.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+from typing import Annotated, Final
+
+import numpy as np
+from msgspec import Meta
+
+from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.campaigns.run import Run
+from merge_sumo.controllers.process import LOG
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.chance import clopper_pearson
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.records import Record
+from merge_sumo.scenario.case import Pool
+from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.workers import Workers, workers_or_here
+
+CASES: Final = 2000
+"""Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
+ROUND: Final = 200
+"""Uniform cases of a level that run at a time where they run in SUMO, and the least of them."""
+PART: Final = 0.2
+"""Of the time of a campaign, for further rounds."""
+CONFIDENCE: Final = 0.95
+STREAM: Final = 11
+"""Key of the random stream, so that it is none of a sampler's."""
+Count = Annotated[int, Meta(ge=0)]
+
+
+class LevelShare(Record, frozen=True):
+    """Uniform cases of a POV level, how many of them fail, and how many end as an error."""
+
+    level: Count
+    cases: Count
+    failures: Count
+    without_verdict: Count = 0
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The exact interval of the share; of no failure one-sided, from 0.
+
+        Cases without a verdict are safe for its lower end, and failures for the upper.
+        """
+        confidence = CONFIDENCE - (0.0 if self.failures else 1.0 - CONFIDENCE)
+        most = self.failures + self.without_verdict
+        low, _ = clopper_pearson(self.failures, self.cases, confidence)
+        _, high = clopper_pearson(most, self.cases, confidence)
+        return low, high
+
+    def with_more(self, more: LevelShare) -> LevelShare:
+        """Return both together."""
+        return LevelShare(
+            self.level,
+            self.cases + more.cases,
+            self.failures + more.failures,
+            self.without_verdict + more.without_verdict,
+        )
+
+    @property
+    def shown(self) -> str:
+        """The share and its interval in percent."""
+        low, high = map(_percent, self.interval)
+        if not self.failures:
+            return f"less than {high} %"
+        return f"{_percent(self.failures / self.cases)} % [{low}, {high}]"
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.{3 if share >= 0.1 else 2}g}"
+
+
+class Shares(Record, frozen=True):
+    """The share that fails at each level."""
+
+    levels: tuple[LevelShare, ...]
+
+
+SHARES: Final = StudyFile("shares.json", Shares)
+
+
+def note_shares(
+    run: Run,
+    plan: SimulationPlan,
+    workers: Workers | None = None,
+    took_s: float = 0.0,
+    check: Callable[[], None] = lambda: None,
+    on_part: Callable[[int, int], None] = lambda _done, _total: None,
+) -> None:
+    """Measure the share that fails at each level of a campaign that has just ended.
+
+    Nothing is written for drivers that ask SUMO, with which it takes long (`probability`), where a
+    case ends otherwise in SUMO than by eq. (4), where one may fail in some of its runs, nor of a
+    controller whose cases mostly end as errors.
+
+    Args:
+        run: the campaign.
+        plan: how it was run.
+        workers: where its cases ran, and those of a user's controller run here, too.
+        took_s: how long it took; cases in SUMO may take a part of that.
+        check: called after each level, and may raise.
+        on_part: told how many cases are done, and how many there are, from 0 on.
+    """
+    errors = sum(outcome.measures.end.is_error for outcome in run.outcomes)
+    random = run.tolerated or run.scenario.sense.is_random
+    if plan.asks_sumo or random or 2 * errors > len(run.outcomes):
+        return
+    by_equations = plan.needs_sumo is None
+    size, budget_s = (CASES, 0.0) if by_equations else (ROUND, PART * took_s)
+    plan = plan.with_log(run.folder.resolve() / LOG)
+    streams = {level: stream(run.settings.seed, level) for level in run.levels}
+    shares = {level: LevelShare(level, 0, 0) for level in run.levels}
+    done, begun_s = 0, perf_counter()
+    # Worker processes would take longer to start than the cases by the equations.
+    with workers_or_here(None if by_equations else workers) as processes:
+        while True:
+            round_s = perf_counter()
+            total = done + size * len(streams)
+            for level, rng in streams.items():
+                on_part(done, total)
+                try:
+                    more = share_at(plan, level, size, rng, processes)
+                except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
+                    return
+                shares[level] = shares[level].with_more(more)
+                done += size
+                on_part(done, total)
+                check()
+            now_s = perf_counter()
+            if now_s - begun_s + (now_s - round_s) > budget_s:
+                break
+    SHARES.write(run.folder, Shares(tuple(shares.values())))
+
+
+def stream(seed: int, level: int) -> np.random.Generator:
+    """Return what draws the uniform cases of a level of a campaign with a seed."""
+    return np.random.default_rng([seed, STREAM, level])
+
+
+def share_at(
+    plan: SimulationPlan,
+    level: int,
+    cases: int,
+    rng: np.random.Generator,
+    workers: Workers | None = None,
+) -> LevelShare:
+    """Return the share of uniform cases of a level that fail.
+
+    They run by the equations of motion where the drivers allow it, else in SUMO.
+    """
+    points = rng.random((cases, len(plan.scenario.dimensions(level))))
+    pool = Pool(levels=(level,), scenario=plan.scenario)
+    chosen = plan.for_verdicts().with_engine(None)
+    ran = dict(evaluate(chosen, pool.cases(points, level), workers, end_of)).values()
+    failures, errors = (sum(of) for of in zip(*ran, strict=True))
+    return LevelShare(level, cases, failures, errors)
+
+
+def end_of(episode: Episode) -> tuple[bool, bool]:
+    """Return whether a case fails, and whether it ended as an error."""
+    return episode.outcome.failed, episode.trajectory.end.is_error

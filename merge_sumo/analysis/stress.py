@@ -1,0 +1,278 @@
+"""Which verdicts of a campaign hang by a thread: its cases run again, each time a little otherwise.
+
+Every rung of the ladder (`RUNGS`) is a change of the plan or of the cases: one thing that the
+simulation leaves out or simplifies. The recorded cases run again with each. A failure is robust
+where it fails on every rung; a verdict flips where a case that failed passes, or the other way
+round, or has no verdict any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Annotated, Any, Final
+
+import numpy as np
+from msgspec import Meta
+
+from merge_sumo.analysis.run_study import RunStudy
+from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.campaigns.run import failures
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import CaseVerdict, Outcome
+from merge_sumo.records import Record
+from merge_sumo.result import Result
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import COORDINATES, DT_S
+from merge_sumo.simulation.plan import SimulationPlan
+
+LISTED: Final = 10
+"""Failures that are not robust that a sentence names."""
+Index = Annotated[int, Meta(ge=0)]
+"""The index of a case in its campaign."""
+
+
+class Flips(Record, frozen=True):
+    """The cases whose verdicts flip in one run of all cases.
+
+    Attributes:
+        passes: indices of failures that pass.
+        fails: indices of passes that fail.
+        without_verdict: indices of cases that end without a verdict.
+    """
+
+    passes: tuple[Index, ...] = ()
+    fails: tuple[Index, ...] = ()
+    without_verdict: tuple[Index, ...] = ()
+
+
+class Rung(Record, frozen=True):
+    """What became of the cases on one rung.
+
+    Attributes:
+        name: short name, as "lag-0.2".
+        about: what is changed, in a phrase.
+        source: where its number is from; empty for none.
+        runs: the verdicts that flip, by run: several where the change is drawn at random.
+        skipped: why it was not run, in a clause; empty where it was.
+    """
+
+    name: str
+    about: str
+    source: str = ""
+    runs: tuple[Flips, ...] = ()
+    skipped: str = ""
+
+    @property
+    def counts(self) -> list[int]:
+        """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
+        kinds = ([run.passes, run.fails, run.without_verdict] for run in self.runs)
+        return [sum(map(len, of)) for of in zip(*kinds, strict=True)]
+
+    @property
+    def flips(self) -> int:
+        """Verdicts that flip, over all runs."""
+        return sum(self.counts)
+
+
+class StressResult(Result, Record, frozen=True):
+    """What a stress test of a campaign found.
+
+    Attributes:
+        cases: recorded cases with a verdict: those that ran again.
+        failures: indices of those that had failed, the worst first.
+        rungs: what became of them on each rung.
+        vut: name of the VUT.
+    """
+
+    computed = ("robust",)
+
+    cases: int
+    failures: tuple[Index, ...]
+    rungs: tuple[Rung, ...]
+    vut: str
+
+    @property
+    def runs(self) -> int:
+        """Number of times that every case ran."""
+        return sum(len(rung.runs) for rung in self.rungs)
+
+    @property
+    def robust(self) -> tuple[int, ...]:
+        """Indices of the failures that fail in every run of every rung, the worst first."""
+        return tuple(index for index in self.failures if not self.passes_in(index))
+
+    def passes_in(self, index: int) -> int:
+        """Return in how many runs of all rungs a failure does not fail."""
+        runs = (run for rung in self.rungs for run in rung.runs)
+        return sum(index in (*run.passes, *run.without_verdict) for run in runs)
+
+    def share(self, rung: Rung) -> float:
+        """Return the share of verdicts that flip on a rung."""
+        return rung.flips / max(self.cases * len(rung.runs), 1)
+
+
+STRESS: Final = StudyFile("stress.json", StressResult)
+PART_S: Final = 0.02
+"""Step of the rung with a shorter step than that of eq. (4)."""
+LAGS_S: Final = (0.2, 0.35, 0.5)
+POWER_W_PER_KG: Final = 34.0
+"""Power over mass: above this a car is of class 3, the highest. UN GTR No. 15, Annex 1."""
+ERROR_X_M: Final = 0.5
+ERROR_V_MPS: Final = 2.0 / 3.6
+"""Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
+ERRORS_BY_UNIT: Final = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
+OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
+"""Coordinates that are no state of another car."""
+CAR_LENGTH_M: Final = 5.0
+DRAWS: Final = 5
+"""Times that all cases run where a change is drawn at random, with the seed of the case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disturbance:
+    """A rung before it runs.
+
+    Attributes:
+        name: short name.
+        about: what is changed, in a phrase.
+        source: where its number is from.
+        plan: returns the plan of the rung by that of the campaign; raises `UserError` where it
+            cannot be.
+        case: returns a case of the rung by one of the campaign, and what draws at random; None for
+            the same coordinates.
+    """
+
+    name: str
+    about: str
+    source: str = ""
+    plan: Callable[[SimulationPlan], SimulationPlan] = lambda plan: plan
+    case: Callable[[Case, np.random.Generator], Case] | None = None
+
+    @property
+    def draws(self) -> int:
+        """Number of times that all cases run."""
+        return 1 if self.case is None else DRAWS
+
+
+def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
+    act = plan.scenario.act
+    for name in values:
+        if getattr(act, name) not in (0.0, None):
+            raise UserError(f"the scenario has {name} of its own")
+    return _changed(plan, act=replace(act, **values))
+
+
+def _with_long_pov(plan: SimulationPlan) -> SimulationPlan:
+    return _changed(plan, pov_length_m=plan.scenario.pov_length_m + CAR_LENGTH_M)
+
+
+def _changed(plan: SimulationPlan, **changes: Any) -> SimulationPlan:
+    scenario = replace(plan.scenario, **changes)
+    plan.criterion.check(scenario)
+    return replace(plan, scenario=scenario)
+
+
+def _start_off(case: Case, rng: np.random.Generator) -> Case:
+    """Return a case whose POV starts a little elsewhere, at another speed; within the pool."""
+    values: dict[str, Any] = {}
+    for dimension in case.scenario.dimensions(case.level):
+        name = dimension.field
+        most = ERRORS_BY_UNIT.get(case.scenario.notation[name].unit, 0.0)
+        if most and name not in OF_VUT:
+            value = getattr(case, name) + rng.uniform(-most, most)
+            values[name] = min(max(value, dimension.low), dimension.high)
+    return replace(case, **values)
+
+
+NOTHING: Final = Disturbance("nothing", "nothing is changed")
+RUNGS: Final = (
+    NOTHING,
+    Disturbance(
+        "step",
+        f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
+        plan=lambda plan: replace(plan, substeps=round(DT_S / PART_S)),
+    ),
+    *(
+        Disturbance(
+            f"lag-{lag_s:g}",
+            f"the acceleration of the VUT lags by {lag_s:g} s",
+            "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)",
+            partial(_with_actuator, lag_s=lag_s),
+        )
+        for lag_s in LAGS_S
+    ),
+    Disturbance(
+        "power",
+        f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
+        "UN GTR No. 15, Annex 1: lower limit of class 3",
+        partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
+    ),
+    Disturbance(
+        "start",
+        f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
+        "accuracy of a radar, Autoliv NB24G1V2, user's manual, 3.1",
+        case=_start_off,
+    ),
+    Disturbance(
+        "long-pov",
+        f"cars of the mainline are {CAR_LENGTH_M:g} m longer, to the rear",
+        plan=_with_long_pov,
+    ),
+)
+"""The ladder; the first rung shows whether cases repeat at all."""
+RUNS: Final = sum(one.draws for one in RUNGS)
+
+
+def stress(study: RunStudy) -> StressResult:
+    """Run the cases of a campaign on every rung, and write what becomes of them into its folder.
+
+    Raises `UserError` for a campaign without a verdict, or with a net or POVs of another day.
+    """
+    study.check_same_system()
+    run = study.run
+    tested = [outcome for outcome in run.cases if outcome.is_tested]
+    if not tested:
+        raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
+    rungs = tuple(_rung(study, tested, one) for one in RUNGS)
+    failing = tuple(outcome.index for outcome in failures(tested))
+    found = StressResult(len(tested), failing, rungs, run.vut)
+    STRESS.write(run.folder, found)
+    return found
+
+
+def verdict_of(episode: Episode) -> CaseVerdict:
+    """Return the verdict on a case."""
+    return episode.outcome.verdict
+
+
+def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
+    """Run all cases with a change; one that cannot be is skipped with its reason."""
+    flips: list[Flips] = []
+    skipped = ""
+    try:
+        plan = one.plan(study.plan.for_cases(len(tested)))
+        for draw in range(one.draws):
+            cases = [replace(outcome.case, scenario=plan.scenario) for outcome in tested]
+            if one.case is not None:
+                cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
+            flips.append(flips_of(tested, study.simulate(cases, plan, verdict_of)))
+    except UserError as error:
+        if one is NOTHING:
+            raise
+        study.on_cases((one.draws - len(flips)) * len(tested))
+        flips, skipped = [], str(error)
+    return Rung(one.name, one.about, one.source, tuple(flips), skipped)
+
+
+def flips_of(tested: Sequence[Outcome], found: Sequence[CaseVerdict]) -> Flips:
+    """Return which verdicts flip, by those of a run of the same cases."""
+    pairs = list(zip(tested, found, strict=True))
+    flipped = [o for o, now in pairs if now.is_tested and now.failed != o.failed]
+    return Flips(
+        passes=tuple(o.index for o in flipped if o.failed),
+        fails=tuple(o.index for o in flipped if not o.failed),
+        without_verdict=tuple(o.index for o, now in pairs if not now.is_tested),
+    )

@@ -1,0 +1,70 @@
+"""The chance to fail of the cases that a campaign did not run, by a surrogate.
+
+The surrogate is that of the sampler `coverage`, learned afresh from the outcomes of a run,
+whichever sampler chose its cases.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.samplers.belief import JUDGED_FROM, learn_chance
+from merge_sumo.samplers.uniform import UniformSampler
+from merge_sumo.scenario.case import FloatArray, Pool
+from merge_sumo.workers import workers_or_cores
+
+FEWEST_FAILURES: Final = 5
+"""Failures at a level from which a surrogate is learned. Chosen, not tuned."""
+PART: Final = 4000
+"""Points asked at a time, so that memory does not grow with their number."""
+
+Grid = tuple[int, int, int]
+"""Nodes in each coordinate; of two coordinates the last number is 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """The surrogate of one level of a run; `predict` is its learned chance to fail."""
+
+    predict: Callable[[FloatArray], FloatArray]
+
+    def chance(self, points: FloatArray) -> FloatArray:
+        """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
+        parts = np.array_split(points, len(points) // PART + 1)
+        # Each part in one thread: the answer is the same whatever the number of cores.
+        with threadpool_limits(1), ThreadPoolExecutor(workers_or_cores(None)) as cores:
+            return np.concatenate(list(cores.map(self.predict, parts)))
+
+
+def nodes(grid: Grid) -> FloatArray:
+    """Return the nodes of a grid of the unit cube, (n, d), the first coordinate running fastest."""
+    axes = [np.linspace(0.0, 1.0, n) for n in grid if n > 1]
+    mesh = np.meshgrid(*axes[::-1], indexing="ij")
+    return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
+
+
+def learn_surface(
+    outcomes: Sequence[Outcome], level: int, tolerated: float = 0.0
+) -> Surface | None:
+    """Return the surrogate of a level, or None where too few cases failed to learn from."""
+    at_level = [outcome for outcome in outcomes if outcome.case.level == level]
+    if not at_level:
+        return None
+    sampler = UniformSampler(Pool(levels=(level,), scenario=at_level[0].case.scenario), seed=0)
+    sampler.tolerated = tolerated
+    sampler.tell(at_level)
+    history = sampler.history(level)
+    failing = int(history.failed.sum())
+    if failing < FEWEST_FAILURES or len(history.failed) - failing < JUDGED_FROM:
+        return None
+    with threadpool_limits(1):
+        predict = learn_chance(history)
+    assert predict is not None, "there are cases enough"  # noqa: S101
+    return Surface(predict)

@@ -1,0 +1,372 @@
+"""Controllers: what one sees, how one answers, and an array of them that drives all corridors."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, NamedTuple, Self
+
+import msgspec
+import numpy as np
+
+from merge_sumo.controllers.deadline import Deadline, closed, text_of
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
+from merge_sumo.drivers.following import car_met
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, POV, VUT, Bounds, lane_of
+from merge_sumo.scenario.signals import Left
+
+
+class Car(NamedTuple):
+    """A car of the mainline.
+
+    Attributes:
+        x_m: distance of its front bumper to M along its lane, negative before M.
+        v_mps: its speed.
+    """
+
+    x_m: float
+    v_mps: float
+
+
+class _State(NamedTuple):
+    t_s: float
+    x_pov_m: float
+    v_pov_mps: float
+    x_vut_m: float
+    v_vut_mps: float
+
+
+class Seen(_State):
+    """What a VUT sees at a step: time and state, and nothing of the POV's driver.
+
+    A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
+
+    In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
+    the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
+    (`drivers.following.car_met`). `others` has all cars.
+
+    On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
+    M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.
+
+    Attributes:
+        t_s: time since the episode began.
+        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
+        v_pov_mps: speed of the POV.
+        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
+        v_vut_mps: speed of the VUT.
+    """
+
+    _traffic: tuple[Car, ...] = ()
+    _lane_m: Bounds | None = None
+    _merged: bool = False
+
+    @property
+    def vehicles(self) -> tuple[Car, ...]:
+        """All vehicles in the order of their rows: POV, VUT, and the cars ahead and behind."""
+        pair = Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
+        return self._traffic or pair
+
+    @property
+    def others(self) -> tuple[Car, ...]:
+        """All cars of the mainline, the one in front first."""
+        cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
+        return tuple(sorted(cars, reverse=True))
+
+    @property
+    def lane_begin_m(self) -> float:
+        """Where the acceleration lane begins; 0 where there is none."""
+        return 0.0 if self._lane_m is None else self._lane_m[0]
+
+    @property
+    def lane_end_m(self) -> float:
+        """Where it ends; 0 where there is none."""
+        return 0.0 if self._lane_m is None else self._lane_m[1]
+
+    @property
+    def merged(self) -> bool:
+        """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
+        return self.x_vut_m >= 0.0 if self._lane_m is None else self._merged
+
+    @property
+    def may_merge(self) -> bool:
+        """Whether a wish to merge, now, puts the VUT on the mainline in the next step.
+
+        False after the merge, and where there is no acceleration lane.
+        """
+        if self._lane_m is None or self._merged:
+            return False
+        return self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
+
+
+def seen_in(
+    t_s: float,
+    met: int,
+    x_m: Sequence[float],
+    v_mps: Sequence[float],
+    lane_m: Bounds | None = None,
+    *,
+    merged: bool = False,
+) -> Seen:
+    """Return what a VUT sees of the vehicles of a corridor.
+
+    Args:
+        t_s: time since the episode began.
+        met: row of the car that counts as POV.
+        x_m: positions by row.
+        v_mps: speeds by row.
+        lane_m: acceleration lane, None without one.
+        merged: whether the VUT has left that lane.
+    """
+    seen = Seen(t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT])
+    if lane_m is not None:
+        seen._lane_m, seen._merged = lane_m, merged
+    if len(x_m) > 2:
+        seen._traffic = tuple(map(Car, x_m, v_mps))
+    return seen
+
+
+class Start(msgspec.Struct, array_like=True, frozen=True):
+    """What a controller learns when an episode begins; level and orientation of the POV are hidden.
+
+    Attributes:
+        seed: seed of the episode, for controllers that draw random numbers.
+        a_min_mps2: least acceleration of the scenario.
+        a_max_mps2: largest acceleration of the scenario.
+        lane_m: acceleration lane, None without one.
+        met: row of the car that counts as POV.
+        x_m: positions by row.
+        v_mps: speeds by row.
+    """
+
+    seed: int
+    a_min_mps2: float
+    a_max_mps2: float
+    lane_m: tuple[float, float] | None
+    met: int
+    x_m: tuple[float, ...]
+    v_mps: tuple[float, ...]
+
+    @classmethod
+    def of(cls, case: Case) -> Self:
+        """Return the start of a case."""
+        scenario = case.scenario
+        x_m, v_mps = np.array(case.starts(), dtype=np.float64).T
+        met = POV
+        if len(x_m) > 2:
+            level0 = scenario.level0_a_mps2, scenario.level0_v_mps
+            met = int(car_met(x_m[:, None], v_mps[:, None], *level0)[0])
+        return cls(
+            seed=case.told_seed,
+            a_min_mps2=float(scenario.a_min_mps2),
+            a_max_mps2=float(scenario.a_max_mps2),
+            lane_m=lane_of(scenario),
+            met=met,
+            x_m=tuple(x_m.tolist()),
+            v_mps=tuple(v_mps.tolist()),
+        )
+
+    @property
+    def seen(self) -> Seen:
+        """What the controller sees at the start."""
+        return seen_in(0.0, self.met, self.x_m, self.v_mps, self.lane_m)
+
+
+class Controller(ABC):
+    """Drives the vehicle of one corridor, one episode after another.
+
+    Attributes:
+        single_use: whether it drives one episode only, and a new one drives the next.
+    """
+
+    single_use: bool = False
+
+    def reset(self, start: Start) -> None:  # noqa: B027 (most remember nothing)
+        """Begin an episode."""
+
+    @abstractmethod
+    def act(self, seen: Seen) -> Any:
+        """Return the acceleration for the next step, m/s2, or (acceleration, whether to merge)."""
+
+    def signals(self) -> Left:
+        """Return the signals of the last answer."""
+        return {}
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the numbers that a spec may set, with their present values."""
+        return {}
+
+    def close(self) -> None:  # noqa: B027 (most hold nothing)
+        """Release what the controller holds."""
+
+
+class ControllerDriver(Driver):
+    """A driver that learns of an episode only its start, so that it can run in another process."""
+
+    def begin(self, corridor: int, case: Case) -> None:
+        """Begin an episode of a case."""
+        self.reset(corridor, Start.of(case))
+
+    @abstractmethod
+    def reset(self, corridor: int, start: Start) -> None:
+        """Begin an episode in a corridor."""
+
+
+class ControllerArray(ControllerDriver):
+    """Drives each corridor by a controller of its own.
+
+    An error of a controller is the reason of its corridor alone; the next episode in that corridor
+    has a new controller.
+    """
+
+    def __init__(self, corridors: int, new: Callable[[], Controller], deadline_s: float) -> None:
+        """Create a controller for each corridor.
+
+        Args:
+            corridors: number of corridors.
+            new: creates a controller.
+            deadline_s: time for one call.
+        """
+        super().__init__(corridors)
+        self._new, self._deadline = new, Deadline(deadline_s)
+        self._controllers: list[Controller] = []
+        self._reasons: list[str | None] = [None] * corridors
+        self._replace = [False] * corridors
+        self._signals: dict[int, Left] = {}
+        self._lanes_m: list[Bounds | None] = [None] * corridors
+        try:
+            for _ in range(corridors):
+                self._controllers.append(new())
+        except BaseException:
+            self.close()
+            raise
+
+    def reset(self, corridor: int, start: Start) -> None:
+        """Reset the controller of a corridor; an error is kept as the reason of its answer."""
+        self._reasons[corridor], self._lanes_m[corridor] = None, start.lane_m
+        activity = "reset"
+        try:
+            with self._deadline as deadline:
+                if self._replace[corridor]:
+                    activity = "made anew for this episode"
+                    self._close(corridor)
+                    deadline.start()
+                    self._controllers[corridor] = self._new()
+                    deadline.stop()
+                    activity = "reset"
+                controller = self._controllers[corridor]
+                self._replace[corridor] = controller.single_use
+                deadline.start()
+                controller.reset(start)
+                deadline.stop()
+        except BaseException as error:
+            self._fail(corridor, f"{activity}: {self._deadline.reason(error)}")
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the answers of the controllers; NaN where there is a reason."""
+        self._signals, self._wishes = {}, None
+        answers = [0.0] * self.corridors
+        wishes: dict[int, int] = {}
+        met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        merged = [False] * self.corridors if scene.merged is None else scene.merged.tolist()
+        rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
+        states = zip(*(row.tolist() for row in rows), met, strict=True)
+        with self._deadline as deadline:
+            for k, (active, step, x_m, v_mps, row) in enumerate(states):
+                if not active:
+                    continue
+                if self._reasons[k] is not None:
+                    answers[k] = math.nan
+                    continue
+                try:
+                    lane_m, controller = self._lanes_m[k], self._controllers[k]
+                    seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps, lane_m, merged=merged[k])
+                    deadline.start()
+                    answers[k], wish = as_answer(controller.act(seen))
+                    signals = controller.signals()
+                    deadline.stop()
+                    if signals:
+                        self._signals[k] = signals
+                    if wish != NO_WISH:
+                        wishes[k] = wish
+                except BaseException as error:
+                    self._fail(k, deadline.reason(error))
+                    answers[k] = math.nan
+        if wishes:
+            self._wishes = np.full(self.corridors, NO_WISH, dtype=np.int8)
+            self._wishes[list(wishes)] = list(wishes.values())
+        return np.array(answers)
+
+    def reason(self, corridor: int) -> str | None:
+        """Return what the controller of a corridor did wrong."""
+        return self._reasons[corridor]
+
+    def signals(self) -> Mapping[int, Left]:
+        """Return the signals of the last answers, by corridor."""
+        return self._signals
+
+    def parameters(self) -> Mapping[str, float]:
+        """Return the parameters of the first controller."""
+        return self._controllers[0].parameters()
+
+    def close(self) -> None:
+        """Close the controllers; their errors are printed."""
+        for corridor in range(len(self._controllers)):
+            self._close(corridor)
+
+    def _close(self, corridor: int) -> None:
+        closed(self._deadline.deadline_s, self._controllers[corridor].close)
+
+    def _fail(self, corridor: int, reason: str) -> None:
+        self._reasons[corridor], self._replace[corridor] = reason, True
+
+
+class WrongAnswerError(Exception):
+    """A controller answered something that is not an acceleration, or not a wish."""
+
+
+def as_answer(answer: Any) -> tuple[float, int]:
+    """Return an answer as an acceleration and a wish, `NO_WISH` where it says nothing of one.
+
+    Raises `WrongAnswerError` for what is neither one real number nor (number, whether to merge).
+    """
+    if type(answer) is float:
+        return answer, NO_WISH
+    if isinstance(answer, tuple | list) and len(answer) == 2:
+        acceleration, merge = answer
+        return as_number(acceleration), as_wish(merge)
+    return as_number(answer), NO_WISH
+
+
+def as_number(answer: Any) -> float:
+    """Return an answer as a float; raises `WrongAnswerError` for what is not one real number."""
+    if isinstance(answer, (int, float, np.integer, np.floating)) and not isinstance(answer, bool):
+        return float(answer)
+    if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
+        return float(answer)
+    raise WrongAnswerError(f"answered {_shown(answer)} instead of a number, or (number, merge)")
+
+
+def as_wish(merge: Any) -> int:
+    """Return `MERGE` or `STAY`; raises `WrongAnswerError` for what is not True, False, 1 or 0."""
+    value = merge.item() if isinstance(merge, np.ndarray) and merge.shape == () else merge
+    is_number = isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
+    if is_number and value in (0, 1):
+        return MERGE if value else STAY
+    raise WrongAnswerError(f"wishes {_shown(merge)} instead of True or False, to merge or not")
+
+
+MERGES_ABOVE: Final = 0.5
+"""A number that says whether to merge, as of a network or a unit, wishes it above this."""
+
+
+def as_merge(number: float) -> bool:
+    """Return whether a number wishes to merge; raises `WrongAnswerError` for NaN and infinity."""
+    if not math.isfinite(number):
+        raise WrongAnswerError(f"wishes {number} instead of a number, to merge or not")
+    return number > MERGES_ABOVE
+
+
+def _shown(answer: Any) -> str:
+    return f"{text_of(answer, repr)[:60]} ({type(answer).__name__})"

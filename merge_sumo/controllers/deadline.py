@@ -1,0 +1,144 @@
+"""Limit the time of calls to a controller, and describe what a call raised."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import threading
+from bdb import BdbQuit
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from time import perf_counter
+from types import FrameType, TracebackType
+from typing import Any, Final, Self, TextIO
+
+from merge_sumo.interrupt import Stopped
+from merge_sumo.scenario.trajectory import as_reason
+
+
+class DeadlineExceeded(BaseException):
+    """A call took too long. Not an Exception, so that a controller does not catch it by habit."""
+
+
+RING_AFTER: Final = 1.02
+"""The timer rings at this share of the deadline, when the call is certainly late."""
+MOST_CHARACTERS: Final = 300
+"""Maximum length of a text that comes from a controller."""
+
+heartbeat: list[Callable[[float], None]] = []
+"""Called with the time before each call. Only a process that hosts a controller has one: in such a
+process an interrupt is the controller's own doing."""
+
+
+@dataclass(slots=True)
+class Deadline:
+    """Ends calls to a controller that take longer than the deadline.
+
+    While it is entered, a timer in the main thread interrupts a late call, and what the controller
+    prints goes to standard error. Native code is not interrupted, and neither is a call in another
+    thread or on Windows: such a call counts as late when it returns.
+
+    Example:
+        ```python
+        with Deadline(1.0) as deadline:
+            deadline.start()
+            answer = controller.act(seen)
+            deadline.stop()
+        ```
+    """
+
+    deadline_s: float
+    _since_s: float = math.inf
+    _stdout: TextIO | None = None
+    _restore: Callable[[], None] | None = field(default=None, repr=False)
+
+    def __enter__(self) -> Self:
+        self._stdout, sys.stdout = sys.stdout, sys.stderr
+        if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
+            handler = signal.signal(signal.SIGALRM, self._ring)
+            timer = signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+            def restore() -> None:
+                signal.setitimer(signal.ITIMER_REAL, *timer)
+                signal.signal(signal.SIGALRM, handler)
+
+            self._restore = restore
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._since_s = math.inf
+        if self._restore is not None:
+            self._restore()
+            self._restore = None
+        if self._stdout is not None:
+            sys.stdout = self._stdout
+
+    def start(self) -> None:
+        """Begin the time of a call."""
+        if self._restore is not None:
+            # Set again for each call: an early ring would cut short a call that waits in C.
+            first_s = RING_AFTER * self.deadline_s
+            signal.setitimer(signal.ITIMER_REAL, first_s, self.deadline_s / 10)
+        now_s = perf_counter()
+        if heartbeat:
+            heartbeat[0](now_s)
+        self._since_s = now_s
+
+    def stop(self) -> None:
+        """End the time of a call; raises `DeadlineExceeded` if it took too long."""
+        spent_s, self._since_s = perf_counter() - self._since_s, math.inf
+        if spent_s > self.deadline_s:
+            raise DeadlineExceeded
+
+    def reason(self, error: BaseException) -> str:
+        """Describe what a call raised, with file and line; Ctrl-C is raised again."""
+        self._since_s = math.inf
+        if isinstance(error, (Stopped, KeyboardInterrupt)) and not heartbeat:
+            raise error
+        if isinstance(error, DeadlineExceeded):
+            return f"took longer than the deadline of {self.deadline_s:g} s"
+        if isinstance(error, BdbQuit):
+            return "a debugger was left; breakpoints work with `merge-sumo run --debug`"
+        name = text_of(error, lambda error: type(error).__name__)
+        return f"{name}: {text_of(error)}{text_of(error, _place)}"
+
+    def _ring(self, _signal: int, _frame: FrameType | None) -> None:
+        if perf_counter() - self._since_s > self.deadline_s:
+            raise DeadlineExceeded
+
+
+def closed(deadline_s: float, close: Callable[[], Any]) -> None:
+    """Call a controller's `close` within the deadline; an error is printed, it changes nothing."""
+    deadline = Deadline(deadline_s)  # its own: this may be part of another call
+    try:
+        with deadline:
+            deadline.start()
+            close()
+            deadline.stop()
+    except BaseException as error:
+        with suppress(OSError):
+            sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
+
+
+def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
+    """Return the text of a controller's object in one line, even where making it raises.
+
+    The text of a subclass of `str` is taken as the characters that it has.
+    """
+    try:
+        return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
+    except Exception as error:
+        return f"({type(error).__name__} when it was to be shown)"
+
+
+def _place(error: BaseException) -> str:
+    """Return where an error was raised, " (FILE, line N)"; "" where that was not in a VUT."""
+    last: TracebackType | None = error.__traceback__
+    while last is not None and last.tb_next is not None:  # a recursion leaves thousands
+        last = last.tb_next
+    if last is None or Path(last.tb_frame.f_code.co_filename).parent == Path(__file__).parent:
+        return ""
+    return f" ({Path(last.tb_frame.f_code.co_filename).name}, line {last.tb_lineno})"

@@ -1,0 +1,121 @@
+"""VUTs that are objects of this Python process: a class of a notebook, a lambda, an instance.
+
+What can be imported is named, `module:Name`, and hosted as on the command line. The rest is kept
+here under a name of its own, `here:Name`, and drives in the process that runs the cases.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from multiprocessing.reduction import ForkingPickler
+from typing import Any, Final, Protocol, SupportsFloat
+
+from merge_sumo.controllers.base import HERE, VutOptions, VutSpec
+from merge_sumo.controllers.controller import Seen
+from merge_sumo.controllers.here import HereKind, object_of, objects
+from merge_sumo.controllers.python import SeenBatch, is_code
+from merge_sumo.controllers.spec import parse
+from merge_sumo.errors import UserError, notice
+from merge_sumo.workers import AnyWorkers
+
+Answer = SupportsFloat | tuple[SupportsFloat, bool]
+"""An acceleration, or it and whether to merge."""
+
+
+class Acts(Protocol):
+    """A controller of one corridor."""
+
+    def act(self, seen: Seen, /) -> Answer:
+        """Return the acceleration for the next 0.1 s, in m/s2, or it and whether to merge."""
+
+
+class ActsInBatches(Protocol):
+    """A controller of all K corridors at once."""
+
+    def act_batch(self, seen: SeenBatch, /) -> Any:
+        """Return accelerations for 0.1 s, in m/s2, (K,), or these and whether to merge, (2, K)."""
+
+
+AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
+"""A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
+MAINS: Final = ("__main__", "__mp_main__")
+
+
+def spec_of(vut: Any) -> str:
+    """Return what names a VUT in this process and in those that it starts: a spec as it is.
+
+    Raises `UserError` for what is no VUT.
+    """
+    if isinstance(vut, str):
+        return vut
+    if is_code(vut):
+        importable = _importable(vut)
+        if importable is not None:
+            return importable
+    name = str(getattr(vut, "__qualname__", type(vut).__qualname__)).rpartition(".")[2]
+    name = "lambda" if name == "<lambda>" else name
+    number, unique = 1, name
+    while objects.get(unique, vut) is not vut:
+        number += 1
+        unique = f"{name}-{number}"
+    spec = VutSpec(HERE, unique)
+    objects[unique] = vut
+    try:
+        HereKind(spec, VutOptions())
+    except UserError:
+        del objects[unique]
+        raise
+    return str(spec)
+
+
+def is_here(text: str) -> bool:
+    """Return whether a spec names an object of this process."""
+    return parse(text).kind == HERE
+
+
+def travels(spec: VutSpec) -> bool:
+    """Return whether other processes can be given a VUT: by name, or as a copy of the object.
+
+    What the main module defines cannot be found there.
+    """
+    if spec.kind != HERE:
+        return True
+    try:
+        content = bytes(ForkingPickler.dumps(object_of(spec)))
+    except Exception:  # whatever an object does when it is asked for a copy of itself
+        return False
+    return not any(name.encode() in content for name in MAINS)
+
+
+def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None, AnyWorkers]:
+    """Return the specs of what drives, and which workers can have it.
+
+    Says in a sentence where something drives in this process that could do it harm.
+    """
+    specs = spec_of(vut), None if pov is None else spec_of(pov)
+    for spec in (parse(text) for text in specs if text is not None):
+        if object_of(spec) is None:
+            continue
+        where = "with the cases"
+        if not travels(spec):
+            workers, where = 1, "in this process, without workers"
+        notice(
+            f"{spec.argument} is an object, so it drives {where}, which what it does wrong may "
+            "end; put its class or function into a module for a process of its own",
+            UserWarning,
+        )
+    return *specs, workers
+
+
+def _importable(target: Any) -> str | None:
+    """Return MODULE:NAME of a class or a function; None where no other process finds it so."""
+    module, name = getattr(target, "__module__", None), getattr(target, "__qualname__", "")
+    if module in (None, *MAINS) or "<" in name:
+        return None
+    imported: Any = sys.modules.get(str(module))
+    if any(getattr(imported, own, None) is None for own in ("__spec__", "__file__")):
+        return None
+    for part in name.split("."):
+        imported = getattr(imported, part, None)
+    return f"{module}:{name}" if imported is target else None

@@ -1,0 +1,144 @@
+"""SUMO's own drivers as VUT: a car-following model with SUMO's junction logic.
+
+At every step the model decides on a speed from the state, as it does in any SUMO simulation; the
+POV is a vehicle on the road for it, before M by the right of way of the zipper junction and behind
+M as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
+any other, and eq. (4) moves the car. On an acceleration lane SUMO's lane-change model decides when
+to merge: the lane on which the VUT is after SUMO's step is its wish.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
+from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
+from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, VUT
+from merge_sumo.sumo.world import World
+
+SHARED_OPTIONS: Final = {
+    *("maxSpeed", "accel", "decel", "emergencyDecel"),
+    *("apparentDecel", "tau", "minGap", "speedFactor", "impatience", "jmIgnoreFoeProb"),
+    *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
+    *("jmAdvance",),
+}
+LANE_CHANGE_OPTIONS: Final = {
+    *("lcStrategic", "lcStrategicLookahead", "lcLookaheadLeft", "lcAssertive", "lcSigma"),
+    *("lcCooperative", "lcCooperativeSpeed", "lcCooperativeMinSpeed", "lcCooperativeRoundabout"),
+    *("lcCooperativeHelpTime", "lcCooperativeHelpThreshold"),
+    *("lcSpeedGain", "lcSpeedGainRight", "lcSpeedGainLookahead", "lcSpeedGainRemainTime"),
+    *("lcKeepRight", "lcKeepRightAcceptanceTime", "lcContRight", "lcOpposite", "lcOvertakeRight"),
+    *("lcOvertakeDeltaSpeedFactor", "lcMaxSpeedLatStanding", "lcMaxSpeedLatFactor"),
+    "lcMaxDistLatStanding",
+}
+"""Those of SUMO's lane-change model LC2013; -1 turns some of them off. The others that SUMO knows
+are of its sublane model, which does not drive here."""
+ACC_OPTIONS: Final = {
+    *("speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
+    *("gapControlGainSpeed", "gapControlGainSpace", "collisionAvoidanceGainSpeed"),
+    *("collisionAvoidanceGainSpace", "collisionAvoidanceOverride"),
+}
+NO_NOISE: Final = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0}
+MODELS: Final[dict[str, tuple[set[str], dict[str, float]]]] = {
+    "Krauss": ({"sigma", "sigmaStep"}, {"sigma": 0.0}),
+    "IDM": ({"delta", "stepping"}, {}),
+    "EIDM": (
+        {
+            *("delta", "stepping", "tpreview", "tPersDrive", "treaction", "tPersEstimate"),
+            *("ccoolness", "jerkmax", "epsilonacc", "taccmax", "Mflatness", "Mbegin"),
+            *("maxvehpreview", *NO_NOISE),
+        },
+        NO_NOISE,
+    ),
+    "ACC": (ACC_OPTIONS, {}),
+    "CACC": (
+        {
+            *ACC_OPTIONS,
+            *("speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot"),
+            *("gapControlGainGap", "gapControlGainGapDot", "collisionAvoidanceGainGap"),
+            "collisionAvoidanceGainGapDot",
+        },
+        {},
+    ),
+}
+"""Options of each model besides the shared ones, and its defaults that are not SUMO's: without
+noise all are deterministic."""
+
+
+class SumoKind(ControllerKind):
+    """SUMO's own driver: `sumo:MODEL?NAME=VALUE&...`."""
+
+    form = "sumo:MODEL[?OPTION=VALUE&...]"
+    what = "SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic"
+    example = '--vut "sumo:IDM?tau=1.2"'
+    own_code = False
+
+    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+        """Take model and options; `UserError` for what SUMO does not have."""
+        super().__init__(spec, options)
+        model = spec.argument
+        if model not in MODELS:
+            raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
+        own, defaults = MODELS[model]
+        known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
+        self.parameters = chosen = spec.numbers()
+        for name, value in chosen.items():
+            if name not in known:
+                raise spec.has_no(name, known)
+            least = -1 if name in LANE_CHANGE_OPTIONS else 0
+            if value < least:
+                raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
+        options_of_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
+        self.vut_type = {"carFollowModel": model, **options_of_type}
+
+    def driver(self, corridors: int, world: object) -> Driver:
+        """Return a driver in a world of SUMO."""
+        if not isinstance(world, World):
+            raise UserError(f"{self.spec} drives in a SUMO world only")
+        return SumoVut(corridors, world)
+
+
+class SumoVut(Driver):
+    """Answers what SUMO decided in its step."""
+
+    def __init__(self, corridors: int, world: World, rows: Sequence[int] = (VUT,)) -> None:
+        """Drive the vehicles in rows of a world that was opened with a vType for them.
+
+        These are the VUTs, or the cars of the mainline: then `corridors` are those of all cars.
+        """
+        super().__init__(corridors)
+        self.world, self._rows = world, list(rows)
+        self._chooses = world.road.lane_m is not None and self._rows == [VUT]
+        self._merges = np.zeros(world.corridors, dtype=np.bool_)
+
+    def act(self, scene: Scene) -> FloatArray:
+        """Return the accelerations to the speeds that SUMO decided on."""
+        v_mps = self.world.v_mps[self._rows].ravel()
+        wanted_mps = self.world.wanted_v_mps(self._rows)
+        if self._chooses:
+            self._merges = self.world.wants_to_merge()
+            stays = ~self._merges if scene.merged is None else ~(self._merges | scene.merged)
+            wanted_mps = np.where(stays, np.minimum(wanted_mps, self._stopping_mps()), wanted_mps)
+        acceleration: FloatArray = (wanted_mps - v_mps) / DT_S
+        return acceleration
+
+    def wishes(self) -> NDArray[np.int8] | None:
+        """Return whether SUMO's lane-change model merged, (K,); None without a lane."""
+        return np.where(self._merges, MERGE, STAY).astype(np.int8) if self._chooses else None
+
+    def _stopping_mps(self) -> FloatArray:
+        """Return the highest speeds from which VUTs stop before the end of their lane, (K,).
+
+        In a step SUMO moves by the new speed and eq. (4) by the old one, so a driver that brakes at
+        the last moment would come a little beyond the end.
+        """
+        _, end_m = self.world.road.lane_m or (0.0, 0.0)
+        next_m = self.world.x_m[VUT] + self.world.v_mps[VUT] * DT_S
+        return stopping_mps(end_m - END_MARGIN_M - next_m, -self.world.scenario.a_min_mps2)

@@ -1,0 +1,211 @@
+"""What counts as a failure: a criterion that is named, or a condition on the measures of a case.
+
+A criterion gives every case a margin: below 0 it fails, above 0 it does not, and how far from 0
+is said in units of the thresholds (`expression.py`), or, under the criterion of the paper, in
+units of lambda.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.metrics.criteria import CRITERIA, PAPER
+from merge_sumo.metrics.expression import Condition, Value, Vocabulary, parse_condition
+from merge_sumo.metrics.measures import MEASURES
+from merge_sumo.metrics.score import (
+    FOLLOWED_UP,
+    ON_LANE,
+    CaseVerdict,
+    Measures,
+    Outcome,
+    margin_of,
+    measure,
+    merge_score,
+)
+from merge_sumo.metrics.severity import Severity
+from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
+from merge_sumo.printable import printable
+from merge_sumo.scenario.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.suggestions import nearest
+
+TEXTS: Final = {
+    "end": frozenset(end.value for end in End if not end.is_error),
+    "severity": frozenset(severity.value for severity in Severity),
+    "merged_first": frozenset({"VUT", "POV"}),
+    "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
+}
+"""What may be said of measures that are texts. Errors have no verdict under any criterion."""
+OF_BODIES: Final = frozenset({"before_clearance_m"})
+"""Measures that need the centre lines of the road."""
+NO_TEXT: Final = frozenset({"merged_first", "severity"})
+"""Texts that an episode may be without; they count as an empty one."""
+CLOSE: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
+"""What it counts as where |dx| < 6 m: no braking would do, and there was no way out at any time."""
+
+
+@dataclass(frozen=True, slots=True)
+class Criterion:
+    """What counts as a failure; `UserError` for what is no criterion.
+
+    Attributes:
+        fail_when: the name of a criterion, or a condition over measures, as Python writes it.
+        require: what is to hold over time instead, in signal temporal logic (`temporal.py`); the
+            margin is then its robustness.
+    """
+
+    fail_when: str = PAPER
+    require: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the condition; however it is spaced, it is the same."""
+        name = self.fail_when.strip()
+        if name not in CRITERIA:
+            if name.isidentifier() and (near := nearest(name, CRITERIA)):
+                raise UserError(f"`fail_when` is {printable(name)!r}: did you mean {near[0]}?")
+            _, name = _parsed(self.fail_when)
+        object.__setattr__(self, "fail_when", name)
+        if self.require is not None:
+            if name != PAPER:
+                raise UserError("`fail_when` and `require` both say what a failure is: choose one")
+            object.__setattr__(self, "require", check_formula(self.require))
+
+    def check(self, scenario: Scenario) -> None:
+        """Raise `UserError` where it speaks of what an episode of a scenario does not have.
+
+        Also where it is no formula, or what evaluates one is missing.
+        """
+        if self.is_papers and not isinstance(scenario, MergeScenario):
+            raise UserError(
+                f"`fail_when` {PAPER} is of merges, and {scenario.name} is of kind "
+                f"{scenario.kind}: choose {scenario.criterion}, or a condition"
+            )
+        if self.require is not None:
+            try_formula(self.require)
+            return
+        spoken = condition_of(self.words).names
+        if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
+            where = scenario.said("behind M")
+            raise UserError(
+                f"`fail_when` speaks of {min(named)}, which is measured {where}: say how long "
+                "with `follow_up_s` SECONDS"
+            )
+        if lane_of(scenario) is None and (named := spoken.intersection(ON_LANE)):
+            raise UserError(
+                f"`fail_when` speaks of {min(named)}, and {scenario.name} has no acceleration "
+                "lane: choose a scenario with one, such as us23-lane"
+            )
+
+    @property
+    def is_papers(self) -> bool:
+        """Whether it is that of the paper, whose margin is that of the score."""
+        return self.fail_when == PAPER and self.require is None
+
+    @property
+    def speaks_of_score(self) -> bool:
+        """Whether it is a condition on the score, whose margin may be that of the score."""
+        return self.require is None and "score" in condition_of(self.words).names
+
+    @property
+    def text(self) -> str:
+        """What a person would write."""
+        return self.fail_when if self.require is None else f"not ({self.require})"
+
+    @property
+    def words(self) -> str:
+        """Return when a case fails, as a condition."""
+        return CRITERIA[self.text].condition if self.text in CRITERIA else self.text
+
+    def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
+        """Return the margin of an episode; None after an error."""
+        if measures.end.is_error:
+            return None
+        if self.is_papers:
+            return margin_of(measures.score)
+        if self.require is not None:
+            return robustness(self.require, trajectory)
+        condition = condition_of(self.words)
+        return condition.margin(values_of(measures, condition.names))
+
+    def outcome(
+        self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
+    ) -> Outcome:
+        """Return the outcome of an episode at a place in a campaign."""
+        measures = measure(trajectory, lines)
+        margin = self.margin(trajectory, measures)
+        return Outcome(index, batch, trajectory.case, measures, margin=margin)
+
+    def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
+        """Return the outcome of an episode of no campaign, for its verdict alone.
+
+        What takes most of the time is left out where the criterion does not speak of it: the last
+        way out, and bodies before M.
+        """
+        spoken = frozenset[str]() if self.require else condition_of(self.words).names
+        seen = lines if spoken & OF_BODIES else None
+        measures = measure(
+            trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
+        )
+        margin = self.margin(trajectory, measures)
+        return Outcome(0, 0, trajectory.case, measures, margin=margin)
+
+    def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
+        """Return the verdict on an episode, the same as that of its outcome."""
+        if self.is_papers and trajectory.case.scenario.measures is None:
+            # The score of a merge takes less time than all of its measures.
+            found = CaseVerdict(margin_of(merge_score(trajectory)), trajectory.end.is_tested)
+            return found._replace(is_tested=found.is_tested or found.failed)
+        return self.judged(trajectory, lines).verdict
+
+    def is_close_call(
+        self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
+    ) -> bool:
+        """Return whether another motion, by a rounding error in m, could have another verdict."""
+        if self.is_papers:
+            last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
+            return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
+        margin = self.judged(trajectory, lines).margin
+        return margin is not None and abs(margin) <= rounding
+
+
+PAPER_CRITERION: Final = Criterion()
+
+
+@lru_cache
+def _parsed(text: str) -> tuple[Condition, str]:
+    """Return a condition, which may name criteria, and its text as Python would write it."""
+    named = {name: criterion.condition for name, criterion in CRITERIA.items()}
+    return parse_condition(text, vocabulary(), "`fail_when`", named)
+
+
+def condition_of(text: str) -> Condition:
+    """Return the condition that a criterion states, by its words."""
+    return _parsed(text)[0]
+
+
+def vocabulary() -> Vocabulary:
+    """Return what a condition may speak of: None for a number, or all that a text may be."""
+    numbers = (name for name, one in MEASURES.items() if one.missing is not None)
+    return {**dict.fromkeys(numbers), **TEXTS}
+
+
+def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[str, Value]:
+    """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
+    missing: dict[str, Value] = dict(CLOSE) if measures.is_close else {}
+    if measures.end is End.MERGED:
+        missing["brake_after_mps2"] = math.inf
+    if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
+        missing["after_drac_mps2"] = math.inf
+    values: dict[str, Value] = {}
+    for name in vocabulary() if names is None else names:
+        value = measures.value(name)
+        if value is None:
+            value = missing.get(name, "" if name in NO_TEXT else MEASURES[name].missing)
+        values[name] = value if isinstance(value, str) else float(value or 0.0)
+    return values

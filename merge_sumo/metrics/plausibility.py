@@ -1,0 +1,97 @@
+"""Doubts about the outcomes of a campaign, in sentences: what to know before believing them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from merge_sumo.metrics.campaign_verdict import message_of
+from merge_sumo.metrics.criteria import CRITERIA
+from merge_sumo.metrics.criterion import Criterion, condition_of, values_of
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import counted, printable
+from merge_sumo.scenario.scenario import DT_S
+
+KMH_PER_MPS: Final = 3.6
+CLIPPED_SHARE: Final = 0.01
+"""Share of the steps from which on it is said that accelerations were clipped."""
+MOSTLY_CLIPPED: Final = 0.5
+"""Share of the steps above which it is a headline: the limits drove, and not the VUT."""
+_THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
+"""A measure, and the number that it is compared with."""
+
+
+def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str, int]) -> list[str]:
+    """Return sentences on what is odd about the outcomes of a campaign; none for most.
+
+    Of a criterion that says the same of all cases, a neighbour that would not. `vain` are commands
+    that changed nothing: see `in_vain`.
+    """
+    clipped = _clipped(outcomes, CLIPPED_SHARE)
+    often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
+    return [*often, *behind(outcomes), *_one_verdict(outcomes, criterion), *in_vain(vain)]
+
+
+def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield in how many cases a driver fails behind M, where a verdict stands already."""
+    wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
+    if wrong:
+        first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"
+        yield f"in {counted(len(wrong), 'case')} an error ends the follow-up, {first}"
+
+
+def in_vain(cases: Mapping[str, int]) -> list[str]:
+    """Return a sentence on commands that changed nothing, by the cases in which they were given."""
+    listed = ", ".join(f"{printable(name)} in {counted(n, 'case')}" for name, n in cases.items())
+    return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
+
+
+def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:
+    """Return a sentence on a VUT that drove at its limits in most steps; None for others."""
+    clipped = _clipped(outcomes, MOSTLY_CLIPPED)
+    return clipped and f"not driven as asked: {clipped}; check the unit and the sign of its answers"
+
+
+def _clipped(outcomes: Sequence[Outcome], share: float) -> str | None:
+    """Return in how many steps a VUT asked for more than its limits; None up to a share of them."""
+    clipped = sum(outcome.measures.clipped_steps for outcome in outcomes)
+    steps = sum(round(outcome.measures.t_end_s / DT_S) for outcome in outcomes)
+    if clipped <= share * steps:
+        return None
+    scenario = outcomes[0].case.scenario
+    return (
+        f"in {clipped} of {steps} steps the VUT asks for an acceleration outside "
+        f"{scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped"
+    )
+
+
+def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[str]:
+    """Yield a neighbour of a criterion that tells cases apart, where itself does not."""
+    judged = [outcome for outcome in outcomes if outcome.margin is not None]
+    failures = sum(outcome.failed for outcome in judged)
+    is_own = criterion.require is None and criterion.fail_when not in CRITERIA
+    if not is_own or 0 < failures < len(judged):
+        return
+    for text, why in _with_other_thresholds(criterion.words):
+        other = condition_of(text)
+        met = sum(other.margin(values_of(outcome.measures)) < 0.0 for outcome in judged)
+        if 0 < met < len(judged):
+            every = "every case fails" if failures else "no case fails"
+            yield (
+                f"{every} under {criterion.words}; with {text} ({why}) {met} of "
+                f"{counted(len(judged), 'case')} would"
+            )
+            return
+
+
+def _with_other_thresholds(condition: str) -> Iterator[tuple[str, str]]:
+    """Yield a condition with a threshold in another unit or of the other sign, and what it is."""
+    for found in _THRESHOLD.finditer(condition):
+        name, number = found[1], float(found[2])
+        others = [(-number, "the other sign")]
+        if name.endswith("_mps"):
+            others.insert(0, (number / KMH_PER_MPS, f"{number:g} km/h"))
+            others.append((number * KMH_PER_MPS, f"{number:g} m/s as km/h"))
+        for other, why in others if number else []:
+            yield f"{condition[: found.start(2)]}{other:.3g}{condition[found.end(2) :]}", why

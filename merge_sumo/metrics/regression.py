@@ -1,0 +1,62 @@
+"""The margin of a regression: how far a case is from failing with a new version alone.
+
+With margins m_new and m_old, below 0 for a failure, the margin of a regression is
+max(m_new, -m_old): it is below 0 where the new version fails and the old one passes. A sampler
+that is told this margin searches for regressions as it searches for failures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.metrics.prediction import NO_GAP, Prediction
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.scenario.case import FloatArray
+
+FARTHEST: Final = NO_GAP - 1.0
+"""Margin of a VUT that never arrives, and the largest one."""
+
+
+def regression(new: Outcome, old: Outcome, prediction: Prediction | None = None) -> Outcome:
+    """Return the outcome of a case whose failure is a regression, with its prediction.
+
+    It has the measures of the new version, and its margin is not that of the score. Without a
+    verdict on both versions it has none.
+    """
+    silent = next((outcome for outcome in (new, old) if outcome.margin is None), None)
+    if silent is not None:
+        return replace(new, measures=silent.measures, margin=None, prediction=prediction)
+    margin = max(_margin(new), -_margin(old))
+    return replace(new, margin=min(margin, FARTHEST), prediction=prediction)
+
+
+def _margin(outcome: Outcome) -> float:
+    """Return the margin of an outcome with a verdict; that of the score says less than the gap."""
+    if outcome.margin is not None and not outcome.is_by_score:
+        return outcome.margin
+    return float(margins(np.array([outcome.signed_gap], dtype=np.float64))[0])
+
+
+def margins(gap: FloatArray) -> FloatArray:
+    """Return the margins, (...), that signed gaps at M stand for, in units of the limit.
+
+    The inverse of `Outcome.signed_gap`; NaN is the gap of a VUT that never arrives.
+    """
+    share = np.abs(gap)
+    with np.errstate(divide="ignore"):
+        margin = np.where(share >= 1.0, share - 1.0, 1.0 - 1.0 / share)
+    return np.nan_to_num(margin, nan=FARTHEST, posinf=FARTHEST, neginf=-FARTHEST)
+
+
+def regression_gaps(new: FloatArray, old: FloatArray) -> FloatArray:
+    """Return what stands for the gap of a regression, (...), by the signed gaps of both versions.
+
+    It is `Outcome.signed_gap` of `regression`: within 1 for a regression, with the sign of the new
+    version's gap.
+    """
+    margin = np.minimum(np.maximum(margins(new), -margins(old)), FARTHEST)
+    size = np.where(margin >= 0.0, 1.0 + margin, 1.0 / (1.0 - np.minimum(margin, 0.0)))
+    return np.asarray(np.where(new < 0.0, -size, size), dtype=np.float64)

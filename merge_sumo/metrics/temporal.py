@@ -1,0 +1,153 @@
+"""Requirements over time: signal temporal logic over the signals of an episode, by rtamt.
+
+A formula says what is to hold, such as `always (v_vut_mps > 2)`. Its robustness at the begin of the
+episode (Donze and Maler, 2010) is above 0 where it holds and below where it does not, in the units
+of the signals. rtamt (Nickovic and Yamaguchi, 2020) imports modules that a formula names, so that
+only words and signs of our own get to it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
+from merge_sumo.printable import printable
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
+from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.suggestions import meant
+
+SIGNALS: Final = (
+    *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
+    *("dx_m", "dv_mps", "bumper_gap_m", "ttc_s"),
+)
+"""What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
+NEVER_S: Final = 100.0
+"""The time to collision where no gap closes, and the longest."""
+LAST_PYTHON: Final = (3, 12)
+"""The last one that the parser of rtamt runs on."""
+WORDS: Final = (
+    *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
+    *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
+)
+FINITE: Final = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
+"""Parts of a formula that have numbers, by rtamt's names; infinite, they would decide by chance."""
+_TOKEN: Final = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
+_BOUNDS: Final = re.compile(r"\[([^\]]*)\]")
+_NUMBER: Final = re.compile(r"\d+\.?\d*|\.\d+")
+
+
+def check_formula(text: str) -> str:
+    """Return a formula on one line, with single spaces; `UserError` where a word or sign is none.
+
+    Whether it is one as a whole, `try_formula` says.
+    """
+    what = f"`require` {printable(text[:80])!r}"
+    if len(text) > MOST_CHARACTERS:
+        raise UserError(f"`require` has {len(text)} characters: {MOST_CHARACTERS} are the most")
+    place = depth = 0
+    while place < len(text):
+        token = _TOKEN.match(text, place)
+        if token is None:
+            sign = printable(text[place])
+            raise UserError(
+                f"{what}: at character {place + 1}: {sign!r} is no part of a formula over signals"
+            )
+        word = token[0]
+        if (word[0].isalpha() or word[0] == "_") and word not in (*SIGNALS, *WORDS):
+            hint = meant(word, (*SIGNALS, *WORDS))
+            hint = hint or f"choose {', '.join(SIGNALS)}"
+            raise UserError(
+                f"{what}: at character {place + 1}: there is no signal {word!r}: {hint.strip()}"
+            )
+        depth += (word == "(") - (word == ")")
+        if depth < 0:
+            raise UserError(f"{what}: a bracket is closed that was not opened")
+        place = token.end()
+    for bounds in _BOUNDS.findall(text):
+        ends_s = [float(number) for number in _NUMBER.findall(bounds)]
+        if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
+            raise UserError(f"{what}: no episode has a time [{bounds}], in seconds")
+    return " ".join(text.split())
+
+
+def try_formula(text: str) -> None:
+    """Raise `UserError` where a checked formula is none, or rtamt is missing."""
+    try:
+        _robustness(text, {name: np.ones(2) for name in SIGNALS})
+    except ImportError as error:
+        how = "pip install 'merge-sumo[stl]'"
+        if sys.version_info[:2] > LAST_PYTHON:
+            how = "it runs up to Python {}.{}; use that, or a condition with `fail_when`".format(
+                *LAST_PYTHON
+            )
+        raise UserError(f"`require` needs rtamt: {how}") from error
+    except UserError:
+        raise
+    # A parser that is not ours.
+    except Exception as error:
+        raise UserError(
+            f"`require` {text[:80]!r} is no formula of signal temporal logic such as 'always "
+            f"((x_vut_m > -20) implies (bumper_gap_m > 2))': {printable(str(error))[:200]}"
+        ) from error
+
+
+def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
+    """Return the signals of an episode by name, (T + 1,), with those of the follow-up behind M."""
+    motion = trajectory.whole
+    scenario = trajectory.case.scenario
+    (x_pov, v_pov, a_pov), (x_vut, v_vut, a_vut) = (
+        motion[:, row].T for row in (trajectory.nearest, 1)
+    )
+    dx, dv = x_pov - x_vut, v_pov - v_vut
+    gap = np.abs(dx) - np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
+    closing = np.where(dx >= 0.0, -dv, dv)
+    ttc = np.full(len(gap), NEVER_S)
+    np.divide(np.maximum(gap, 0.0), closing, out=ttc, where=closing > 0.0)
+    values = (x_pov, v_pov, a_pov, x_vut, v_vut, a_vut, dx, dv, gap, np.minimum(ttc, NEVER_S))
+    return dict(zip(SIGNALS, values, strict=True))
+
+
+def robustness(text: str, trajectory: Trajectory) -> float:
+    """Return the robustness of a formula at the begin of an episode: finite, and never 0."""
+    value = _robustness(text, signals(trajectory))
+    size = min(max(abs(value), LEAST_MARGIN), MOST_MARGIN)
+    return size if value > 0.0 else -size
+
+
+def _robustness(text: str, values: dict[str, FloatArray]) -> float:
+    steps = len(values[SIGNALS[0]])
+    time_s = [round(step * DT_S, 1) for step in range(steps)]
+    data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
+    specification = _specification(text)
+    value = float(specification.evaluate(data)[0][1])
+    # A minimum or a maximum over time hides what is no number, so that every part is looked at; an
+    # operator with bounds in time appends infinities to its part.
+    for node, part in specification.ast.offline_results.items():
+        if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
+            raise UserError(
+                f"`require` {printable(text[:80])!r} calculates with infinity: prev and next are "
+                "infinite where no step is, so put them around a comparison, not into it; and "
+                "write no number that large"
+            )
+    return value
+
+
+@lru_cache(maxsize=8)
+def _specification(text: str) -> Any:
+    import rtamt
+
+    specification = rtamt.StlDiscreteTimeOfflineSpecification()
+    for name in SIGNALS:
+        specification.declare_var(name, "float")
+    specification.set_sampling_period(100, "ms", 0.1)
+    specification.spec = f"({text})"  # what stands behind a formula would not be read
+    specification.parse()
+    return specification

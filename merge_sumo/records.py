@@ -1,0 +1,306 @@
+"""Records by declaration: JSON and TOML into typed values, or one sentence on what is wrong.
+
+What a record may hold is what the annotations of its class say, with bounds as `Meta`. Reading is
+strict: texts and true are not numbers, and 18 is 18.0 where a number may have a fraction.
+Unknown names, numbers beyond float64, half characters and endless nesting are refused, since the
+file may be another person's.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Container, Sequence
+from dataclasses import is_dataclass
+from enum import Enum
+from functools import cache
+from operator import methodcaller
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from merge_sumo.errors import UserError
+from merge_sumo.folders import read_limited, regular
+from merge_sumo.suggestions import meant
+
+T = TypeVar("T")
+
+WORDS: Final[dict[Any, str]] = {
+    bool: "True or False",
+    int: "a whole number",
+    float: "a number",
+    str: "a text",
+    tuple[float, float]: "two numbers, [low, high]",
+    tuple[int, ...]: "a list of whole numbers",
+    tuple[float, ...]: "a list of numbers",
+    tuple[str, ...]: "a list of texts",
+}
+"""Types of fields in words; another type is a table of names and values."""
+MAX_RECORD_BYTES: Final = 1 << 28
+"""A larger JSON file is not read."""
+MAX_TOML_BYTES: Final = 1 << 20
+"""A larger file is not read, and so not written: some 6,000 cases."""
+_NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
+
+
+class RecordError(UserError):
+    """A value that is not a record of its type."""
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of values that are a line or a table of a file."""
+
+
+def record_type(name: str, fields: Sequence[tuple[Any, ...]]) -> Any:
+    """Return a type of records with fields that are known at run time: (name, type[, default])."""
+    return msgspec.defstruct(name, fields, bases=(Record,), frozen=True, forbid_unknown_fields=True)
+
+
+def decode(content: bytes | str, kind: Any = Any) -> Any:
+    """Return JSON as a value of a type; `RecordError` where it is none."""
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except msgspec.ValidationError as error:
+        record = None if kind is Any else decode(content)
+        raise RecordError(_sentence(error, record, kind)) from error
+    except RecursionError as error:
+        raise RecordError("it is nested too deeply") from error
+    except (msgspec.DecodeError, ValueError) as error:
+        raise RecordError(f"it is no JSON ({error})") from error
+
+
+def read_record(path: Path, kind: type[T]) -> T | None:
+    """Return a JSON file as a value of a type; None without the file.
+
+    Raises `UserError` for a file that is not as it was written.
+    """
+    try:
+        known: T = decode(read_limited(path, MAX_RECORD_BYTES), kind)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from error
+    except UserError as error:
+        raise UserError(f"{path} is not as it was written: {error}") from error
+    return known
+
+
+def convert(record: object, kind: type[T], *, strict: bool = True) -> T:
+    """Return plain values, as JSON and TOML have them, as a value of a type.
+
+    Args:
+        record: the values.
+        kind: the type.
+        strict: False where texts stand for numbers, as in XML.
+
+    Raises:
+        RecordError: the values are others, or have names that a dataclass does not have.
+    """
+    _check_names(record, kind)
+    try:
+        return msgspec.convert(record, kind, strict=strict)
+    except msgspec.ValidationError as error:
+        raise RecordError(_sentence(error, record, kind)) from error
+    except RecursionError as error:
+        raise RecordError("it is nested too deeply") from error
+
+
+def _check_names(record: object, kind: Any) -> None:
+    """Raise `RecordError` for a name that a dataclass, or one in its fields, does not have."""
+    if not (is_dataclass(kind) and isinstance(record, dict)):
+        return
+    hints = _hints(kind)  # type: ignore[arg-type]
+    for name, value in record.items():
+        if name not in hints:
+            raise RecordError(_unknown(name, kind))
+        _check_names(value, hints[name])
+
+
+def check_fields(value: Any) -> None:
+    """Check and convert the fields of a dataclass in place: 18 to 18.0, a list to a tuple.
+
+    Numbers of numpy are as good as those of Python. Raises `RecordError` for another type.
+    """
+    kind: Any = type(value)
+    for name, hint in _hints(kind).items():
+        known = getattr(value, name)
+        if isinstance(hint, type) and is_dataclass(hint) and isinstance(known, hint):
+            continue  # also of a subclass, which msgspec takes for another type
+        plain = known.item() if isinstance(known, np.generic) else known
+        try:
+            object.__setattr__(value, name, msgspec.convert(plain, hint))
+        except msgspec.ValidationError as error:
+            raise RecordError(_not_a_value(name, known, hint, str(error))) from error
+
+
+def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
+    """Return the lines of a JSON-lines file by their `index`; nothing without the file.
+
+    Args:
+        path: the file.
+        kind: what each line is.
+        indices: those that a line may have.
+
+    Raises:
+        RecordError: a line is not of that kind, or has another index or that of an earlier line.
+    """
+    try:
+        lines = regular(path).read_bytes().splitlines()
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise RecordError(f"{path} cannot be read: {error.strerror}") from error
+    values: dict[int, T] = {}
+    for number, line in enumerate(lines, start=1):
+        try:
+            value: Any = convert(decode(line, dict[str, Any]), kind)
+            if value.index not in indices or value.index in values:
+                raise RecordError(f"it is of case {value.index}, of which no such line can be")
+        except UserError as error:
+            line_of = f"line {number} of {path}"
+            raise RecordError(f"{line_of} is not as it was written: {error}") from error
+        values[value.index] = value
+    return values
+
+
+def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
+    """Return the text of a TOML file, and its record; `what` it holds stands in the sentences.
+
+    Raises `UserError` where it cannot be read or is no TOML.
+    """
+    try:
+        text = read_limited(path, MAX_TOML_BYTES).decode()
+    except OSError as error:
+        raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"the {what} {path} is no text in UTF-8") from error
+    try:
+        return text, tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise UserError(f"the {what} {path} is no TOML: {error}") from error
+
+
+def check_toml_size(content: bytes, path: Path) -> None:
+    """Raise `UserError` where a file of this content is one that `read_toml` refuses."""
+    if len(content) > MAX_TOML_BYTES:
+        size = f"{MAX_TOML_BYTES // 2**20} MiB"
+        raise UserError(f"cannot write {path}: it is larger than {size}; name fewer cases")
+
+
+def toml_value(value: object) -> str:
+    """Return plain values as TOML has them, in a line, numbers in full."""
+    if isinstance(value, dict):
+        named = []
+        for name, of in value.items():
+            is_bare = name.isascii() and name.isidentifier()
+            named.append(f"{name if is_bare else toml_value(name)} = {toml_value(of)}")
+        return f"{{{', '.join(named)}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def to_plain(value: object) -> Any:
+    """Return a value as the lists and tables that JSON has; a number of numpy is one of Python."""
+    return msgspec.to_builtins(value, enc_hook=methodcaller("item"))
+
+
+def to_json(value: object, *, indent: int | None = None) -> bytes:
+    """Return a value as JSON, with its line end; `ValueError` for a number that is not finite."""
+    return (json.dumps(to_plain(value), indent=indent, allow_nan=False) + "\n").encode()
+
+
+def replaced(value: T, **changes: Any) -> T:
+    """Return a record with other values in some fields."""
+    return msgspec.structs.replace(value, **changes)  # type: ignore[type-var]
+
+
+def in_words(hint: Any) -> str:
+    """Return the values of a type in words, for "it must be ..."."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        meta: Meta = parts[1]
+        limits = "" if meta.gt is None else f" above {meta.gt:g}"
+        limits += "" if meta.ge is None else f" of {meta.ge:g} or more"
+        limits += "" if meta.le is None else f", up to {meta.le:g}"
+        return meta.description or in_words(parts[0]) + limits
+    if origin in (Union, UnionType):
+        words = dict.fromkeys(in_words(part) for part in parts if part is not NoneType)
+        return " or ".join(words)
+    if origin is Literal:
+        return f"one of {', '.join(parts)}"
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return f"one of {', '.join(str(member.value) for member in hint)}"
+    return WORDS.get(hint, "a list" if origin is tuple else "a table of names and values")
+
+
+@cache
+def _hints(kind: type) -> dict[str, Any]:
+    hints = get_type_hints(kind, include_extras=True).items()
+    return {name: hint for name, hint in hints if get_origin(hint) is not ClassVar}
+
+
+def _unknown(name: object, kind: Any) -> str:
+    known = list(_hints(kind))
+    hint = meant(str(name), known) or f"it has {', '.join(known)}"
+    return f"{kind.__name__.lower()} has no {name!r:.60}: {hint.strip()}"
+
+
+def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
+    """Return a sentence on a record: the field, its value, and what it must be."""
+    message = str(error)
+    place = re.search(r" - at `\$([^`]*)`$", message)
+    names = re.findall(r"\.(\w+)", place[1]) if place else []
+    for name in names:
+        table = record if isinstance(record, dict) else {}
+        # The type of a field, or the tags that tell records of a union apart.
+        tags = tuple(_tag(known) for known in get_args(kind) if _is_record(known))
+        kind = _hints(_class_of(table, kind)).get(name, Literal[tags])
+        record = table.get(name)
+    name = names[-1] if names else "it"
+    wrong = _NAMED.match(message)
+    if wrong and wrong[1] == "missing required":
+        return f"{name} has no {wrong[2]}"
+    if wrong:
+        return _unknown(wrong[2], _class_of(record, kind))
+    return _not_a_value(name, record, kind, message)
+
+
+def _class_of(table: dict[str, Any], hint: Any) -> Any:
+    """Return the class that a type means; of a union, the record of the kind that a table names."""
+    classes = [part for part in get_args(hint) if _is_record(part) or is_dataclass(part)] or [hint]
+    named = (known for known in classes if _is_record(known) and _tag(known) == table.get("kind"))
+    return next(named, classes[0])
+
+
+def _is_record(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, Record)
+
+
+def _tag(kind: Any) -> Any:
+    return kind.__struct_config__.tag
+
+
+def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
+    try:
+        shown = f"{value!r:.60}"
+    except (ValueError, RecursionError):  # thousands of digits, or of brackets
+        shown = "something endless"
+    finite = "out of range" in message
+    return f"{name} is {shown}: it must be {'finite' if finite else in_words(hint)}"

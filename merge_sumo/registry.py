@@ -1,0 +1,157 @@
+"""Registries of samplers, controllers and measures, of this package and by entry points.
+
+A registry names what it holds without importing it: names of this package stand in the registry,
+names of others in the metadata of installed packages. An object is imported when it is asked for.
+Only installed packages, which the user chose, are searched; the working folder is data.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from functools import lru_cache
+from importlib.metadata import EntryPoint, distributions
+from typing import Final, Generic, TypeVar
+from warnings import warn
+
+from merge_sumo.errors import Notice, UserError
+from merge_sumo.suggestions import meant
+
+T = TypeVar("T")
+
+OURS: Final = "merge-sumo"
+
+
+class Registry(Mapping[str, T], Generic[T]):
+    """Objects of one kind by name: those of this package in their order, then installed ones.
+
+    It is read like a dictionary. An unknown name, a name that stands twice, and an object that
+    cannot be loaded or is of another kind raise `UserError`.
+
+    Args:
+        group: group of entry points, as `merge_sumo.samplers`.
+        noun: what it holds, in the singular.
+        ours: objects of this package by name, or `module:attribute` for an import when needed.
+        accepts: whether a loaded object is of the kind.
+        contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
+    """
+
+    def __init__(
+        self,
+        group: str,
+        noun: str,
+        ours: Mapping[str, str | T],
+        *,
+        accepts: Callable[[object], bool],
+        contract: str,
+    ) -> None:
+        self.group, self.noun = group, noun
+        self._accepts, self._contract = accepts, contract
+        self._ours: dict[str, EntryPoint | T] = {}
+        for name, item in ours.items():
+            self._ours[name] = EntryPoint(name, item, group) if isinstance(item, str) else item
+
+    def register(self, name: str, item: T) -> T:
+        """Add an object in this process; `UserError` where the name is taken.
+
+        Processes that this one starts do not know it: an entry point reaches them, too.
+        """
+        if name in self:
+            raise UserError(f"the {self.noun} {name!r} is registered already: choose another name")
+        self._ours[name] = self._checked(name, item, "this process")
+        return item
+
+    @property
+    def ours(self) -> frozenset[str]:
+        """The names of this package."""
+        return frozenset(self._ours)
+
+    @property
+    def packages(self) -> list[str]:
+        """The installed packages that add to it, in the order of their names."""
+        return sorted({package for found in entries_of(self.group).values() for package in found})
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(dict.fromkeys((*self._ours, *entries_of(self.group))))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._ours or name in entries_of(self.group)
+
+    def __getitem__(self, name: str) -> T:
+        bringers: dict[str, EntryPoint | T] = dict(entries_of(self.group).get(name, {}))
+        if name in self._ours:
+            bringers[OURS] = self._ours[name]
+        if len(bringers) > 1:
+            packages = " and ".join(sorted(bringers))
+            raise UserError(
+                f"{packages} bring a {self.noun} {name!r}: uninstall all but one of them"
+            )
+        if not bringers:
+            raise UserError(
+                f"there is no {self.noun} {name!r}: {meant(name, self)}choose one of "
+                f"{', '.join(self)}"
+            )
+        ((package, entry),) = bringers.items()
+        if not isinstance(entry, EntryPoint):
+            return entry
+        try:
+            item = entry.load()
+        except (Exception, SystemExit) as error:
+            raise UserError(
+                f"the {self.noun} {entry.name!r} of {package} cannot be loaded from "
+                f"{entry.value}: {type(error).__name__}: {error}"
+            ) from error
+        return self._checked(name, item, package)
+
+    def _checked(self, name: str, item: T, package: str) -> T:
+        if not self._accepts(item):
+            raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
+        own = getattr(item, "name", name)
+        if isinstance(own, str) and own != name:
+            raise UserError(
+                f"the {self.noun} {name!r} of {package} names itself {own!r}: register it by that "
+                "name"
+            )
+        return item
+
+
+def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
+    """Return the installed entry points of a group, by name and then by package.
+
+    Nothing is imported, and nothing in the working folder, where lies what somebody sent, is found.
+    """
+    with suppress(OSError):  # the working folder may be gone
+        return _installed(group, tuple(sys.path), os.getcwd())  # noqa: PTH109
+    return {}
+
+
+@lru_cache(maxsize=64)
+def _installed(
+    group: str, folders: tuple[str, ...], working_folder: str
+) -> dict[str, dict[str, EntryPoint]]:
+    here = os.path.realpath(working_folder)
+    searched = [folder for folder in folders if folder and os.path.realpath(folder) != here]
+    entries: dict[str, dict[str, EntryPoint]] = {}
+    packages: set[str] = set()
+    for package in distributions(path=searched):
+        try:
+            selected = package.entry_points.select(group=group)
+            name = str(package.metadata["Name"]) if selected else ""
+        except ValueError as error:  # not UTF-8, or no entry points
+            where = package.locate_file("")
+            warn(f"left out the entry points of a package in {where}: {error}", Notice, 2)
+            continue
+        # The name takes most of the time; the first package of a name shadows others.
+        if not selected or name in packages:
+            continue
+        packages.add(name)
+        for entry in selected:
+            # Where the backport of importlib.metadata is imported, as by Dask, entries are its own.
+            plain = EntryPoint(entry.name, entry.value, group)
+            entries.setdefault(entry.name, {})[name] = plain
+    return entries

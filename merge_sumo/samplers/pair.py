@@ -1,0 +1,49 @@
+"""The twins of two versions of a VUT: together they predict where the versions differ."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from merge_sumo.metrics.regression import regression_gaps
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.samplers.twin import Twin
+from merge_sumo.scenario.case import FloatArray
+
+
+class TwinPair:
+    """Predicts what stands for the gap of a regression; see `Predictor` and `regression`.
+
+    Each member of the new version's twin is paired with the member of the old version's twin that
+    learned from the same cases.
+    """
+
+    def __init__(self, new: Twin, old: Twin) -> None:
+        """Take a twin of each version."""
+        self._new, self._old = new, old
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the new version and their motions, (T + 1, A, 3), by index."""
+        self._new.tell(outcomes, motions)
+
+    def tell_old(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the old version and their motions, in the same way."""
+        self._old.tell(outcomes, motions)
+
+    def can_predict(self, level: int) -> bool:
+        """Return whether both twins can predict cases of a level."""
+        return self._new.can_predict(level) and self._old.can_predict(level)
+
+    def predict(
+        self,
+        level: int,
+        points: FloatArray,
+        *,
+        screening: int | None = None,
+        held_out: Sequence[int] = (),
+    ) -> FloatArray:
+        """Return what stands for the gap of a regression in each case; see `Predictor`."""
+        new, old = (
+            twin.predict(level, points, screening=screening, held_out=held_out)
+            for twin in (self._new, self._old)
+        )
+        return regression_gaps(new, old)

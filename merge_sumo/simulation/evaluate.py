@@ -1,0 +1,204 @@
+"""From a plan and cases to episodes. Whatever runs cases does it here.
+
+A process keeps its simulator open from one chunk of cases to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from threading import RLock
+from typing import Any, TypeVar, overload
+
+import numpy as np
+
+from merge_sumo.errors import UserError
+from merge_sumo.hashing import hashed
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.score import Outcome, measure_all
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
+from merge_sumo.simulation.plan import Engine, SimulationPlan
+from merge_sumo.simulation.simulator import Simulator
+from merge_sumo.workers import Workers, when_worker_ends
+
+R = TypeVar("R")
+
+
+@overload
+def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]: ...
+@overload
+def simulate(
+    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], R]
+) -> list[R]: ...
+def simulate(
+    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], Any] | None = None
+) -> list[Any]:
+    """Run cases in this process; return their episodes in order.
+
+    Where the plan has an earlier version of the VUT, each episode has that of the earlier version.
+
+    Args:
+        plan: how they run.
+        cases: cases of the plan's scenario.
+        keep: gives the part of an episode that is returned, by default all of it.
+
+    Raises:
+        UserError: if the plan cannot be carried out.
+    """
+    cases = list(cases)
+    if plan.against is not None:
+        both = _simulate_both(plan, cases)
+        return both if keep is None else list(map(keep, both))
+    with opened_simulator(plan) as simulator:
+        trajectories = simulator.run(cases)
+        outcomes = _measured(plan, trajectories)
+        files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
+        episodes = []
+        for place, (outcome, trajectory) in enumerate(zip(outcomes, trajectories, strict=True)):
+            episode = Episode(
+                outcome,
+                trajectory,
+                files,
+                pov_files,
+                again=place in simulator.ran_again,
+                in_sumo=place in simulator.in_sumo,
+            )
+            episodes.append(episode)
+        return episodes if keep is None else list(map(keep, episodes))
+
+
+def lost(plan: SimulationPlan, case: Case) -> Episode:
+    """Return the episode of a case that ended its worker process each time that it ran."""
+    start = [[(x, v, 0.0) for x, v in case.starts()]]
+    error = "its worker process died twice"
+    trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, error)
+    (outcome,) = _measured(plan, [trajectory])
+    episode = Episode(outcome, trajectory)
+    return episode if plan.against is None else replace(episode, earlier=episode)
+
+
+@overload
+def evaluate(
+    plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None = None
+) -> Iterator[tuple[int, Episode]]: ...
+@overload
+def evaluate(
+    plan: SimulationPlan,
+    cases: Sequence[Case],
+    workers: Workers | None,
+    keep: Callable[[Episode], R],
+) -> Iterator[tuple[int, R]]: ...
+def evaluate(
+    plan: SimulationPlan,
+    cases: Sequence[Case],
+    workers: Workers | None = None,
+    keep: Callable[[Episode], Any] | None = None,
+) -> Iterator[tuple[int, Any]]:
+    """Simulate cases on workers; return (place in `cases`, result) in order, as they end.
+
+    Args:
+        plan: how they run.
+        cases: cases of the plan's scenario.
+        workers: where they run; None for this process, which keeps its simulator open.
+        keep: gives the part of an episode that travels to this process, by default all of it. A
+            function that is found by its name.
+
+    Raises:
+        UserError: if the plan cannot be carried out.
+    """
+
+    def lost_result(case: Case) -> Any:
+        return lost(plan, case) if keep is None else keep(lost(plan, case))
+
+    available = Workers(None, 1) if workers is None else workers
+    chunk = CHUNK if plan.engine is Engine.KINEMATIC else None
+    return available.run(partial(simulate, plan, keep=keep), cases, lost_result, chunk=chunk)
+
+
+def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
+    """Open the simulator of a plan in a worker, and have all workers started.
+
+    Raises:
+        UserError: if the plan cannot be carried out.
+    """
+
+    def died(_: None) -> None:
+        own = plan.povs.own
+        pov = "" if own is None else f" or the POV {own.spec}"
+        raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
+
+    workers.collect(workers.submit(partial(_open_simulators, plan), [[None]], died))
+
+
+_kept: tuple[tuple[object, ...], Simulator] | None = None
+"""The simulator of this process, with the key of its plan: it stays open between chunks."""
+_one_at_a_time = RLock()
+"""libsumo holds one simulation per process, and some clusters give a process several threads."""
+
+
+@contextmanager
+def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
+    """Give the simulator of this process, which stays open for the next chunk of the same plan."""
+    global _kept  # noqa: PLW0603 (one SUMO per process)
+    with _one_at_a_time:
+        try:
+            if _kept is None or _kept[0] != _key(plan):
+                close_simulator()
+                plan.check_software()
+                kind = KinematicSimulator if plan.engine is Engine.KINEMATIC else Simulator
+                _kept = _key(plan), (SubstepSimulator if plan.substeps > 1 else kind)(plan)
+                when_worker_ends(close_simulator)
+            yield _kept[1]
+        except BaseException:
+            close_simulator()  # its episodes have not ended
+            raise
+
+
+def close_simulator() -> None:
+    """Close the simulator that this process keeps, if any."""
+    global _kept
+    with _one_at_a_time:
+        if _kept is not None:
+            simulator, _kept = _kept[1], None
+            simulator.close()
+
+
+def _key(plan: SimulationPlan) -> tuple[object, ...]:
+    """Return what decides whether a simulator serves a plan."""
+    return plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors, plan.substeps
+
+
+def _measured(plan: SimulationPlan, trajectories: Sequence[Trajectory]) -> list[Outcome]:
+    """Return the outcomes of trajectories."""
+    measured = measure_all(trajectories, centre_lines(plan.road))
+    outcomes = []
+    for place, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
+        margin = plan.criterion.margin(trajectory, measures)
+        outcomes.append(Outcome(place, 0, trajectory.case, measures, margin=margin))
+    return outcomes
+
+
+def _simulate_both(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
+    """Run cases with both versions of the VUT, first with the one whose simulator is open."""
+    new, old = replace(plan, against=None), plan.earlier
+    assert old is not None, "the plan has two versions"  # noqa: S101
+    if _kept is not None and _kept[0] == _key(old):
+        before = simulate(old, cases)
+        after = simulate(new, cases)
+    else:
+        after = simulate(new, cases)
+        before = simulate(old, cases)
+    return [replace(a, earlier=b) for a, b in zip(after, before, strict=True)]
+
+
+def _open_simulators(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[None]:
+    earlier = plan.earlier
+    if earlier is not None:
+        _open_simulators(earlier, nothing)
+    with opened_simulator(replace(plan, against=None)):
+        return nothing

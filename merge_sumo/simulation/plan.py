@@ -1,0 +1,210 @@
+"""The plan of a simulation: everything that decides what becomes of a case."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from enum import StrEnum
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.spec import runs_code
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.measures import MEASURES
+from merge_sumo.road.corridor import Corridor
+from merge_sumo.scenario.scenario import OWN, Scenario, lane_of
+from merge_sumo.simulation.povs import Povs
+from merge_sumo.workers import AnyWorkers
+
+MAX_CORRIDORS: Final = 32
+"""Episodes that one process runs at a time."""
+
+
+class Engine(StrEnum):
+    """What moves the vehicles of a case."""
+
+    SUMO = "sumo"
+    KINEMATIC = "kinematic"
+    """Eq. (4) alone, with a share of the cases in SUMO, too (`kinematic_simulator.py`)."""
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software that decide the outcome of a case.
+
+    Packages that bring measures or criteria are among it: records and verdicts depend on them.
+    """
+    extensions = MEASURES.packages
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn", *extensions)
+    return {"python": platform.python_version()} | {name: _installed(name) for name in packages}
+
+
+@cache
+def _installed(package: str) -> str:
+    """Return the version of a package, as it was when this process first asked: it is loaded."""
+    return version(package)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class SimulationPlan:
+    """What it takes to run cases in any process; it travels to workers with every chunk.
+
+    Attributes:
+        scenario: the scenario, with its follow-up behind M.
+        road: the road on which it takes place.
+        vut: the VUT.
+        povs: the drivers of the mainline.
+        criterion: when a case fails.
+        against: an earlier version of the VUT, with which each case runs, too.
+        engine: what moves the vehicles; campaigns take SUMO.
+        corridors: the most episodes at a time in SUMO; decides no outcome.
+        substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more
+            than one. Drivers are asked once a step.
+        versions: those of the software that gives the outcomes; by default of this process.
+        policies_sha256: hashes of the learned drivers; by default of those that this process finds.
+    """
+
+    scenario: Scenario
+    road: Corridor
+    vut: VutFactory
+    povs: Povs
+    criterion: Criterion
+    against: VutFactory | None = None
+    engine: Engine = Engine.SUMO
+    corridors: int = MAX_CORRIDORS
+    substeps: int = 1
+    versions: Mapping[str, str] = field(default_factory=versions)
+    policies_sha256: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Note the learned drivers, unless they are given.
+
+        Raises `UserError` where the VUT cannot sense as the scenario says.
+        """
+        if not self.scenario.sense.is_perfect and self.vut.vut.vut_type is not None:
+            raise UserError(
+                f"the VUT {self.vut.spec} sees other cars in SUMO itself, where `sense` does not "
+                "reach: leave it away (`act` is for every VUT)"
+            )
+        if not self.policies_sha256:
+            object.__setattr__(self, "policies_sha256", self.povs.sha256())
+
+    def key(self, level: int = OWN) -> dict[str, Any]:
+        """Return what decides the outcomes of cases at a level, as plain values for JSON.
+
+        The files of a VUT are left out, as they are known in full only after it drove: what is kept
+        under a key has their hashes beside it. Instead the working folder counts where a user's
+        code runs, because the same name may be another file in another folder.
+        """
+        own = self.povs.own if level == OWN else None
+        vut, pov = str(self.vut.spec), None if own is None else str(own.spec)
+        code = runs_code(vut) or (pov is not None and runs_code(pov))
+        return {
+            "vut": vut,
+            "deadline_s": self.vut.options.deadline_s,
+            "pov": pov,
+            "folder": str(Path.cwd()) if code else None,
+            "policies_sha256": dict(self.policies_sha256),
+            "road_sha256": self.road.sha256,
+            "scenario": self.scenario.to_record(),
+            "criterion": asdict(self.criterion),
+            "versions": dict(self.versions),
+        }
+
+    @property
+    def earlier(self) -> SimulationPlan | None:
+        """The plan of the earlier version of the VUT, if the cases run with one."""
+        if self.against is None:
+            return None
+        return replace(self, vut=self.against, against=None)
+
+    def at_level(self, level: int) -> SimulationPlan:
+        """Return the plan for the cases of a level, which a POV of another level does not meet."""
+        if level == OWN:
+            return self
+        return replace(self, povs=replace(self.povs, own=None))
+
+    def for_verdicts(self) -> SimulationPlan:
+        """Return the plan for verdicts alone: where these are those of M, without a follow-up."""
+        if not self.criterion.is_papers or lane_of(self.scenario) is not None:
+            return self
+        return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
+
+    def with_engine(self, engine: str | None) -> SimulationPlan:
+        """Return the plan with an engine; None is the kinematic one where the drivers allow it.
+
+        Raises `UserError` for an unknown name, and where the drivers do not allow it.
+        """
+        if engine is None:
+            kinematic = self.needs_sumo is None
+            return replace(self, engine=Engine.KINEMATIC if kinematic else Engine.SUMO)
+        if engine not in list(Engine):
+            raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
+        if engine == Engine.KINEMATIC and self.needs_sumo is not None:
+            raise UserError(f"`engine` kinematic: {self.needs_sumo}; choose `engine` sumo")
+        return replace(self, engine=Engine(engine))
+
+    @property
+    def needs_sumo(self) -> str | None:
+        """Why cases run in SUMO alone, in a clause; None where eq. (4) moves vehicles as well."""
+        if self.povs.own is not None:
+            return f"the POV {self.povs.own.spec} is none of this package"
+        if not self.vut.kind.by_arrays:
+            return f"the VUT {self.vut.spec} is none of this package"
+        return None
+
+    @property
+    def asks_sumo(self) -> bool:
+        """Whether the VUT, or a POV that is none of this package, asks SUMO anything."""
+        own = self.povs.own
+        return self.vut.kind.asks_sumo or (own is not None and own.kind.asks_sumo)
+
+    def workers(self, requested: AnyWorkers) -> int | str:
+        """Return the number of processes that run cases: as many as VUT and POV can serve.
+
+        Those at an address are taken as they are. Raises `UserError` where more are requested than
+        that.
+        """
+        if isinstance(requested, str):
+            return requested
+        most, own = self.vut.workers(requested), self.povs.own
+        return most if own is None else min(most, own.workers(requested))
+
+    def for_cases(self, cases: int) -> SimulationPlan:
+        """Return the plan with no more corridors than there are cases to run at a time."""
+        return replace(self, corridors=min(self.corridors, cases))
+
+    def with_log(self, log: Path) -> SimulationPlan:
+        """Return the plan with what a user's drivers print added to a file."""
+        against = None if self.against is None else self.against.with_log(log)
+        povs = self.povs.with_log(log)
+        return replace(self, vut=self.vut.with_log(log), against=against, povs=povs)
+
+    def check_software(self) -> None:
+        """Raise `UserError` where the software of this process would give other outcomes."""
+        for name, (expected, present) in differences(dict(self.versions), versions()).items():
+            raise UserError(
+                f"a worker has {name} {present}, and this process {expected}: install the same "
+                "there"
+            )
+        for name in differences(dict(self.policies_sha256), self.povs.sha256()):
+            raise UserError(
+                f"a worker has another policy {name} in {self.povs.policies} than this process, or "
+                "none: put the same files there"
+            )
+
+
+def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
+    """Return by name where two records differ, with both values; None for one that is missing."""
+    if isinstance(was, dict) and isinstance(now, dict):
+        differing: dict[str, tuple[Any, Any]] = {}
+        for key in now | was:
+            inner = f"{name}.{key}" if name else key
+            differing |= differences(was.get(key), now.get(key), inner)
+        return differing
+    was, now = (list(value) if isinstance(value, tuple) else value for value in (was, now))
+    return {} if was == now else {name: (was, now)}

@@ -1,0 +1,349 @@
+"""From cases to trajectories: two drivers in the SUMO world, or by eq. (4) alone."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.following import Following
+from merge_sumo.drivers.lane import Merging
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
+from merge_sumo.scenario.signals import Left, series
+from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.sumo.world import SimulationError, World
+
+RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
+"""Rows of the record: an episode is copied out before its first row is written over."""
+
+
+ROUNDING_MPS2: Final = 1e-9
+"""An answer this little outside the limits is a rounding error, not a wish for more."""
+
+WRONGS: Final = (Exception, SystemExit)
+"""A black box may raise anything; only a person's own interruption is not its doing."""
+
+OF_THE_POV: Final = "the POV: "
+"""Begins the reason of an error that is the doing of a POV."""
+
+MAX_DEATHS: Final = 2
+"""A case that ends the process of its controller this often, alone, is at fault: once may have come
+from outside."""
+
+END_OF_ROAD_M: Final = 20.0
+"""No vehicle is followed up to where the road ends."""
+
+NEVER: Final = 2**62
+"""The step at which a corridor without an episode times out."""
+
+
+@dataclass(slots=True)
+class _Running:
+    """What runs in a corridor."""
+
+    index: int
+    case: Case
+    first_row: int
+    merge_row: int | None = None
+    """The row in which the VUT is at M, where it goes on behind M."""
+    clipped: int = 0
+    """Answers that were clipped before M."""
+    left: list[tuple[int, Left]] = field(default_factory=list)
+    """Signals, by the row of the episode at which the VUT left them."""
+
+
+class Rollout:
+    """Cases that run in the corridors of a world.
+
+    Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
+    episode does not depend on the number of corridors nor on its neighbours. What the VUT does
+    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR. Where that ended the
+    process of the controllers, the running episodes begin again, one by one; an episode that ends
+    it twice, alone, is at fault. When SUMO fails, the episodes that were running end as
+    SIM_ERROR, SUMO is started again, and the others go on.
+
+    Example:
+        trajectories = Rollout(world, pov, vut, cases).run()
+
+    Attributes:
+        unexplained: places of the cases that ran again although none was at fault: something from
+            outside ended the process.
+    """
+
+    def __init__(
+        self, world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
+    ) -> None:
+        """Take the corridors and their drivers.
+
+        Args:
+            world: the corridors.
+            pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+            vut: drives the VUT of each corridor.
+            cases: cases of the world's scenario.
+        """
+        corridors, vehicles = world.corridors, len(world.x_m)
+        self.world, self.pov, self.vut = world, pov, vut
+        self.mainline = [row for row in range(vehicles) if row != VUT]
+        self.following = Following(corridors) if len(self.mainline) > 1 else None
+        self.queue = enumerate(cases)
+        self.suspects: deque[tuple[int, Case]] = deque()
+        """Episodes that ran when a process of controllers died: each runs again alone."""
+        self.alone = False
+        """Whether a suspect runs alone."""
+        self.deaths = Counter[int]()
+        """How often a process died with one case alone, by the place of the case."""
+        self.unexplained = set[int]()
+        self.episodes: list[_Running | None] = [None] * corridors
+        self.active = np.zeros(corridors, dtype=bool)
+        self.step = np.zeros(corridors, dtype=np.int64)
+        self.clipped = np.zeros(corridors, dtype=np.int64)
+        self.errors: dict[int, tuple[End, str]] = {}
+        self.raised: str | None = None
+        """What the VUT raised instead of its last answer."""
+        self.a_min = np.zeros((vehicles, corridors))
+        self.a_max = np.zeros((vehicles, corridors))
+        self.timeout_at = np.full(corridors, NEVER)
+        """Rows of the record at which episodes time out."""
+        self.next_timeout = NEVER
+        # One row per step of the world: x, v, a of every vehicle. An episode lies in one piece.
+        self.ends_as = End(world.scenario.ends_as)
+        self.follow_steps = round(world.scenario.follow_up_s / DT_S)
+        has_lane = lane_of(world.scenario) is not None
+        self.merging = Merging(corridors, world.scenario) if has_lane else None
+        self.ring = RING_ROWS + self.follow_steps
+        self.record = np.zeros((corridors, self.ring, vehicles, 3))
+        self.ended: dict[int, Trajectory] = {}
+        self.row = 0
+        self.now = self.record[:, 0]
+        """The row of this step."""
+
+    def run(self) -> list[Trajectory]:
+        """Run all cases; return their trajectories in order."""
+        world, everywhere = self.world, range(self.world.corridors)
+        self.refill(everywhere)
+        while self.next_timeout < NEVER:  # as long as an episode runs
+            self.now = self.record[:, self.row % self.ring]
+            self.now[..., 0], self.now[..., 1] = world.x_m.T, world.v_mps.T
+            self.row += 1
+            try:
+                world.advance()
+                acceleration = self.ask_drivers()
+                merging = self.merging
+                merged = None if merging is None else merging.step(world.x_m, world.v_mps)
+                world.command(acceleration, merged)
+            except VutLostError as lost:
+                self.begin_again(lost)
+                continue
+            except SimulationError as error:
+                for corridor in np.flatnonzero(self.active).tolist():
+                    self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
+                world.restart()
+                self.errors.clear()
+                self.refill(everywhere)
+                continue
+            self.step += 1
+            if self.merging is not None:
+                arrived = self.merging.merged & self.active
+            else:
+                arrived = world.scenario.has_ended(world.x_m, world.v_mps) & self.active
+            # In most steps no episode ends.
+            if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
+                ended = arrived | (self.row >= self.timeout_at)
+                ended[list(self.errors)] = True
+                corridors = np.flatnonzero(ended).tolist()
+                if self.follow_steps:
+                    corridors = [k for k in corridors if not self.goes_on(k, arrived=arrived[k])]
+                for corridor in corridors:
+                    if corridor in self.errors:
+                        self.finish(corridor, *self.errors.pop(corridor))
+                    else:
+                        self.finish(corridor, self.ends_as if arrived[corridor] else End.TIMEOUT)
+                self.refill(corridors)
+        return [trajectory for _, trajectory in sorted(self.ended.items())]
+
+    def goes_on(self, corridor: int, *, arrived: bool) -> bool:
+        """Return whether an episode goes on behind M; note where that begins."""
+        episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
+        assert episode is not None, "only running episodes go on"  # noqa: S101
+        if corridor in self.errors or not arrived:
+            return False
+        if episode.merge_row is None:
+            episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
+            self.timeout_at[corridor] = self.row + self.follow_steps
+            self.next_timeout = int(self.timeout_at.min())
+        on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
+        return self.row < self.timeout_at[corridor] and on_the_road
+
+    def begin_again(self, lost: VutLostError) -> None:
+        """Let what was running begin again, one by one; end the episode at fault, if any."""
+        episodes = enumerate(self.episodes)
+        running = [(k, e) for k, e in episodes if e is not None and self.active[k]]
+        for corridor, episode in running:
+            self.deaths[episode.index] += len(running) == 1
+            if self.deaths[episode.index] == MAX_DEATHS:
+                self.unexplained.clear()
+                if isinstance(lost, PovLostError):
+                    self.finish(corridor, End.SIM_ERROR, OF_THE_POV + lost.reason)
+                else:
+                    self.finish(corridor, End.VUT_ERROR, lost.reason)
+            else:
+                self.unexplained.add(episode.index)
+                self.suspects.append((episode.index, episode.case))
+        self.errors.clear()
+        self.active[:] = False
+        self.alone = bool(self.suspects)
+        self.refill(range(self.world.corridors))
+
+    def refill(self, corridors: Sequence[int]) -> None:
+        """Begin the next episodes in corridors whose own have ended."""
+        if not corridors:
+            return
+        if self.alone:  # nothing else runs
+            self.alone = bool(self.suspects)
+            corridors = range(self.world.corridors)
+        for corridor in corridors:
+            self.active[corridor] = False
+        for corridor in corridors:
+            self.begin(corridor, *self.next_case())
+        self.next_timeout = int(self.timeout_at.min())
+
+    def next_case(self) -> tuple[int, Case | None]:
+        """Return what is to run next; None where a corridor is to stay empty."""
+        if self.alone:
+            return (-1, None) if self.active.any() else self.suspects.popleft()
+        return next(self.queue, (-1, None))
+
+    def begin(self, corridor: int, index: int, case: Case | None) -> None:
+        """Begin an episode in a corridor, or park it."""
+        self.active[corridor] = case is not None
+        self.step[corridor] = self.clipped[corridor] = 0
+        if self.merging is not None:
+            self.merging.begin(corridor)
+        if case is None:
+            self.episodes[corridor] = None
+            self.world.park(corridor)
+            self.timeout_at[corridor] = NEVER
+            self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
+            return
+        scenario = case.scenario
+        self.a_min[:, corridor] = scenario.a_min_mps2
+        self.a_max[:, corridor] = scenario.a_max_mps2
+        self.timeout_at[corridor] = self.row + scenario.max_steps
+        self.episodes[corridor] = _Running(index, case, self.row)
+        self.world.place(corridor, case.starts(), own=case.level == OWN)
+        for car in range(len(self.mainline)):
+            self.pov.begin(car * self.world.corridors + corridor, case)
+        if self.following is not None:
+            self.following.begin(corridor, case)
+        try:
+            self.vut.begin(corridor, case)
+        except WRONGS as error:
+            said = f"reset raised {type(error).__name__}: {error}"
+            self.errors[corridor] = End.VUT_ERROR, said
+
+    def ask_drivers(self) -> FloatArray:
+        """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
+        x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
+        # In most steps the sums of squares are enough.
+        if not math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)) and not (
+            np.isfinite(x_m).all() and np.isfinite(v_mps).all()
+        ):
+            raise SimulationError("a position or a speed is not finite")
+        merged = x_m[VUT] >= 0.0 if self.follow_steps else None
+        if self.merging is not None:
+            merged = self.merging.merged
+        scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
+        cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        if following is not None:
+            scene = scene._replace(facing=following.met(x_m, v_mps))
+        self.raised = None
+        try:
+            of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
+            self.take_signals(of_vut)
+        except (SimulationError, VutLostError):
+            raise
+        except WRONGS as error:
+            self.raised = f"{type(error).__name__}: {error}"
+            of_vut = np.full(self.world.corridors, np.nan)
+        answer = np.concatenate((cars[:VUT], of_vut[None], cars[VUT:]))
+        # Before the limits of car following, which would turn an infinite answer into a number.
+        if not math.isfinite(np.vdot(answer, answer)):
+            answer = self.only_numbers(answer)
+        if following is not None:
+            following.limit(answer, x_m, v_mps)
+        if self.merging is not None:
+            self.merging.take(self.vut.wishes(), answer, x_m, v_mps)
+        acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
+        self.now[..., 2] = acceleration.T
+        off = answer - acceleration
+        # In most steps nobody asks for more than it may.
+        commands = self.vut.clipped()
+        if commands is not None:
+            self.clipped += commands
+        elif np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
+            self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
+        return acceleration
+
+    def take_signals(self, answer: FloatArray) -> None:
+        """Keep the signals of the VUT; ValueError where its answer is not one a corridor."""
+        if answer.shape != self.active.shape:
+            raise ValueError(f"answered shape {answer.shape} instead of {self.active.shape}")
+        for corridor, left in self.vut.signals().items():
+            episode = self.episodes[corridor]
+            if left and episode is not None:
+                episode.left.append((self.row - 1 - episode.first_row, left))
+
+    def only_numbers(self, answer: FloatArray) -> FloatArray:
+        """Return answers, (A, K), with 0 where one is no number; note whose doing that was.
+
+        A VUT that is driven for answers what it likes.
+        """
+        finite = np.isfinite(answer)
+        wrong = ~finite & self.active
+        if self.merging is not None:
+            wrong[VUT] &= ~self.merging.driven_for
+        for row, corridor in np.argwhere(wrong).tolist():
+            said = f"answered {answer[row, corridor]}"
+            if row == VUT:
+                error = End.VUT_ERROR, self.raised or self.vut.reason(corridor) or said
+            else:
+                place = self.mainline.index(row) * self.world.corridors + corridor
+                error = End.SIM_ERROR, OF_THE_POV + (self.pov.reason(place) or said)
+            self.errors.setdefault(corridor, error)
+        return np.where(finite, answer, 0.0)
+
+    def finish(self, corridor: int, end: End, error: str | None = None) -> None:
+        """Keep the record of a corridor's episode; after an error without the last step.
+
+        An error behind M ends the follow-up alone: the VUT has merged. After a merge from an
+        acceleration lane it is one of the episode, because the time after the merge is judged.
+        """
+        episode = self.episodes[corridor]
+        assert episode is not None, "only running episodes end"  # noqa: S101
+        length = self.row - episode.first_row + (error is None)
+        first = episode.first_row % self.ring
+        rows = self.record[corridor]
+        motion = rows[first : first + length].copy()
+        if len(motion) < length:  # the ring closes
+            motion = np.concatenate((motion, rows[: length - len(motion)]))
+        if error is None:
+            motion[-1, :, 0] = self.world.x_m[:, corridor]
+            motion[-1, :, 1] = self.world.v_mps[:, corridor]
+        motion[-1, :, 2] = 0.0
+        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
+        motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
+        left = series(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
+        if episode.merge_row is None or (error is not None and self.merging is not None):
+            after, clipped = None, int(self.clipped[corridor])
+        else:
+            motion, after = cut_at(motion, episode.merge_row - episode.first_row)
+            end, clipped = self.ends_as, episode.clipped
+        ended = Trajectory(episode.case, motion, end, error, clipped, after, *left)
+        self.ended[episode.index] = ended

@@ -1,0 +1,99 @@
+"""The simulator: a VUT and the POVs in a SUMO world, in whatever process runs the cases."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from contextlib import ExitStack
+from typing import Self
+
+from merge_sumo.drivers.actuation import ActuatedDriver
+from merge_sumo.drivers.base import Driver
+from merge_sumo.drivers.lane import LanePov
+from merge_sumo.drivers.sensing import SensedDriver
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import Scenario, lane_of
+from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.povs import PovLibrary, Povs
+from merge_sumo.simulation.rollout import Rollout
+from merge_sumo.sumo.world import World
+
+
+class Simulator:
+    """A VUT and the POVs in a world: takes cases, gives trajectories; to be used in `with`.
+
+    Attributes:
+        world: that of SUMO, or of a subclass's engine.
+        in_sumo: places of the cases of the last `run` that SUMO ran.
+        ran_again: places of those that ran again, because a process was ended from outside.
+    """
+
+    world: World | EquationWorld
+    vut: Driver
+    pov: Driver
+    in_sumo: Collection[int] = ()
+    ran_again: Collection[int] = ()
+
+    def __init__(self, plan: SimulationPlan) -> None:
+        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
+        own = plan.povs.own
+        car_type = None if own is None else own.vut.vut_type
+        with ExitStack() as opened:
+            world = World(
+                *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut.vut_type),
+                scenario=plan.scenario,
+                car_type=car_type,
+            )
+            opened.callback(world.close)
+            self._open_drivers(plan, world, world, opened)
+
+    def _open_drivers(
+        self,
+        plan: SimulationPlan,
+        world: World | EquationWorld,
+        sumo: World | None,
+        opened: ExitStack,
+    ) -> None:
+        """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
+        self.world = world
+        scenario = plan.scenario
+        self.vut = plan.vut(world.corridors, sumo)
+        if not scenario.sense.is_perfect:
+            self.vut = SensedDriver(self.vut, scenario)
+        if not scenario.act.is_perfect:
+            self.vut = ActuatedDriver(self.vut, scenario.act.at_most("delay_s"))
+        opened.callback(self.vut.close)
+        self.pov = povs_for(scenario, plan.povs, world.corridors, sumo)
+        opened.callback(self.pov.close)
+        self._opened = opened.pop_all()
+
+    def run(self, cases: Sequence[Case]) -> list[Trajectory]:
+        """Run cases; return their trajectories in order."""
+        self.in_sumo = range(len(cases)) if isinstance(self.world, World) else ()
+        rollout = Rollout(self.world, self.pov, self.vut, cases)
+        self.ran_again = rollout.unexplained
+        return rollout.run()
+
+    def close(self) -> None:
+        """Stop the POVs, the VUT, then SUMO."""
+        self._opened.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def corridors_of(plan: SimulationPlan, most: int) -> int:
+    """Return the number of corridors, at most so many, that VUT and POVs of a plan can serve."""
+    corridors = min(most, plan.vut.vut.max_corridors or most)
+    return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
+
+
+def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:
+    """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
+    library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
+    drives_on = lane_of(scenario) is not None or scenario.follow_up_s > 0.0
+    return LanePov(library) if drives_on else library

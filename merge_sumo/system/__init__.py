@@ -1,1 +1,0 @@
-"""The machine: folders, processes, signals, and what may be trusted."""

@@ -1,1 +1,0 @@
-"""What is measured of an episode, when it fails, and by which margin."""

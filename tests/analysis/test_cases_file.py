@@ -1,0 +1,356 @@
+"""A cases file: what is in it, what `rerun` says of it, and that nothing else is taken for one."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from lxml import etree
+from support.calling import assert_refused
+from support.campaigning import campaign_settings, run_campaign
+from support.handmade import write_run
+
+import merge_sumo as ms
+from merge_sumo.analysis.cases_file import CasesFile
+from merge_sumo.analysis.comparison import ComparedCase, passes
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.severity import Severity
+from merge_sumo.reports.cases_toml import write_cases
+from merge_sumo.reports.text import comparison_headline
+from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
+from merge_sumo.scenario.scenario import OWN, US23
+from merge_sumo.scenario.trajectory import End
+
+CONTROLLER = """
+class Own:
+    AHEAD_M = 500.0
+
+    def act(self, seen):
+        if seen.x_pov_m > 0.0 or seen.x_vut_m < -self.AHEAD_M:
+            return 1.0
+        pov_arrives_s = -seen.x_pov_m / max(seen.v_pov_mps, 1.0)
+        wanted_mps = -seen.x_vut_m / (pov_arrives_s + 2.0)
+        return min(max(wanted_mps - seen.v_vut_mps, -3.0), 1.5)
+
+class Late(Own):
+    AHEAD_M = 60.0
+
+class Blind(Own):
+    def act(self, seen):
+        return 1.0
+
+class Lost(Own):
+    def act(self, seen):
+        return 1.0 / 0.0 if seen.x_vut_m > -50.0 else super().act(seen)
+"""
+WORSE = "design2?kp=0.7"
+
+
+@pytest.fixture(scope="module", params=["us23", "us23-lane"])
+def run(request, tmp_path_factory):
+    scenario = named_scenario(request.param)
+    judged = {"scenario": scenario, "fail_when": scenario.criterion, "cases": 120}
+    settings = campaign_settings(vut="design2", levels=(0, 1, 2), **judged)
+    return run_campaign(settings, tmp_path_factory.mktemp("campaigns") / request.param)
+
+
+@pytest.fixture
+def file(run, tmp_path):
+    """Return the path of a file of 40 cases."""
+    return write_cases(run, [], tmp_path / "kept")
+
+
+on_us23 = pytest.mark.parametrize("run", ["us23"], indirect=True)
+
+
+def edit(path, old, new, count=1):
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new, count))
+
+
+def test_a_file_of_40_cases_has_51_lines_and_all_of_each_case(run, file):
+    assert len(file.read_text().splitlines()) == 51
+    assert str(run.folder) not in file.read_text(), "no path of this machine"
+    kept = CasesFile(file).outcomes
+    assert [(o.case.level, o.index) for o in kept] == sorted((o.case.level, o.index) for o in kept)
+    for outcome in kept:
+        before = run.outcome(outcome.index)
+        assert outcome.case == before.case, "to the last digit"
+        assert outcome.margin == pytest.approx(before.margin, rel=1e-5)
+        assert outcome.measures.became == before.measures.became
+    nearest = min((o for o in run.outcomes if not o.failed), key=lambda o: o.margin)
+    assert nearest.index in {outcome.index for outcome in kept}
+    assert sum(outcome.failed for outcome in kept) >= 7
+
+
+def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
+    edit(file, "tolerance = 0.01", "tolerance = 0.0")
+    same = ms.rerun(file)
+    assert same.lines() == [comparison_headline(same)]
+    assert same.text == file.read_text()
+    assert not same.worse
+    edit(file, "tolerance = 0.0", "tolerance = 0.01")
+    assert all(ms.rerun(file, vut=f"design2?{one}").worse for one in ("gap_m=12", "x1_m=40"))
+    assert ms.rerun(file, vut="level0").worse
+    edit(file, "tolerance = 0.01", "tolerance = 200.0")
+    tolerant = ms.rerun(file, vut="design2?gap_m=12")
+    worse = [one for one in tolerant.steps[0].cases if one.change == "worse but passing"]
+    assert all(one.b.measures.severity == "contact" for one in worse), "new contacts alone"
+    assert tolerant.worse is bool(worse)
+    assert len(tolerant.lines()) > 2, "what changed is shown all the same"
+
+
+def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(CONTROLLER)
+    run_campaign(campaign_settings(vut="own.py:Own", cases=60), tmp_path / "run")
+    assert command_line("export", "run", "--format", "cases", "--out", "c.toml").code == 0
+    assert_refused(command_line("rerun", "c.toml"), "c.toml was run with vut own.py:Own")
+    ms.export("run", range(60), file_format="cases", out="named.toml")
+    assert len(CasesFile(Path("named.toml")).outcomes) == 60, "those that are named"
+    said = command_line("rerun", "c.toml", "--vut", "own.py:Own")
+    assert (said.code, said.out) == (
+        0,
+        "0 failures in 40 cases -> 0 failures in 40 cases; of 40 shared cases 0 broke, 40 pass "
+        "with both\n",
+    )
+    for name, words in (
+        ("Late", ", worse but passing: Safe: "),
+        ("Blind", ", broke: "),
+        ("Lost", ", broke: VUT_ERROR at "),
+    ):
+        said = command_line("rerun", "c.toml", "--vut", f"own.py:{name}")
+        assert said.code == 1, name
+        assert words in said.out, name
+    edit(tmp_path / "c.toml", "},\n", ', accepted = "never mind"},\n', 40)
+    assert ms.rerun("c.toml", vut="own.py:Lost").broke == 40, "no error is accepted"
+
+
+@on_us23
+def test_a_new_error_or_contact_is_worse(file):
+    record = CasesFile(file)
+    safe = next(o for o in record.outcomes if passes(o) and o.measures.severity == "safe")
+    fails = next(o for o in record.outcomes if not passes(o))
+
+    def change(before, **measured):
+        return record.change_of(
+            ComparedCase(before, replace(before, measures=replace(before.measures, **measured)))
+        )
+
+    assert change(safe, severity=Severity.CONTACT) == "worse but passing"
+    assert change(safe, severity=Severity.HARSH) == "pass with both"
+    assert change(safe, error="answered nan") == "broke", "behind M"
+    record.accepted = {fails.index: "known", safe.index: "known"}
+    assert change(fails) == "accepted"
+    assert change(fails, end=End.VUT_ERROR, error="answered nan") == "broke"
+    assert record.change_of(ComparedCase(safe, replace(safe, margin=-0.1))) == "accepted"
+
+
+NOISY = (
+    CONTROLLER
+    + """
+from collections import Counter
+from random import Random
+TIMES, NUMBERS = Counter(), Random(3)
+
+class Drawing(Own):
+    def reset(self, seen):
+        self.far = seen.x_pov_m < -300.0
+        TIMES[seen.x_pov_m] += 1
+        self.times = TIMES[seen.x_pov_m]
+
+    def act(self, seen):
+        return 1.0 if seen.x_vut_m > -100.0 - self.times else -1.0
+
+class Failing(Drawing):
+    def act(self, seen):
+        if self.far and seen.x_vut_m > -20.0 * self.times:
+            raise ValueError(self.times)
+        return Own.act(self, seen)
+
+class Stopping(Drawing):
+    def act(self, seen):
+        return -4.0 + 0.1 * self.times if self.far else Own.act(self, seen)
+
+class Rough(Own):
+    def reset(self, seen):
+        self.bias = NUMBERS.uniform(-2.5, 1.0)
+
+    def act(self, seen):
+        return Own.act(self, seen) + self.bias
+
+class Once(Drawing):
+    def act(self, seen):
+        return -4.0 if self.far and self.times == 1 else Own.act(self, seen)
+"""
+)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return a campaign of a controller that repeats, and its cases as a file."""
+    folder = tmp_path_factory.mktemp("noisy")
+    (folder / "own.py").write_text(NOISY)
+    searched = {"cases": 16, "levels": (0,), "seed": 1, "sampler": "uniform"}
+    run_campaign(campaign_settings(vut=f"{folder}/own.py:Own", **searched), folder / "run")
+    (file,) = ms.export(folder / "run", file_format="cases", out=folder / "own.toml")
+    return folder / "run", file
+
+
+class TestAControllerThatDoesNotRepeat:
+    @pytest.fixture
+    def rerun(self, command_line, recorded):
+        """Return what runs the campaign or the file again, 0 or 1, with a controller."""
+
+        def run(of, name, *more):
+            vut = f"{recorded[of].with_name('own.py')}:{name}"
+            # One process counts the times.
+            return command_line("rerun", recorded[of], "--vut", vut, "--workers", 1, *more)
+
+        return run
+
+    def test_is_said_and_its_margins_count_as_nothing(self, rerun, tmp_path):
+        code, out, _ = rerun(1, "Drawing", "--junit", tmp_path / "j.xml")
+        assert code == 0
+        number = int(re.search(r"(\d+) not repeatable", out)[1])
+        assert number > 0
+        assert f"Not repeatable: {number} of {number} case" in out
+        assert f"Not counted one by one, as it may be chance: {number} change" in out
+        junit = etree.parse(tmp_path / "j.xml").getroot()
+        assert len(junit.findall(".//skipped")) == number
+        assert not junit.findall(".//failure")
+
+    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
+    def test_breaks_nothing_where_a_verdict_is_another_one_once(self, rerun, of):
+        code, out, _ = rerun(of, "Once")
+        assert code == 0
+        assert re.search(r" 0 broke, [1-9]\d* not repeatable", out)
+        assert re.search(r"\d+ of \d+ cases that ran twice .* of them with another verdict", out)
+
+    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
+    def test_does_not_break_where_random_numbers_decide(self, rerun, of):
+        code, out, _ = rerun(of, "Rough")
+        assert code == 0
+        assert re.search(r" 0 broke, [1-9]\d* not repeatable", out)
+
+    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
+    @pytest.mark.parametrize("name", ["Stopping", "Failing"])
+    def test_is_worse_where_it_passes_neither_time(self, rerun, of, name):
+        code, out, _ = rerun(of, name)
+        assert code == 1
+        assert re.search(r" [1-9]\d* broke", out)
+        assert "Not repeatable: " in out
+
+
+@on_us23
+def test_the_diff_has_the_lines_of_the_file_that_change(file, command_line, tmp_path):
+    new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
+    said = command_line("rerun", file, "--vut", WORSE, "--out", new, "--junit", junit)
+    assert said.code == 1
+    removed, added = (
+        [line[2:] for line in said.out.splitlines() if line.startswith(sign)] for sign in "-+"
+    )
+    assert (removed[0], added[0]) == ('vut = "design2"', f'vut = "{WORSE}"')
+    swapped = dict(zip(removed, added, strict=True))
+    before, after = ([x.strip() for x in path.read_text().splitlines()] for path in (file, new))
+    assert set(removed) <= set(before)
+    assert after == [swapped.get(line, line) for line in before]
+    assert command_line("rerun", new).code == 0, "the new file holds now"
+    root = etree.parse(junit).getroot()
+    wrong = said.out.count(", broke: ") + said.out.count(", worse but passing: ")
+    assert (root.get("tests"), root.get("failures")) == ("40", str(wrong))
+    assert any(", margin " in failure.get("message") for failure in root.iter("failure"))
+
+
+@on_us23
+def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, tmp_path):
+    now = ms.rerun(file, vut=WORSE)
+    index = next(one.b.index for one in now.steps[0].cases if one.change == "broke")
+    (line,) = (text for text in file.read_text().splitlines() if f"{{index = {index}," in text)
+    edit(file, line, line.replace("},", ', accepted = "it waits\\u001b"},'))
+    new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
+    assert_refused(command_line("rerun", file, index, "--out", new), "all cases: name none of them")
+    ms.rerun(file, vut=WORSE, out=new)
+    said = command_line("rerun", file, index, "--vut", WORSE, "--junit", junit)
+    assert said.code == 0
+    assert "of 1 shared case 0 broke, 1 accepted\n" in said.out
+    assert f"case {index} is accepted (it waits\\x1b) and fails, not counted" in said.out
+    assert len(etree.parse(junit).getroot().findall(".//skipped")) == 1
+    assert CasesFile(new).accepted == {index: "it waits\x1b"}
+    said = command_line("rerun", file, index)
+    assert said.code == 0
+    assert (
+        f"case {index} is accepted (it waits\\x1b) and passes now: take the mark away" in said.out
+    )
+    told = json.loads(command_line("run", "--case", file, index, "--json").out)
+    assert told["score"] == pytest.approx(CasesFile(file).outcome(index).measures.score, rel=1e-5)
+    assert_refused(command_line("rerun", file, 999), f"{file} has no case 999")
+
+
+def test_scenarios_errors_and_timeouts_are_what_they_were(tmp_path):
+    scenarios = [named_scenario(name) for name in shipped_scenarios()]
+    scenarios += [replace(US23, name='od"d', follow_up_s=0.0, dx_crash_m=1.0 / 3.0)]
+    for number, scenario in enumerate(scenarios):
+        folder, errors = tmp_path / str(number), {3: 'said "no"'}
+        run = write_run(folder, 4, scenario=scenario, errors=errors, timeouts=(5,))
+        kept = CasesFile(write_cases(run, [5, 3, 0], tmp_path / f"{number}.toml"))
+        assert kept.scenario == scenario
+        ends = {outcome.index: outcome.measures.end for outcome in kept.outcomes}
+        assert ends == {0: "MERGED", 3: "VUT_ERROR", 5: "TIMEOUT"}
+        assert kept.outcome(3).measures.error == 'said "no"'
+
+
+def test_a_pov_of_a_persons_own_must_be_the_same(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pov.py").write_text("def Pov(seen):\n    return 0.0\n")
+    settings = campaign_settings(vut="design2", pov="pov.py:Pov", levels=(OWN,), cases=10)
+    path = write_cases(run_campaign(settings, tmp_path / "run"), range(10), tmp_path)
+    assert not ms.rerun(path, pov="pov.py:Pov").worse
+    (tmp_path / "pov.py").write_text("def Pov(seen):\n    return 1.0\n")
+    with pytest.raises(UserError, match="against another POV of level own than today"):
+        ms.rerun(path, pov="pov.py:Pov")
+
+
+def test_a_net_of_ones_own_is_found_from_the_file(tmp_path):
+    for name in ("nets", "checks", "elsewhere"):
+        (tmp_path / name).mkdir()
+    scenario = replace(US23, net=str(tmp_path / "nets" / "mine.net.xml"))
+    path = write_cases(write_run(tmp_path / "run", 4, scenario=scenario), [0], tmp_path / "checks")
+    assert tomllib.loads(path.read_text())["scenario"]["net"] == "./../nets/mine.net.xml"
+    moved = (tmp_path / "checks").rename(tmp_path / "elsewhere" / "checks") / "cases.toml"
+    net = tmp_path / "elsewhere" / "nets" / "mine.net.xml"
+    assert CasesFile(moved).scenario.net == str(net)
+
+
+@on_us23
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ('vut = "design2"', "vut = 2", "vut is 2: it must be a text"),
+        ('vut = "design2"', "", "it has no vut"),
+        ("tolerance = 0.01", "tolerance = nan", "tolerance is nan"),
+        ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': did you mean tolerance?"),
+        ('scenario = {name = "us23"}', 'scenario = "us99"', "scenario is 'us99': it must be a"),
+        ('name = "us23"', 'kind = "us99"', "kind is 'us99'"),
+        ('fail_when = "paper"', 'fail_when = "scores < 3"', "there is no measure 'scores'"),
+        ("level = 0", "level = 0, was = 1", "has no 'was'"),
+        ("x_pov0_m = -", "x_pov0_m = -9", "choose between -900 and 0"),
+        ("x_pov0_m = -", "x_pov0_m = -500.5, dx_m = -", "is outside of the pool, -340 to -180 m"),
+        ("x_pov0_m = -", "dx_m = -", "x_pov0_m is None: it must be a number"),
+        ("v_pov0_mps = ", "v_pov0_mps = nan, dx_m = ", "it has a number that is not finite"),
+        ('"pass"', '"fail"', "verdict is 'fail', but by margin and end it is pass"),
+        ("},", ', accepted = " "},', "accepted is ' ': it must be a reason"),
+        ("net_sha256 = ", "net_sha256 = 1 #", "net_sha256 is 1: it must be a text"),
+        ('net_sha256 = "', 'net_sha256 = "0', "was run on another net than"),
+        ('pov1 = "', 'pov1 = "0', "was run against another POV of level 1 than today's"),
+    ],
+)
+def test_what_is_no_cases_file_is_refused_in_a_sentence(file, command_line, old, new, part):
+    edit(file, old, new)
+    assert_refused(command_line("rerun", file), str(file), part)

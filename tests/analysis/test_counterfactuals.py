@@ -1,0 +1,186 @@
+"""Who would have avoided a failure: checked against eq. (4) worked out here, without SUMO."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.campaigning import campaign_settings, run_campaign
+from support.plans import plan_for
+
+from merge_sumo.analysis.counterfactuals import (
+    AVOIDANCE,
+    Stage,
+    avoidance,
+    avoidances,
+    run_counterfactuals,
+)
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.drivers.base import Scene
+from merge_sumo.drivers.policies import policies_of
+from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.merge import brake_after_mps2
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.scenario import OWN, US23
+from merge_sumo.simulation.evaluate import opened_simulator, simulate
+from merge_sumo.simulation.povs import Povs, own_pov
+
+
+def avoidance_of(run, workers=None, **other):
+    settings = settings_of(run.folder, run.record, controllers(run.record))
+    return avoidance(run, resolve(settings), workers=workers, **other)
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return avoidance_of(run)
+
+
+@pytest.fixture
+def folder(run, tmp_path):
+    return shutil.copytree(run.folder, tmp_path / "run")
+
+
+def passes(failure, driver, until, *, in_the_povs_place=False):
+    """Return whether a driver passes a failure: eq. (4), with a POV that keeps its speed."""
+    case = failure.case
+    driver.begin(0, case)
+    (x_pov, v_pov), (x, v) = case.starts()
+    for step in range(300):
+        state = (np.array([value]) for value in (x_pov, v_pov, x, v))
+        seen = Scene.of_pair(np.array([True]), np.array([step]), *state)
+        a = a_pov = 0.0
+        if in_the_povs_place:
+            a, a_pov = failure.a_vut_mps2[step], driver.act(seen)[0]
+        elif step < until:
+            a = failure.a_vut_mps2[step]
+        else:
+            a = driver.act(seen)[0]
+        x, x_pov = x + 0.1 * v, x_pov + 0.1 * v_pov
+        v, v_pov = max(v + 0.1 * a, 0.0), max(v_pov + 0.1 * a_pov, 0.0)
+        if x >= 0.0:
+            gap, closing = abs(x_pov - x) - 5.0, max(v_pov - v if x_pov < x else v - v_pov, 0.0)
+            # Whoever is behind has 0.75 s, and then 4 m/s2.
+            return gap >= 1.0 and closing**2 <= 8.0 * max(gap - 0.75 * closing, 0.0)
+    return False
+
+
+def last_of(failure):
+    """Return the last of all steps at which the FSM driver may take over; None without one."""
+    steps = range(len(failure.motion) - 1)
+    passing = [step for step in steps if passes(failure, REFERENCES["fsm"](1), step)]
+    return max(passing, default=None)
+
+
+class TestEveryFailure:
+    def test_has_its_line_in_the_order_of_cases(self, run, found):
+        assert [one.index for one in found] == sorted(o.index for o in failures(run.outcomes))
+        assert found
+
+    def test_names_the_drivers_that_pass_it(self, run, found):
+        for one in found[:3]:
+            failure = run.trajectory(one.index)
+            names = [n for n, make in REFERENCES.items() if passes(failure, make(1), 0)]
+            assert list(one.avoided_by) == names
+
+    def test_says_at_which_step_the_driver_may_take_over_at_last(self, run, found):
+        for one in found[:3]:
+            last = last_of(run.trajectory(one.index))
+            assert one.latest_takeover_s == (None if last is None else last / 10.0)
+        assert any(one.latest_takeover_s is not None for one in found)
+
+    def test_says_whether_a_careful_driver_on_the_mainline_avoids_it(self, run, found):
+        for one in found[:3]:
+            failure = run.trajectory(one.index)
+            avoids = passes(failure, CarefulPov(1), 0, in_the_povs_place=True)
+            assert one.pov_careful == avoids
+
+
+def test_eq_4_alone_says_what_sumo_says(tmp_path):
+    settings = campaign_settings(vut="design1", cases=60, batch=20, seed=1)
+    run = run_campaign(settings, tmp_path / "run")
+    failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
+    assert len(failing) >= 10
+    plan = replace(resolve(settings), vut=VutFactory.of("careful"))
+    with opened_simulator(plan) as ground:
+        in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
+    assert run_counterfactuals(plan, failing) == in_sumo
+    assert len({one.latest_takeover_s for one in in_sumo}) > 3
+
+
+def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
+    road = named_scenario("us23-lane")
+    settings = CampaignSettings(
+        vut="level0", scenario=road, levels=(0,), cases=120, seed=4, fail_when="unsafe"
+    )
+    run = run_campaign(settings, tmp_path / "run")
+    plan = resolve(settings)
+    failing = [o for o in run.outcomes if o.failed]
+    found = run_counterfactuals(plan, [(o.index, run.trajectory(o.index)) for o in failing])
+    passing: list[list[str]] = [[] for _ in failing]
+    for name in REFERENCES:
+        by_name = plan_for(name, scenario=road, criterion=plan.criterion)
+        results = simulate(by_name.with_engine("kinematic"), [o.case for o in failing])
+        for names, result in zip(passing, results, strict=True):
+            verdict = result.outcome.verdict
+            can_brake = brake_after_mps2(result.trajectory) <= 4.0
+            if can_brake and verdict.is_tested and not verdict.failed:
+                names.append(name)
+    assert [list(one.avoided_by) for one in found] == passing
+    assert len(set(map(tuple, passing))) > 1
+
+
+def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
+    path = tmp_path / "keeps.py"
+    path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
+    povs = Povs(
+        policies=policies_of(US23), own=own_pov(f"{path}:keeps", VutOptions(in_process=True))
+    )
+    failing = []
+    for one in found[:4]:
+        failure = run.trajectory(one.index)
+        failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
+    assert run_counterfactuals(plan_for("careful", povs=povs), failing) == found[:4]
+
+
+class TestTheFile:
+    def test_is_read_as_it_was_written_and_leaves_the_outcomes_alone(self, folder, found):
+        before = (folder / "outcomes.jsonl").read_bytes()
+        assert AVOIDANCE.read_lines(Run(folder)) == {}
+        AVOIDANCE.write_lines(folder, found)
+        assert list(AVOIDANCE.read_lines(Run(folder)).values()) == found
+        assert (folder / "outcomes.jsonl").read_bytes() == before
+
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"index": 10_000},
+            {"index": True},
+            {"avoided_by": ["nobody"]},
+            {"avoided_by": "careful"},
+            {"latest_takeover_s": "<b>"},
+            {"latest_takeover_s": 1e9},
+            {"pov_careful": 1},
+            {"more": 1},
+        ],
+    )
+    def test_of_somebody_else_is_refused_where_it_is_not_as_it_is_written(
+        self, folder, found, change
+    ):
+        AVOIDANCE.write_lines(folder, found)
+        path = folder / AVOIDANCE.name
+        lines = path.read_text().splitlines()
+        lines[0] = json.dumps(json.loads(lines[0]) | change)
+        path.write_text("\n".join(lines) + "\n")
+        with pytest.raises(UserError, match=r"line 1 of .* is not as it was written"):
+            AVOIDANCE.read_lines(Run(folder))

@@ -1,0 +1,192 @@
+"""Truths in the cache, and samplers beside each other and a truth, by hand and in SUMO."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from dataclasses import astuple
+
+import numpy as np
+import pytest
+from support.plans import key_of, plan_for
+from support.vut_contract import factory
+
+from merge_sumo import config
+from merge_sumo.analysis.sampler_study import (
+    SamplerRun,
+    SamplerStudy,
+    SamplerSummary,
+    Spread,
+    Study,
+)
+from merge_sumo.analysis.truth import Truth, ground_truth, read_truth
+from merge_sumo.metrics.fmc import fmc
+from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.scenario.case import from_unit, to_unit
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def truth(cache):
+    return ground_truth(plan_for("design1"), 0, 300, cache=cache)
+
+
+def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch):
+    (path,) = cache.glob("truth-*.npz")
+    counted: list[int] = []
+    again = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
+    assert np.array_equal(again.margin, truth.margin)
+    assert counted == []
+    path.write_bytes(path.read_bytes()[:100])
+    remade = ground_truth(plan_for("design1"), 0, 300, cache=cache, on_cases=counted.append)
+    assert np.array_equal(remade.margin, truth.margin)
+    assert sum(counted) == 300
+
+
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        {"in_sumo": np.array([300, 300])},
+        {"in_sumo": np.array(301)},
+        {"in_sumo": np.array(np.nan)},
+        {"margin": np.array(0.5)},
+        {"margin": np.zeros((300, 2))},
+        {"margin": np.array(["x"] * 300)},
+        {"points": np.full((300, 2), np.nan)},
+        {"points": np.full((300, 2), 2.0)},
+        {"points": np.zeros((300, 2), dtype=np.complex128)},
+    ],
+)
+def test_a_file_of_the_cache_with_other_arrays_is_none(truth, cache, tmp_path, spoilt):
+    (path,) = cache.glob("truth-*.npz")
+    (kept := tmp_path / path.name).write_bytes(path.read_bytes())
+    tmp_path.chmod(0o700)
+    assert np.array_equal(read_truth(kept, 0, 300, US23).margin, truth.margin)
+    with np.load(path) as data:
+        np.savez(kept, **{**data, **spoilt})
+    assert read_truth(kept, 0, 300, US23) is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"vut": "design2"},
+        {"level": 1},
+        {"cases": 301},
+        {"seed": 1},
+        {"deadline_s": 1.0},
+    ],
+)
+def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
+    assert key_of().path() == key_of().path()
+    assert key_of().path() != key_of(**change).path()
+
+
+def truth_of(vut: str, cache, **options) -> int:
+    """Return in how many cases a VUT had to drive for its truth of four cases."""
+    counted: list[int] = []
+    ground_truth(plan_for(factory(vut, **options)), 0, 4, cache=cache, on_cases=counted.append)
+    return sum(counted)
+
+
+READER = """
+import pathlib
+import gain_of_mine
+HERE = pathlib.Path(__file__).parent
+class Vut:
+    def act(self, seen):
+        (HERE / "ran").touch()
+        if seen.t_s == 5.0:
+            import late_gain
+        return float((HERE / "gain.txt").read_text()) if seen.t_s > 2.0 else gain_of_mine.gain
+"""
+
+
+def test_a_truth_is_of_the_code_that_the_vut_loaded_also_while_it_drove(tmp_path):
+    for file, content in {
+        "my_vut.py": READER,
+        "gain_of_mine.py": "gain = 1.0",
+        "late_gain.py": "",
+        "gain.txt": "1.0",
+    }.items():
+        (tmp_path / file).write_text(content)
+    vut = f"{tmp_path / 'my_vut.py'}:Vut"
+    assert truth_of(vut, tmp_path / "cache") == 4
+    (tmp_path / "ran").unlink()
+    assert truth_of(vut, tmp_path / "cache") == 0
+    assert not (tmp_path / "ran").exists()
+    (tmp_path / "late_gain.py").write_text("# changed")
+    assert truth_of(vut, tmp_path / "cache") == 4
+    assert truth_of(vut, tmp_path / "cache") == 0
+
+
+def test_a_study_says_what_samplers_found_of_the_truth(cache):
+    study = Study(plan_for("design1"), cache=cache)
+    asked = config.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
+    result = study.compare((0,), ["uniform"], asked)
+    found = result.samplers["uniform"]
+    assert found.cases_by_batch == [20, 40, 50]
+    assert all(curve == sorted(curve) for curve in found.fmc_by_batch)
+    assert result.is_small
+    assert found.fmc_over_truth == found.cases_to_90_percent == Spread(None, None, None)
+    assert found.covered_share_by_batch == sorted(found.covered_share_by_batch)
+    share = found.covered_share
+    assert 0.0 < share.low <= share.median <= share.high <= 1.0
+    assert result.dense == {}
+
+
+def searched(points_by_batch: list[list[tuple[float, float]]]) -> SamplerRun:
+    """Return a search at level 0 with failures at points, and one safe case in each batch."""
+    outcomes: list[Outcome] = []
+    curve = []
+    for batch, points in enumerate(points_by_batch):
+        for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
+            (case,) = from_unit(np.array([point]), 0, scenario=US23)
+            end, score = End.MERGED, -600.0 if failed else -1.0
+            measures = Measures(end=end, score=score, t_end_s=8.3)
+            outcomes.append(Outcome(len(outcomes), batch, case, measures))
+        curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
+    return SamplerRun(outcomes, curve)
+
+
+def truth_with(*points: tuple[float, float], failures: int = 2) -> Truth:
+    """Return a truth with some failures at each of some points: two of them are large enough."""
+    at = np.array(points * failures or [(0.5, 0.5)])
+    return Truth(at, np.full(len(at), -0.2 if failures else 0.9))
+
+
+TWO = truth_with((0.2, 0.2), (0.8, 0.8))
+SMALL = truth_with((0.2, 0.2), (0.8, 0.8), failures=1)
+HALF = searched([[], [(0.2, 0.24)]])  # 1 case, then 3
+MOST = searched([[(0.2, 0.2)], [(0.8, 0.8)]])  # 2 cases, then 4
+
+
+def study_of(*searches: SamplerRun, truth: Truth = TWO, **more) -> SamplerStudy:
+    return SamplerStudy({"mine": list(searches)}, {0: truth}, **more)
+
+
+def summary(*searches: SamplerRun, **more) -> SamplerSummary:
+    return study_of(*searches, **more).samplers["mine"]
+
+
+class TestASamplerByHand:
+    def test_has_medians_and_quartiles_over_the_seeds(self):
+        found = summary(MOST, HALF)
+        assert found.regions_found == Spread(1.5, 1.25, 1.75)
+        assert found.failures == Spread(1.5, 1.25, 1.75)
+        assert astuple(found.fmc_over_truth) == pytest.approx((0.75, 0.625, 0.875))
+        low, median, high = found.fmc_by_batch
+        disc = fmc(np.zeros((1, 2)))
+        assert (low[0], median[0], high[0]) == pytest.approx((disc / 4, disc / 2, disc * 3 / 4))
+
+    def test_covers_a_share_of_the_failures_of_the_truth(self):
+        assert summary(HALF, truth=SMALL).covered_share_by_batch == [0.0, 0.5]
+        assert summary(MOST, truth=SMALL).covered_share_by_batch == [0.5, 1.0]
+        dense = {0: truth_with((0.2, 0.2), (0.8, 0.8), (0.5, 0.5), (0.9, 0.1))}
+        assert summary(HALF, truth=SMALL, dense=dense).covered_share.median == 0.25

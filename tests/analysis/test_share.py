@@ -1,0 +1,136 @@
+"""The share of starts that fail: by hand, against many more starts, and where it is unknown."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.campaigning import campaign_settings, run_campaign
+
+from merge_sumo import api
+from merge_sumo.analysis import share
+from merge_sumo.analysis.share import SHARES, LevelShare, end_of, share_at, stream
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.simulation.evaluate import evaluate
+
+
+@pytest.mark.parametrize(
+    ("failures", "says"),
+    [
+        # 1 - .05 ** (1 / 2000), one-sided
+        (0, "less than 0.15 %"),
+        # The quantiles of beta(38, 1963) and beta(39, 1962).
+        (38, "1.9 % [1.3, 2.6]"),
+        (2000, "100 % [99.8, 100]"),
+    ],
+)
+def test_is_said_with_its_exact_interval(failures, says):
+    assert LevelShare(level=0, cases=2000, failures=failures).shown == says
+
+
+def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
+    run = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "run")
+    shares = SHARES.read(run.folder)
+    assert shares is not None
+    [level] = shares.levels
+    plan = resolve(campaign_settings(vut="design1")).with_engine(None)
+    points = np.random.default_rng(99).random((20_000, 2))
+    pool = campaign_settings(vut="design1").pool
+    many = evaluate(plan, pool.cases(points, 0), None, end_of)
+    known = sum(fails for _, (fails, _) in many) / len(points)
+    low, high = level.interval
+    assert low < known < high
+    assert (level.cases, level.failures > 0) == (2000, True)
+    assert any(f"  {level.shown} of all starts fail, by 2,000  " in line for line in run.lines())
+    again = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "two", workers=2)
+    assert SHARES.read(again.folder) == shares
+
+
+OWN = """
+class Own:
+    def act(self, seen):
+        return 1.0
+
+class Fragile:
+    def act(self, seen):
+        if seen.t_s == 0.0 and seen.v_pov_mps > 34.0:
+            raise ValueError("no idea")
+        return 1.0
+
+class Broken:
+    def act(self, seen):
+        raise ValueError("no idea")
+"""
+
+
+@pytest.fixture
+def own(tmp_path, monkeypatch):
+    """Work in a folder with controllers of a person's own."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own.py").write_text(OWN)
+
+
+@pytest.mark.usefixtures("own")
+def test_of_a_controller_of_ones_own_is_measured_too():
+    run = api.campaign("own.py:Own", level="0,1", seed=4, cases=10, out="run", progress=False)
+    shares = SHARES.read(run.folder)
+    assert shares is not None
+    plan = resolve(campaign_settings(vut="own.py:Own", levels=(0, 1)))
+    for level, one in enumerate(shares.levels):
+        assert one.cases >= 200
+        assert one.cases % 200 == 0
+        rng = stream(4, level)
+        rounds = [share_at(plan, level, 200, rng, None) for _ in range(one.cases // 200)]
+        assert one.failures == sum(found.failures for found in rounds)
+        assert one.failures or level == 1
+        said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
+        assert any(said in line for line in run.lines())
+    again = api.resume(run.folder, vut="own.py:Own", cases=12, progress=False)
+    assert not any("not measured" in line for line in again.lines())
+
+
+@pytest.mark.usefixtures("own")
+def test_of_a_controller_that_errs_says_so_or_is_not_measured():
+    run = api.campaign("own.py:Fragile", level=0, seed=4, cases=10, out="run", progress=False)
+    [level] = SHARES.read(run.folder).levels
+    assert 0 < level.without_verdict < level.cases
+    facts = {fact.name: fact.value for fact in run.facts if fact.file == SHARES.name}
+    assert facts["uniform starts without a verdict"] == level.without_verdict
+    run = api.campaign("own.py:Broken", level=0, seed=4, cases=4, out="broken", progress=False)
+    assert SHARES.read(run.folder) is None
+    command = "merge-sumo probability broken --vut own.py:Broken"
+    assert any(line.endswith(f"not measured: {command}") for line in run.lines())
+
+
+@pytest.mark.usefixtures("own")
+def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
+    """A level of a round takes 1 s, so a round of two levels 2 s."""
+    settings = campaign_settings(vut="own.py:Own", levels=(0, 1), cases=4)
+    run, now_s = run_campaign(settings, Path("run")), [0.0]
+    told: list[tuple[int, int]] = []
+
+    def ran(_plan, level, cases, _rng, _workers):
+        now_s[0] += 1.0
+        return LevelShare(level, cases, 1)
+
+    monkeypatch.setattr(share, "perf_counter", lambda: now_s[0])
+    monkeypatch.setattr(share, "share_at", ran)
+    for took_s, rounds in ((0.0, 1), (19.9, 1), (20.0, 2), (49.0, 4)):
+        told.clear()
+        share.note_shares(
+            run, resolve(settings), None, took_s, on_part=lambda *part: told.append(part)
+        )
+        expected = tuple(LevelShare(level, 200 * rounds, rounds) for level in (0, 1))
+        assert SHARES.read(run.folder).levels == expected
+        assert told[0] == (0, 400)
+        assert told[-1] == (400 * rounds, 400 * rounds)
+
+
+def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_named(tmp_path):
+    run = api.campaign("sumo:IDM", level="0", cases=10, out=tmp_path / "run", progress=False)
+    assert SHARES.read(run.folder) is None
+    said = f"starts that fail are not measured: merge-sumo probability {run.folder}"
+    assert any(line.endswith(said) for line in run.lines())

@@ -1,0 +1,134 @@
+"""The ladder of a stress test: what flips is what a case of the rung does by itself."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import merge_sumo as ms
+from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, StressResult, flips_of
+from merge_sumo.metrics.score import CaseVerdict
+from merge_sumo.records import to_plain
+from merge_sumo.road.merge import road_for
+from merge_sumo.scenario.imperfection import Actuation
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.simulation.kinematic_world import EquationWorld
+
+FAIL_WHEN = "bumper_gap_m < 15"
+"""Two fifths of the cases fail: no sampler need look for them."""
+TRIED: dict[str, dict[str, Any]] = {
+    "lag-0.5": {"act": Actuation(lag_s=0.5)},
+    "lag-0.2": {"act": Actuation(lag_s=0.2)},
+    "power": {"act": Actuation(power_w_per_kg=34.0)},
+    "long-pov": {"pov_length_m": 10.0},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("stress") / "run"
+    return ms.campaign(
+        "design2", level=0, sampler="uniform", cases=80, fail_when=FAIL_WHEN, out=folder
+    )
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return ms.stress(run)
+
+
+def rung(found, name):
+    return next(rung for rung in found.rungs if rung.name == name)
+
+
+def test_nothing_flips_where_nothing_is_changed(found):
+    assert rung(found, "nothing").runs == (Flips(),)
+    assert found.failures
+    assert [one.skipped for one in found.rungs] == [""] * len(RUNGS)
+
+
+@pytest.mark.parametrize("name", TRIED)
+def test_verdicts_flip_as_the_cases_by_themselves_say(run, found, name):
+    (flips,) = rung(found, name).runs
+    scenario = replace(US23, **TRIED[name])
+    chosen = {*flips.passes[:2], *flips.fails[:2], *found.failures[:3]}
+    for row in (run.cases[index] for index in chosen):
+        now = ms.run("design2", row, level=row["level"], scenario=scenario, fail_when=FAIL_WHEN)
+        index = row["index"]
+        assert now.failed == ((index in found.failures) != (index in (*flips.passes, *flips.fails)))
+
+
+def test_the_ladder_says_which_failures_are_robust(found):
+    passing = [set(flips.passes + flips.without_verdict) for r in found.rungs for flips in r.runs]
+    robust = [index for index in found.failures if not any(index in some for some in passing)]
+    assert list(found.robust) == robust
+    assert found.runs == DRAWS + len(RUNGS) - 1
+
+
+def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run, found):
+    assert STRESS.read(run.folder) == found
+    page = (run.folder / "report.html").read_text(encoding="utf-8")
+    assert "What hangs by a thread" not in page
+    assert "Ten worst failures, one of each region first" in page
+    robust = found.failures[-1]
+    flips = Flips(tuple(index for index in found.failures if index != robust))
+    kept = replaced(found, rungs=(Rung("one", "<b>one</b>", runs=(flips,)),))
+    (run.folder / STRESS.name).write_text(json.dumps(to_plain(kept)))
+    page = Path(run.report()).read_text(encoding="utf-8")
+    (run.folder / STRESS.name).unlink()
+    assert STRESS.read(run.folder) is None
+    assert "What hangs by a thread" in page
+    assert "&lt;b&gt;one&lt;/b&gt;" in page
+    assert "<b>one</b>" not in page
+    listed = page[page.index("Ten worst failures, robust ones first") :]
+    assert listed.index(f'data-case="{robust}"') == listed.index("data-case=")
+
+
+def replaced(found, **changes):
+    names = StressResult.__struct_fields__
+    return StressResult(**{name: changes.get(name, getattr(found, name)) for name in names})
+
+
+def test_flips_by_hand(run):
+    failed = next(o for o in run.run.outcomes if o.failed)
+    passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
+    fails, passes, ends = (
+        CaseVerdict(-0.9, True),
+        CaseVerdict(0.1, True),
+        CaseVerdict(0.1, False),
+    )
+    both = [failed, passed]
+    assert flips_of(both, [fails, passes]) == Flips()
+    assert flips_of(both, [passes, fails]) == Flips((failed.index,), (passed.index,))
+    assert flips_of(both, [ends, ends]) == Flips((), (), (failed.index, passed.index))
+
+
+def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
+    own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
+    skipped = {one.name: one.skipped for one in ms.stress(own).rungs if one.skipped}
+    assert skipped == {"step": "sumo:Krauss drives in a SUMO world only"}
+
+
+class TestAShorterStep:
+    def world(self, x_vut_m=-10.0):
+        world = EquationWorld(1, road_for(US23), US23, substeps=5)
+        world.place(0, [(-50.0, 30.0), (x_vut_m, 20.0)])
+        return world
+
+    def test_moves_by_eq_4_five_times(self):
+        world = self.world()
+        world.command(np.array([[0.0], [1.0]]))
+        # 20 m/s for 0.02 s, then 20.02 m/s, ... 20.08 m/s.
+        assert world.x_m[:, 0] == pytest.approx([-47.0, -10.0 + 2.004], abs=1e-12)
+        assert world.v_mps[:, 0] == pytest.approx([30.0, 20.1], abs=1e-12)
+
+    def test_ends_an_episode_in_the_part_in_which_the_vut_arrives(self):
+        world = self.world(-1.0)
+        world.command(np.zeros((2, 1)))
+        # After 0.06 s the VUT is at 0.2 m.
+        assert world.x_m[:, 0] == pytest.approx([-48.2, 0.2], abs=1e-12)

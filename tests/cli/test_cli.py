@@ -1,0 +1,238 @@
+"""The command line: what it prints where, how it ends, and what it leaves alone."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import importlib
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from lxml import etree
+from support.calling import Said, assert_refused, commands, contents, invoke, run_in_a_process
+
+from merge_sumo.analysis.reproduction import TABLE_II, Scale
+from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.reports.reproduction_page import TABLE_JSON
+from merge_sumo.sumo.binding import DEBIAN_PACKAGES
+from merge_sumo.sumo.replay_folder import RECORD
+
+COMMANDS = [name for name in commands() if " " not in name]
+SMALL = ("campaign", "--vut", "design1", "--level", "0")
+GPR = ("--sampler", "gpr")
+
+
+@pytest.fixture
+def campaign(run, tmp_path) -> Path:
+    """Return a copy of the finished campaign."""
+    return Path(shutil.copytree(run.folder, tmp_path / "campaign"))
+
+
+@pytest.fixture
+def scenario(run, tmp_path) -> Path:
+    """Return a copy of an exported failure."""
+    (first, *_) = sorted((run.folder / "scenarios").iterdir())
+    return Path(shutil.copytree(first, tmp_path / "scenario"))
+
+
+def diverge(scenario: Path) -> None:
+    """Let the record of a scenario have a speed at which the vehicle does not move."""
+    record = etree.parse(scenario / RECORD)
+    vehicle = record.findall("timestep")[20][1]
+    vehicle.set("speed", str(float(vehicle.get("speed")) + 1.0))
+    record.write(scenario / RECORD)
+
+
+class TestACampaignThatCannotRunIsRefusedInOneSentence:
+    @pytest.mark.parametrize(
+        ("arguments", "parts"),
+        [
+            (("--vut", "design9"), ("'design9'", "design1", "level0")),
+            (("--level", "3"), ("'3'", "0, 1, 2, several")),
+            (("--level", "-1"), ("'-1'", "0, 1, 2, several")),
+            (("--cases", "0"), ("--cases is 0",)),
+            (("--gate", "failure"), ("choose failures",)),
+            (("--junit", "gone/junit.xml"), ("--junit", "there is no folder gone")),
+            (("--workers", "two"), ("'two'", "tcp://HOST:PORT")),
+            (("--sampler", "grp"), ("'grp'", "gpr", "uniform")),
+            (("--seed", "-1"), ("--seed is -1",)),
+        ],
+        ids=" ".join,
+    )
+    def test_for_its_settings(self, call, tmp_path, arguments, parts):
+        before = contents(tmp_path)
+        others = [option for option in (SMALL[1:3], SMALL[3:5]) if option[0] not in arguments]
+        assert_refused(call(SMALL[0], *sum(others, ()), "--out", "run", *arguments), *parts)
+        assert contents(tmp_path) == before
+
+    @pytest.mark.parametrize(
+        ("error", "parts"),
+        [
+            (
+                ImportError("libGL.so.1: cannot open shared object file: No such file"),
+                ("libGL.so.1", "apt-get install", DEBIAN_PACKAGES),
+            ),
+            (ModuleNotFoundError("No", name="libsumo"), ("pip install libsumo==",)),
+        ],
+    )
+    def test_for_libsumo_that_cannot_be_loaded(self, call, tmp_path, monkeypatch, error, parts):
+        cannot_import(monkeypatch, "libsumo", error)
+        before = contents(tmp_path)
+        assert_refused(call(*SMALL, "--cases", 4, "-q", "--out", "run"), *parts)
+        assert contents(tmp_path) == before
+
+    def test_for_the_libsumo_of_another_sumo(self, call, monkeypatch):
+        import libsumo
+
+        monkeypatch.setattr(libsumo, "getVersion", lambda: (21, "SUMO 1.18.0"))
+        said = call(*SMALL, "--cases", 4, "-q", "--out", "run")
+        assert_refused(said, "libsumo is of SUMO 1.18.0", "pip install --force-reinstall")
+
+
+def cannot_import(monkeypatch, module: str, error: ImportError) -> None:
+    """Let the import of one module by name fail."""
+    import_module = importlib.import_module
+
+    def refuse(name: str, package: str | None = None):
+        if name == module:
+            raise error
+        return import_module(name, package)
+
+    monkeypatch.setattr(importlib, "import_module", refuse)
+
+
+def test_the_debian_packages_are_those_that_the_wheels_need():
+    needed = ("libgl1", "libx11-6", "libxext6", "libxrender1", "libatomic1", "libexpat1")
+    assert sorted(DEBIAN_PACKAGES.split()) == sorted(needed)
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory) -> tuple[Path, Said]:
+    """Return where a campaign of 80 cases ran in a process of its own, and what it said."""
+    folder = tmp_path_factory.mktemp("ended")
+    arguments = ("--cases", 80, "--seed", 1, *GPR, "--out", "run", "--json")
+    return folder, run_in_a_process(folder, *SMALL, *arguments)
+
+
+class TestACampaign:
+    def test_finds_failures_and_writes_a_line_per_case(self, ended):
+        folder, said = ended
+        assert said.code == 0, said.err
+        run = Run(folder / "run")
+        assert len(run.outcomes) == 80
+        assert (folder / "run" / "outcomes.jsonl").read_bytes().count(b"\n") == 80
+        assert failures(run.outcomes)
+        assert [o.batch for o in run.outcomes] == [index // 40 for index in range(80)]
+
+    def test_prints_exactly_one_json_object_with_its_summary(self, ended):
+        folder, said = ended
+        assert said.out.count("\n") == 1
+        summary = json.loads(said.out)
+        found = len(failures(Run(folder / "run").outcomes))
+        assert (summary["cases"], summary["failures"]) == (80, found)
+        assert summary["levels"]["0"]["failures"] == found
+        # One ball of radius 0.05 has 0.00785.
+        assert 0.0078 < summary["levels"]["0"]["fmc"] <= found * 0.0079
+        assert (folder / summary["report"]).is_file()
+        assert (folder / summary["run"]).is_dir()
+
+    def test_exports_its_worst_failures_as_scenarios_that_replay_identically(self, ended, call):
+        folder, _ = ended
+        worst = spread_failures(Run(folder / "run").outcomes)[:10]
+        names = {f"case-{outcome.index:05d}" for outcome in worst}
+        assert {path.name for path in (folder / "run" / "scenarios").iterdir()} == names
+        for name in sorted(names)[:3]:
+            said = call("replay", folder / "run" / "scenarios" / name)
+            assert (said.code, said.err) == (0, "")
+            assert "\nidentical" in said.out
+
+
+class TestReplay:
+    def test_prints_exactly_one_json_object(self, call, scenario):
+        good = call("replay", scenario, "--json")
+        diverge(scenario)
+        bad = call("replay", scenario, "--json")
+        assert (good.code, bad.code) == (0, 1)
+        assert good.out.count("\n") == bad.out.count("\n") == 1
+        assert json.loads(good.out)["identical"] is True
+        assert json.loads(good.out)["diverged_at_s"] is None
+        assert json.loads(bad.out)["identical"] is False
+        assert json.loads(bad.out)["diverged_at_s"] == 2.0
+        assert "\ndiverged at t = 2.0 s" in call("replay", scenario).out
+
+
+class TestReport:
+    def test_is_written_again_and_nothing_else(self, call, campaign, tmp_path):
+        before = contents(tmp_path)
+        said = call("report", campaign)
+        assert (said.code, said.err) == (0, "")
+        assert said.out == f"{campaign / 'report.html'}\n"
+        first = (campaign / "report.html").read_text()
+        (campaign / "report.html").write_text(first[:1000])
+        assert call("report", campaign).code == 0
+        assert (campaign / "report.html").read_text() == first
+        after = contents(tmp_path)
+        for made in ("report.html", "expected.json"):
+            after.pop(campaign / made, None)
+            before.pop(campaign / made, None)
+        assert after == before
+
+
+class TestHelp:
+    @pytest.mark.parametrize("name", COMMANDS)
+    def test_of_every_command_has_an_example_of_that_command(self, name):
+        result = invoke(name, "--help")
+        assert result.exit_code == 0
+        assert f"Example: merge-sumo {name}" in " ".join(result.output.split())
+
+    def test_says_how_to_start_and_names_every_command_and_the_version(self):
+        said = invoke("--help").output
+        assert invoke("-h").output == said
+        assert "merge-sumo campaign --vut" in said
+        assert all(name in said for name in COMMANDS)
+        assert invoke("--version").output.startswith("merge-sumo ")
+
+
+class TestBenchmark:
+    BENCHMARK = (
+        *("benchmark", "--vut", "design1", "--level", 0, "--truth-cases", 300, "--workers", 1),
+        *("--samplers", "uniform,gpr", "--seeds", 2, "--cases", 30, "--batch", 15),
+    )
+
+    def test_prints_one_json_object_with_the_keys_that_are_promised_and_draws(
+        self, call, tmp_path, monkeypatch
+    ):
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+        code, out, err = call(*self.BENCHMARK, "--json", "--figure", "curves.svg")
+        assert code == 0, err
+        assert out.count("\n") == 1
+        found = json.loads(out)
+        assert 0.0 < found["truth_fmc"] <= found["limit_fmc"]
+        assert found["dense_fmc"] == {}
+        for name in ("uniform", "gpr"):
+            assert set(found["samplers"][name]["fmc"]) == {"median", "low", "high"}
+        assert (tmp_path / "curves.svg").read_text().count("<svg") == 1
+        code, out, err = call(*self.BENCHMARK)
+        assert code == 0, err
+        assert {"truth:", "limit:", "uniform", "gpr"} <= {
+            line.split()[0] for line in out.splitlines() if line.strip()
+        }
+
+
+class TestReproduce:
+    def test_prints_the_table_and_where_the_rest_is(self, call, tmp_path, monkeypatch):
+        scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
+        monkeypatch.setattr("merge_sumo.analysis.reproduction.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.analysis.reproduction.TABLE_II", TABLE_II[:1])
+        monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+        code, out, err = call("reproduce", "--quick", "--workers", 1, "--out", "here")
+        assert code == 0, err
+        assert out.startswith("| FMC: ours (the paper's) |")
+        assert "here/index.html" in out.splitlines()[-1]
+        assert json.loads((tmp_path / "here" / TABLE_JSON).read_text())["scale"]["seeds"] == 1
+
+
+def test_an_error_in_a_process_of_its_own_is_one_sentence_without_a_traceback(tmp_path):
+    assert_refused(run_in_a_process(tmp_path, "replay", "nowhere"), "nowhere")

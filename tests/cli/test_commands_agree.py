@@ -1,0 +1,158 @@
+"""Every command that runs cases judges a case as every other one does, in traffic.
+
+The reference is `run RUN INDEX`, which runs one case alone. The criterion has a follow-up, so that
+a command that forgets the scenario or its follow-up cannot pass.
+"""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import merge_sumo as ms
+from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.fmc import fmc
+from merge_sumo.scenario.case import Case, MergeCase, Pool
+from merge_sumo.scenario.scenario import Scenario
+
+CRITERION = "after_gap_m < 12 or ttc_s < 3"
+
+
+VUT, LEVEL = "design2", 0
+"""It fails in some cases of the scenario and not in others."""
+ASKED = (
+    *("--vut", VUT, "--level", LEVEL, "--scenario", "us23-traffic"),
+    *("--fail-when", CRITERION, "--follow-up", 3),
+)
+"""The options that each command takes."""
+CASES = 12
+OF_A_CASE = (
+    *("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s", "sense_delay_s"),
+)
+
+
+class World:
+    """The command line in a folder of its own, with a campaign in it."""
+
+    def __init__(self, main: Any) -> None:
+        self._main = main
+        self.campaign = self("campaign", *ASKED, *self.search(CASES), "--out", "run")[0]
+
+    def __call__(self, *arguments: object, codes: tuple[int, ...] = (0,)) -> Any:
+        """Return the objects that a command prints as lines of JSON."""
+        code, out, err = self._main(*arguments, "--json")
+        assert code in codes, err
+        return [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+
+    @staticmethod
+    def search(cases: int) -> tuple[object, ...]:
+        return "--sampler", "uniform", "--cases", cases, "--seed", 0
+
+    @property
+    def records(self) -> list[dict[str, Any]]:
+        return lines_of(Path("run") / OUTCOMES)
+
+    @property
+    def scenario(self) -> Scenario:
+        return ms.open_run("run").run.scenario
+
+    def judged(self, case: Case) -> bool:
+        """Return whether a case fails when it is run alone."""
+        at = {name: x for name in OF_A_CASE if (x := getattr(case, name)) is not None}
+        found = ms.run(VUT, level=LEVEL, scenario=self.scenario, at=at)
+        return Criterion(CRITERION).outcome(0, 0, found.trajectory).failed
+
+
+def lines_of(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+
+
+def fails(record: dict[str, Any]) -> bool:
+    return record["margin"] < 0.0
+
+
+@pytest.fixture
+def world(monkeypatch, tmp_path, command_line) -> World:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
+    return World(command_line)
+
+
+@pytest.mark.slow
+def test_every_command_judges_a_case_alike(world: World):
+    records = world.records
+    assert 0 < sum(map(fails, records)) < CASES, "else nothing is told apart"
+    assert world.campaign["levels"][str(LEVEL)]["failures"] == sum(map(fails, records))
+    run_judges_as_the_campaign(world, records)
+    rerun_changes_nothing(world)
+    check_compare_and_truth(world, records)
+    probability_judges_as_run(world)
+    exports_and_replay_have_the_motion(world, records)
+    resume_goes_on_alike(world, records)
+
+
+def run_judges_as_the_campaign(world: World, records: list[dict[str, Any]]) -> None:
+    told = [next(r for r in records if fails(r) is failing) for failing in (True, False)]
+    for record in told:
+        (again,) = world("run", "--case", "run", record["index"], codes=(0, 1))
+        for name in ("motion", "index", "batch", "foretold"):
+            again.pop(name, None)
+        assert again == {k: v for k, v in record.items() if k in again}
+        assert again["margin"] == record["margin"]
+
+
+def rerun_changes_nothing(world: World) -> None:
+    (again,) = world("rerun", "run")
+    (step,) = again["steps"]
+    assert sum(row["cases"] for row in step["transitions"]) == CASES
+    assert {case["change"] for case in step["cases"]} <= {"pass with neither"}
+    assert again["worse"] is False
+
+
+def check_compare_and_truth(world: World, records: list[dict[str, Any]]) -> None:
+    """Compare searches as a campaign with the same sampler, seed and batches; so does its truth."""
+    count = 10
+    (truth,) = world("truth", *ASKED, "--cases", count, "--workers", 1)
+    points = np.random.default_rng([0, LEVEL]).random(
+        (count, len(world.scenario.dimensions(LEVEL)))
+    )
+    cases = Pool(levels=(LEVEL,), scenario=world.scenario).cases(points, LEVEL)
+    failing = np.array([world.judged(case) for case in cases])
+    assert truth["failures"] == failing.sum()
+    sampler = ("--samplers", "uniform", "--seeds", 1, "--cases", CASES, "--batch", CASES)
+    (compared,) = world("benchmark", *ASKED, *sampler, "--truth-cases", count, "--workers", 1)
+    assert compared["truth_fmc"] == truth["fmc"] == fmc(points[failing])
+    assert compared["samplers"]["uniform"]["failures"]["median"] == sum(map(fails, records))
+    of_campaign = world.campaign["levels"][str(LEVEL)]["fmc"]
+    assert compared["samplers"]["uniform"]["fmc"]["median"] == pytest.approx(of_campaign)
+
+
+def probability_judges_as_run(world: World) -> None:
+    (found,) = world("probability", "run", "--cases", 60)
+    assert found["missed"], "else nothing is told apart"
+    for given in found["missed"][:3]:
+        fixed = {"v_vut0_mps": world.scenario.bounds("v_vut0_mps")[0]}
+        assert world.judged(MergeCase(scenario=world.scenario, **{**fixed, **given}))
+
+
+def exports_and_replay_have_the_motion(world: World, records: list[dict[str, Any]]) -> None:
+    failing = next(record["index"] for record in records if fails(record))
+    assert world._main("export", "run", failing, "--format", "csv", "--out", "table")[0] == 0
+    (table,) = Path("table").rglob("*.csv")
+    assert f"{failing}," in table.read_text(encoding="utf-8")
+    assert world._main("replay", "run", failing)[0] == 0
+    assert world._main("report", "run")[0] == 0
+    assert CRITERION.split(maxsplit=1)[0] in Path("run/report.html").read_text(encoding="utf-8")
+
+
+def resume_goes_on_alike(world: World, records: list[dict[str, Any]]) -> None:
+    world("campaign", "--resume", "run", "--cases", CASES + 6)
+    assert world.records[:CASES] == records
+    assert len(world.records) == CASES + 6

@@ -1,0 +1,141 @@
+"""What a person is told who mistypes: the place of the mistake, and the name that was meant."""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+
+import pytest
+
+from merge_sumo import api, cli
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.signatures import check_call, check_methods
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.suggestions import either, meant
+
+
+class TestNearestNames:
+    def test_are_said_in_words(self):
+        assert either(["a"]) == "a"
+        assert either(["a", "b", "c"]) == "a, b or c"
+        assert meant("b", ["x"]) == ""
+        assert meant("lvel0", ["level0"]) == "did you mean level0? "
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ttc_s < 2 or TTC_S < 1", "there is no measure 'TTC_S': did you mean ttc_s"),
+        ("merged_first == VUT", 'a text is to be in quotes: merged_first == "VUT"'),
+        ("merged_first == level0", "there is no measure 'level0'"),
+        ("end == 'timeout'", "end is never 'timeout': did you mean TIMEOUT?"),
+        ("ttc_s = 2", "instead of ="),
+        ("ttc_s < 2 && dx_m > 3", "instead of &&"),
+        ("!(ttc_s < 2)", "instead of !"),
+    ],
+)
+def test_a_condition_is_refused_with_what_was_meant(text, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        Criterion(text)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: VutFactory.of("desgin2"), "did you mean design2"),
+        (lambda: VutFactory.of("Design2"), r"did you mean design2\? choose"),
+        (lambda: VutFactory.of("tracy"), "did you mean traci"),
+        (lambda: VutFactory.of(""), "name the vehicle under test, as in `vut` design2: careful, "),
+        (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
+        (lambda: named_scenario("us23-trafic"), "did you mean us23-traffic"),
+        (lambda: Criterion("contat"), "did you mean contact"),
+    ],
+)
+def test_a_name_that_nobody_knows_is_answered_with_one_that_was_meant(make, said):
+    with pytest.raises(UserError, match=said):
+        make()
+
+
+class TestAWrongSignature:
+    @pytest.mark.parametrize(
+        ("source", "said"),
+        [
+            (
+                "class V:\n\n    def act(self):\n        return 0.0\n",
+                "my.py:3: act(self) is called as act(self, seen)",
+            ),
+            (
+                "class V:\n    @staticmethod\n    def act(): return 0.0\n",
+                "my.py:2: act() is called as act(seen)",
+            ),
+            (
+                "class V:\n    @classmethod\n    def act(cls, a, b): return 0.0\n",
+                "my.py:2: act(cls, a, b) is called as act(cls, seen)",
+            ),
+            (
+                "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
+                "my.py:3: reset(self, seen) is called as reset(self, corridor, seen)",
+            ),
+            ("def V():\n    return 0.0\n", "my.py:1: V() is called as V(seen)"),
+            (
+                "def V(x, v, *rest, gain):\n    return 0.0\n",
+                "my.py:1: V(x, v, rest, gain) is called as V(seen)",
+            ),
+        ],
+    )
+    def test_is_named_in_the_users_file(self, source, said, tmp_path, monkeypatch, command_line):
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "my.py").write_text(source)
+        code, out, err = command_line("campaign", "--vut", "my.py:V", "--out", "run")
+        assert (code, out, err) == (2, "", f"merge-sumo: {said}\n")
+        assert not (tmp_path / "run").exists()
+
+    @pytest.mark.parametrize(
+        "source",
+        [
+            "def f(*arguments, **named): ...",
+            "def f(seen, gain=1.0): ...",
+            "class f:\n    def act(self, *rest): ...\n    def reset(self, seen, seed=0): ...",
+            "class f:\n    act = staticmethod(lambda seen: 0.0)",
+            "class f:\n    reset = None\n    def act(self, seen): ...",
+            "import functools\nclass f:\n    act = functools.partialmethod(lambda s, a, b: 0.0, 1)",
+        ],
+    )
+    def test_is_none_where_the_call_fits(self, source):
+        names: dict = {}
+        exec(source, names)  # noqa: S102
+        check = (
+            check_methods
+            if isinstance(names["f"], type)
+            else partial(check_call, arguments=("seen",))
+        )
+        check(names["f"])
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        ValueError("line\x1b[2J"),
+        KeyError("x"),
+        OSError(9, "no"),
+        EOFError(),
+        BrokenPipeError(32, ""),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_fault_of_ours_is_a_traceback_and_no_result(monkeypatch, command_line, error):
+    def fails(**_):
+        raise error
+
+    monkeypatch.setattr(api, "vuts", fails)
+    code, out, err = command_line("vuts")
+    assert (code, out) == (cli.FAULT, "")
+    assert err.startswith("Traceback (most recent call last):\n")
+    assert f"{type(error).__name__}" in err
+    assert err.endswith("this is a fault of merge-sumo and no result: report it with these lines\n")
+    assert "\x1b" not in err

@@ -1,0 +1,297 @@
+"""Every command that is printed runs as it stands: of the terminal, of pages, and of messages."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lxml import html
+from support.calling import Said
+
+import merge_sumo as ms
+from merge_sumo import testing
+from merge_sumo.campaigns import journal
+from merge_sumo.campaigns.again import again, call_again, command
+from merge_sumo.errors import Notice, UserError
+from merge_sumo.interrupt import Stopped
+from merge_sumo.road.scenario_file import to_toml
+from merge_sumo.scenario.scenario import US23
+
+Call = Callable[..., Said]
+
+ROOT = Path(__file__).resolve().parents[2]
+BAD_USE = 2
+RUN = "a run's"
+"""A folder whose name needs quotes."""
+SOURCE = """
+class MyVut:
+    gain = 1.0
+
+    def reset(self, seen):
+        self.brakes = False
+
+    def act(self, seen):
+        gap_m = seen.x_pov_m - seen.x_vut_m
+        self.brakes = self.brakes or (seen.x_vut_m > -60.0 and abs(gap_m) < 15.0)
+        return -2.0 if self.brakes and seen.v_vut_mps > 10.0 else self.gain
+"""
+CLIENT = """
+import sys, traci
+
+traci.init(int(sys.argv[1]))
+while traci.simulation.getMinExpectedNumber() > 0:
+    traci.simulationStep()
+    if "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+traci.close()
+"""
+TRACI = f"traci:{sys.executable} client.py {{port}}"
+FEW = {"probability": ["--cases", "8"], "campaign": ["--cases", "4", "--level", "0"]}
+"""Options with which the commands of the longest verbs take seconds."""
+A_COMMAND = re.compile(r"(?:PYTHONPATH=\S+ )?(?:merge-sumo|ms\.\w+\(|&& merge-sumo).*")
+
+
+def commands_in(text: str) -> Iterator[str]:
+    """Yield the commands of lines, each at the end of one or between backticks."""
+    for line in text.splitlines():
+        for part in [*line.split("`")[1::2], line.rpartition(": ")[2]]:
+            if A_COMMAND.fullmatch(part.strip()):
+                yield part.strip()
+
+
+def commands_on(page: Path, index: int) -> Iterator[str]:
+    """Yield the commands of a page, as it shows them of a case."""
+    tree: Any = html.fromstring(page.read_bytes())
+    for place in tree.xpath("//code//span[@class='index']"):
+        place.text = str(index)
+    for code in tree.xpath("//code"):
+        text = code.text_content()
+        if A_COMMAND.fullmatch(text):
+            yield text
+    for lines in tree.xpath("//pre"):
+        yield from commands_in(lines.text_content())
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch) -> Path:
+    """Work in a folder with controllers of a person's own."""
+    (tmp_path / "my_vut.py").write_text(SOURCE)
+    (tmp_path / "client.py").write_text(CLIENT)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_vut", raising=False)  # of another test
+    monkeypatch.syspath_prepend(tmp_path)  # before folders of other tests
+    return tmp_path
+
+
+@pytest.fixture
+def runs(command_line: Call) -> Callable[[set[str]], None]:
+    """Return what runs commands, and fails where one is of bad use."""
+
+    def run(found: set[str]) -> None:
+        for text in sorted(found):
+            for part in text.split(" && "):
+                words = [word for word in shlex.split(part) if word != "--gui"]
+                assert words.pop(0) == "merge-sumo", part
+                few = [] if "--resume" in words else FEW.get(words[0], [])
+                said = command_line(*words, *few)
+                assert said.code != BAD_USE, (part, said.err)
+                Path("changes.html").unlink(missing_ok=True)  # each was printed without it
+
+    return run
+
+
+def printed(vut: str, command_line: Call, *options: object) -> set[str]:
+    """Return every command that a campaign and the verbs on it print."""
+    few = ("--level", 0, "--cases", 6, "--seed", 1, "-q", *options)
+    said = command_line("campaign", "--vut", vut, *few, "--fail-when", "t_end_s > 0", "--out", RUN)
+    assert said.code == 0, said.err
+    run = ms.open_run(RUN)
+    worst = run.failures[0]["index"]
+    found = {*commands_in(said.out), *commands_in(said.err)}
+    assert any(f"replay {shlex.quote(RUN)}" in one for one in found)
+    on_page = set(commands_on(run.report_file, worst))
+    (explain,) = (one for one in on_page if " explain " in one)
+    assert " && merge-sumo report " in explain
+    on_page.remove(explain)  # it runs here
+    explained, report = explain.split(" && ")
+    found.add(report)
+    others = [
+        explained,
+        f"{again('rerun', run.folder, run.settings, [worst])}",
+        f"merge-sumo rerun {shlex.quote(RUN)} 0 1 2 --vut fsm -q",
+    ]
+    for line in others:
+        said = command_line(*shlex.split(line)[1:])
+        assert said.code != BAD_USE, said.err
+        found |= {*commands_in(said.out), *commands_in(said.err)}
+    stopped: dict[str, Any] = {"level": 0, "cases": 4, "batch": 2, "seed": 1, "progress": False}
+
+    def stop() -> None:
+        raise Stopped(signal.SIGINT)
+
+    with pytest.raises(Stopped):
+        ms.campaign(vut, **stopped, out="stopped", check=stop)
+    ms.report("stopped")
+    resume = {one for one in commands_on(Path("stopped", "report.html"), 0) if "--resume" in one}
+    assert len(resume) == 1
+    return found | on_page | resume | {again("run", run.folder, run.settings, worst)}
+
+
+@pytest.mark.parametrize(
+    "vut",
+    [
+        "design1",
+        pytest.param("my_vut.py:MyVut", marks=pytest.mark.slow),
+        pytest.param("my_vut:MyVut", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.usefixtures("place")
+def test_runs_of_a_controller(vut, command_line, runs):
+    found = printed(vut, command_line)
+    assert f"merge-sumo campaign --vut fsm --against {vut}" in found
+    runs(found)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("place")
+def test_runs_of_a_traci_client(command_line, runs):
+    found = printed(TRACI, command_line)
+    measure = f"merge-sumo probability {shlex.quote(RUN)} --vut {shlex.quote(TRACI)}"
+    assert measure in found
+    runs(found)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("vut", ["my_vut.py:MyVut", TRACI])
+@pytest.mark.parametrize("scenario", ["us23-lane", "us23-traffic", "roundabout", "my-ramp.toml"])
+@pytest.mark.usefixtures("place")
+def test_runs_in_a_scenario(vut, scenario, command_line, runs):
+    if scenario == "my-ramp.toml":
+        net = ROOT / "sumo_net" / "us23.net.xml"
+        edges = ("--mainline", "main_in main_out", "--ramp", "ramp main_out")
+        said = command_line("scenario", "new", scenario, "--net", net, *edges)
+        assert said.code == 0, said.err
+    found = printed(vut, command_line, "--scenario", scenario)
+    searches = {one for one in found if " campaign " in one and "--resume" not in one}
+    assert len(searches) == 2
+    assert all(one.endswith(f" --scenario {scenario}") for one in searches)
+    measured = not any(" probability " in one for one in found)
+    assert measured == (vut != TRACI)
+    runs(found)
+
+
+@pytest.mark.slow
+def test_runs_of_an_object_of_a_notebook(place):
+    names: dict[str, Any] = {"__name__": "__main__", "ms": ms}
+    exec(SOURCE, names)  # noqa: S102 (as a cell of a notebook)
+    (here,) = (vut for name, vut in names.items() if name == "MyVut")
+    few: dict[str, Any] = {"level": 0, "cases": 12, "seed": 1, "progress": False}
+    with pytest.warns(UserWarning, match="MyVut is an object"):
+        run = ms.campaign(here, **few, tolerated=0.1, out=RUN, fail_when="t_end_s > 0")
+    worst = run.failures[0]["index"]
+    found = set(commands_in("\n".join(run.lines()))) | set(commands_on(run.report_file, worst))
+    assert f'ms.probability("{RUN}", vut=MyVut)' in found
+    assert f'ms.explain("{RUN}", {worst}, vut=MyVut); ms.report("{RUN}")' in found
+    compared = ms.rerun(run, [0, 1, 2], vut="design2", progress=False)
+    found |= set(commands_in("\n".join(compared.lines())))
+    explained = ms.explain(run, worst, vut=here, progress=False)
+    found |= set(commands_in("\n".join(explained.lines())))
+    assert any(one.startswith('ms.campaign(vut="design2", against=MyVut') for one in found)
+    found |= {call_again("resume", run.folder, run.settings)}
+    found |= {again("run", run.folder, run.settings, worst, at={"x_pov0_m": -250.0})}
+    calls = {one for one in found if one.startswith("ms.")}
+    assert len(calls) >= 5
+    assert not any("here:" in one for one in found)
+    more = {"probability": ", cases=8)", "campaign": ", level=0, cases=4)"}
+    for text in sorted(calls):
+        for part in text.split("; "):
+            verb = part.split("(")[0].removeprefix("ms.")
+            ended = part.removesuffix(")") + more.get(verb, ")")
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of an object, as above
+                eval(ended, names)  # noqa: S307 (what is printed to be evaluated)
+
+
+class TestACommand:
+    def test_names_an_object_as_its_process_does(self, monkeypatch):
+        here = {"MyVut": type("MyVut", (), {}), "MyVut-2": object()}
+        monkeypatch.setattr("merge_sumo.controllers.here.objects", here)
+        for spec, said in {
+            "here:MyVut": "MyVut",
+            "here:MyVut-2": "MyVut(...)",
+            "here:Gone-3": "Gone",
+            "here:lambda": "vut",
+            "here:MyVut?gain=2": '"here:MyVut?gain=2"',
+        }.items():
+            assert command("campaign", vut=spec) == f"ms.campaign(vut={said})"
+        mixed = command("rerun", Path("run"), [1, 2], vut="a.py:B", pov="here:MyVut")
+        assert mixed == 'ms.rerun("run", [1, 2], vut="a.py:B", pov=MyVut)'
+
+    def test_finds_a_module_that_only_this_process_finds(self, place, monkeypatch):
+        """As pytest does with a folder of tests."""
+        (place / "tests").mkdir()
+        (place / "tests" / "only_here.py").write_text(SOURCE)
+        monkeypatch.syspath_prepend(place / "tests")
+        vut = __import__("only_here").MyVut
+        with pytest.raises(AssertionError, match="run it again: ") as raised:
+            testing.assert_no_failures(vut, level=0, cases=4, fail_when="t_end_s > 0", out="run")
+        (line,) = (one for one in str(raised.value).splitlines() if "run it again: " in one)
+        text = line.partition("run it again: ")[2]
+        assert text.startswith("PYTHONPATH=")
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+        path = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
+        environment["PATH"] = path
+        done = subprocess.run(
+            ["/bin/sh", "-c", text], env=environment, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1, done.stderr
+
+    @pytest.mark.usefixtures("place")
+    def test_goes_on_where_a_disk_was_full(self, monkeypatch, runs):
+        few: dict[str, Any] = {"level": 0, "cases": 20, "batch": 10, "seed": 1, "progress": False}
+        writes = journal._write_all
+
+        def full(file: Any, content: bytes) -> None:
+            if file.seek(0, os.SEEK_END):
+                raise OSError("No space left on device")
+            writes(file, content)
+
+        monkeypatch.setattr(journal, "_write_all", full)
+        with pytest.raises(UserError) as error:
+            ms.campaign("my_vut.py:MyVut", **few, out="run")
+        monkeypatch.setattr(journal, "_write_all", writes)
+        found = set(commands_in(str(error.value)))
+        assert found == {"merge-sumo campaign --resume run --vut my_vut.py:MyVut"}
+        runs(found)
+
+    @pytest.mark.parametrize("file", ["mine.toml", "elsewhere.toml"])
+    @pytest.mark.usefixtures("place")
+    def test_on_a_scenario_names_its_file_or_is_left_out(self, file, runs):
+        scenario = replace(US23, name="mine", v_pov0_mps=(12.0, 20.0))
+        Path(file).write_text(to_toml(scenario, []))
+        few: dict[str, Any] = {"level": 1, "cases": 4, "seed": 1, "progress": False}
+        with pytest.warns(Notice, match="not trained on mine") as noticed:
+            ms.campaign("design1", scenario=scenario, **few, out="run")
+        found = set(commands_in("\n".join(str(one.message) for one in noticed)))
+        assert found == ({"merge-sumo scenario check mine.toml"} if file == "mine.toml" else set())
+        runs(found)
+
+    def test_writes_a_page_that_is_not_there_yet(self, place, command_line):
+        few = ("--level", 0, "--cases", 12, "--seed", 1, "-q")
+        assert command_line("campaign", "--vut", "design1", *few, "--out", "run")[0] == 0
+        (place / "changes.html").write_text("mine")
+        said = command_line("rerun", "run", "--vut", "fsm", "-q")
+        (page,) = (one for one in commands_in(said.out) if "changes" in one)
+        assert page.endswith(" --out changes-2.html")
+        assert command_line(*shlex.split(page)[1:], "-q")[0] != BAD_USE
+        assert (place / "changes.html").read_text() == "mine"

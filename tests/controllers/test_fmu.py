@@ -1,0 +1,202 @@
+"""A VUT as an FMU of FMI 2.0 and 3.0, compiled here from C."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from build_fmu import NAMES, build_fmu, compiler, description
+from conftest import require, some
+from support.vut_contract import (
+    LEVEL0_CLASS,
+    begin,
+    cases_of,
+    factory,
+    in_process,
+    on_lane,
+    run_cases,
+)
+
+from merge_sumo.drivers.base import MERGE, STAY
+from merge_sumo.errors import UserError
+from merge_sumo.scenario.trajectory import End
+
+pytest.importorskip("fmpy")
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    """Return a function that builds an FMU: its version, names, and what it does wrong."""
+    require(compiler() is not None, "gcc is not on the PATH")
+    folder = tmp_path_factory.mktemp("fmu")
+
+    def build(version="2.0", names=NAMES, fault="", **more) -> Path:
+        path = folder / f"{len(list(folder.iterdir()))}.fmu"
+        return build_fmu(path, version, names, fault, **more)
+
+    return build
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_fmu_drives_like_the_same_law_in_python_and_leaves_nothing(
+    unit, tmp_path, monkeypatch, version
+):
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    (tmp_path / "law.py").write_text(LEVEL0_CLASS)
+    cases = cases_of(30)
+    by_fmu = run_cases(in_process(f"fmu:{unit(version)}"), cases)
+    by_python = run_cases(in_process(f"{tmp_path / 'law.py'}:Level0"), cases)
+    for one, other in zip(by_fmu, by_python, strict=True):
+        assert one.error is None
+        assert np.array_equal(one.motion, other.motion)
+    assert list(scratch.iterdir()) == []
+
+
+def test_variables_of_32_bits_are_as_good_as_those_of_64(unit):
+    cases = cases_of(6)
+    # An output of each kind: the speed reached would hide a wrong acceleration.
+    single = {
+        "acceleration": unit("3.0", kind="single", seed="single"),
+        "speed": unit("3.0", kind="single", v_mps="single"),
+        "speed alone": unit("3.0", v_mps="single"),
+    }
+    expected = run_cases(in_process(f"fmu:{unit('3.0')}"), cases)
+    for name, path in single.items():
+        for one, other in zip(run_cases(in_process(f"fmu:{path}"), cases), expected, strict=True):
+            assert one.error is None, name
+            assert one.motion[1:] == pytest.approx(other.motion[1:], abs=1e-3), name
+    lane = in_process(f"fmu:{unit('3.0', kind='single', merge='single')}")(2)
+    begin(lane)
+    assert lane.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
+    assert lane.wishes().tolist() == [STAY, MERGE]
+    lane.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [("return 3;", "failed with status 3"), ("u->v[4] = NAN; return 0;", "nan")],
+)
+@pytest.mark.parametrize("version", some(["2.0", "3.0"], "2.0"))
+def test_what_an_fmu_does_wrong_is_the_outcome_of_its_own_case(unit, version, fault, reason):
+    cases = cases_of(12)
+    trajectories = run_cases(in_process(f"fmu:{unit(version, fault=fault)}"), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert reason in trajectory.error
+        else:
+            assert trajectory.end is End.MERGED
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "reason"),
+    [
+        ("volatile int *p = 0; *p = 1;", "by signal 11 (SIGSEGV)"),
+        ("abort();", "by signal 6 (SIGABRT)"),
+        ("_Exit(3);", "exit code 3"),
+        ("exit(0);", "exit code 0"),
+        ("__builtin_trap();", "by signal 4 (SIGILL)"),
+        ("for (;;);", "took longer than the deadline of 1 s"),
+        ("void *p; while ((p = malloc(1 << 26))) *(char *)p = 1; abort();", "by signal 6"),
+    ],
+)
+@pytest.mark.parametrize("version", some(["2.0", "3.0"], "3.0"))
+def test_a_binary_that_crashes_ends_its_own_case_alone(unit, version, fault, reason):
+    slow, fast, *_ = sorted(cases_of(6), key=lambda case: case.v_pov0_mps > 30.0)[2:4]
+    cases = [slow, fast]
+    assert [case.v_pov0_mps > 30.0 for case in cases] == [False, True]
+    spec = f"fmu:{unit(version, fault=fault)}"
+    trajectories = run_cases(factory(spec, deadline_s=1.0, memory_gib=0.5), cases)
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        if case.v_pov0_mps > 30.0:
+            assert trajectory.end is End.VUT_ERROR
+            assert reason in trajectory.error
+        else:
+            assert trajectory.end is End.MERGED
+
+
+def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
+    (tmp_path / "text.fmu").write_text("no unit")
+    good, other = unit(), unit(names=("a", "b", "c", "d", "e"))
+    head = 'name="acceleration_mps2" valueReference="4" causality="output" variability="continuous"'
+    array = f'<Float64 {head}><Dimension start="3"/></Float64>'
+    with zipfile.ZipFile(tmp_path / "array.fmu", "x") as archive:
+        described = description("3.0", NAMES, "number", {})
+        assert f"<Float64 {head}/>" in described
+        described = described.replace(f"<Float64 {head}/>", array)
+        archive.writestr("modelDescription.xml", described)
+    for spec, said in {
+        tmp_path / "nothing.fmu": "there is no FMU",
+        tmp_path / "text.fmu": "is no readable FMU",
+        tmp_path / "array.fmu": "is an array: name a number",
+        other: "has none of the inputs",
+        f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",
+        f"{good}?v_vut_mps=wrong": "has no variable 'wrong'",
+        f"{good}?speed=v": "there is no variable 'speed' to name",
+        f"{good}?merge=nothing": "has no variable 'nothing'",
+    }.items():
+        with pytest.raises(UserError, match=r"fmu|FMU") as refused:
+            in_process(f"fmu:{spec}")
+        assert said in str(refused.value)
+
+
+@pytest.mark.parametrize("wish", some(["number", "boolean"], "boolean"))
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_output_merge_is_whether_to_merge(unit, version, wish):
+    vut = in_process(f"fmu:{unit(version, merge=wish)}")(2)
+    begin(vut)
+    assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
+    assert vut.wishes().tolist() == [STAY, MERGE]
+    vut.close()
+
+
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_an_output_v_mps_is_the_speed_reached_unless_the_acceleration_alone_is_named(unit, version):
+    cases = cases_of(3)
+    # Its output acceleration_mps2 says something else in the fourth step.
+    path = unit(version, fault="u->v[4] = -1.0; u->v[6] = u->v[3] - 0.3; return 0;", v_mps="number")
+    for case, by_speed, by_name, named in zip(
+        cases,
+        run_cases(in_process(f"fmu:{path}"), cases),
+        run_cases(in_process(f"fmu:{path}?acceleration_mps2=acceleration_mps2"), cases),
+        run_cases(in_process(f"fmu:{path}?acceleration_mps2=v_vut_mps&v_mps=v_mps"), cases),
+        strict=True,
+    ):
+        fast = case.v_pov0_mps > 30.0
+        assert by_speed.a_vut_mps2[:5] == pytest.approx([1, 1, 1, -3 if fast else 1, 1])
+        assert by_name.a_vut_mps2[:5] == pytest.approx([1, 1, 1, -1 if fast else 1, 1])
+        assert np.array_equal(named.motion, by_speed.motion)
+    assert {case.v_pov0_mps > 30.0 for case in cases} == {True, False}
+
+
+def test_a_speed_out_of_reach_is_clipped_and_one_that_is_none_ends_the_case(unit):
+    fast = [case for case in cases_of(12) if case.v_pov0_mps > 30.0][:1]
+    for said, clipped in (("1e6", 1), ("-1e6", 1), ("NAN", None), ("INFINITY", None)):
+        path = unit(fault=f"u->v[6] = {said}; return 0;", v_mps="number")
+        (trajectory,) = run_cases(in_process(f"fmu:{path}"), fast)
+        if clipped is None:
+            assert trajectory.end is End.VUT_ERROR
+        else:
+            assert trajectory.clipped_steps == clipped
+
+
+@pytest.mark.parametrize("kind", ["number", "integer"])
+@pytest.mark.parametrize("version", ["2.0", "3.0"])
+def test_a_unit_is_told_the_seed_of_each_case(unit, version, kind):
+    fast = [case for case in cases_of(12) if case.v_pov0_mps > 30.0]
+    path = unit(version, fault="u->v[4] = fmod(u->v[7], 1000.0) / 1000.0; return 0;", seed=kind)
+    told = [case.told_seed % 2**31 if kind == "integer" else case.told_seed for case in fast]
+    assert len(set(told)) == len(fast) > 2
+    assert max(case.told_seed for case in fast) > 2**31
+    for seed, trajectory in zip(
+        told, run_cases(in_process(f"fmu:{path}"), fast, corridors=2), strict=True
+    ):
+        assert trajectory.a_vut_mps2[3] == seed % 1000 / 1000.0

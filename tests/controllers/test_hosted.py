@@ -1,0 +1,198 @@
+"""The process of a user's controller: how it starts, what ends it, and what it may answer."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.campaigning import campaign_settings, run_campaign
+from support.misbehaviours import STUBBORN
+from support.processes import none_left, wait_for
+
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.controller import Start
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.hosting import HostedDriver
+from merge_sumo.controllers.messages import Act, decode_request, encode, packed, unpacked
+from merge_sumo.controllers.process import Echo, append
+from merge_sumo.controllers.spec import parse
+from merge_sumo.drivers.base import Scene, VutLostError
+from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23
+
+OPTIONS = VutOptions(deadline_s=0.3)
+HANGS = f"""
+import pathlib, signal, time
+signal.signal(signal.SIGIO, signal.SIG_IGN)
+def Vut(seen):
+    pathlib.Path(__file__).with_name("hangs").touch()
+    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    {STUBBORN.replace(chr(10), chr(10) + "    ")}
+"""
+
+
+@pytest.fixture
+def spec(tmp_path):
+    """Return a function that writes a source and returns its spec."""
+
+    def write(source: str) -> str:
+        (tmp_path / "my_vut.py").write_text(source, encoding="utf-8")
+        return f"{tmp_path / 'my_vut.py'}:Vut"
+
+    return write
+
+
+def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", spec, "--level", "0"]
+    command += ["--cases", "4", "--sampler", "uniform", "--quiet", "--out", str(out), *more]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+
+
+@pytest.mark.slow
+def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_and_ignores_signals(
+    spec, tmp_path
+):
+    with none_left():
+        parent = campaign(spec(HANGS), tmp_path / "run", "--workers", "2", "--deadline", "600")
+        assert wait_for((tmp_path / "hangs").exists)
+        os.kill(parent.pid, signal.SIGKILL)
+        parent.wait()
+        parent.stderr.close()
+
+
+@pytest.mark.slow
+def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
+    with none_left():
+        parent = campaign(spec(HANGS), tmp_path / "run", "--deadline", "600")
+        assert wait_for((tmp_path / "hangs").exists)
+        for _ in range(2):
+            os.kill(parent.pid, signal.SIGINT)
+            time.sleep(0.5)
+        _, said = parent.communicate(timeout=600)
+    assert parent.returncode == 130
+    assert b"Traceback" not in said
+    assert b"go on with" in said
+
+
+def scene(corridors: int) -> Scene:
+    active, step = np.ones(corridors, dtype=bool), np.zeros(corridors, dtype=np.int64)
+    return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
+
+
+def test_after_a_death_it_starts_again_and_knows_which_files_there_were(spec):
+    vut = HostedDriver(2, parse(spec("import os\ndef Vut(seen):\n    os._exit(3)\n")), OPTIONS)
+    try:
+        for _ in range(2):
+            with pytest.raises(VutLostError, match="exit code 3"):
+                vut.act(scene(2))
+            assert {file.name for file in vut.files()} == {"my_vut.py"}
+    finally:
+        vut.close()
+
+
+def test_a_controller_is_opened_once_and_drives_in_that_process(spec, tmp_path):
+    source = """
+import os, pathlib
+with open(pathlib.Path(__file__).with_name("opened"), "a") as file:
+    file.write(f"{os.getpid()} ")
+def Vut(seen):
+    return 1.0
+"""
+    run_campaign(campaign_settings(vut=spec(source), cases=4, batch=2), tmp_path / "run")
+    assert len((tmp_path / "opened").read_text().split()) == 1
+
+
+def test_controllers_that_take_long_together_are_not_late(spec):
+    source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
+    vut = HostedDriver(10, parse(spec(source)), OPTIONS)  # 2 s, and the process has 1.7 s
+    try:
+        assert vut.act(scene(10)).tolist() == [1.0] * 10
+    finally:
+        vut.close()
+
+
+def test_what_starts_print_is_shown_from_where_it_differs(capsys):
+    echo = Echo()
+    for parts in ([b"a", b"b"], [b"ab"], [b"a", b"b"], [b""], [b"a", b"c"], [b"a"], [b"a"]):
+        for part in parts:
+            echo.show(part)
+        echo.end()
+    echo.close()
+    told = "ab(printed 2 more times)\naca(printed 1 more time)\n"
+    assert capsys.readouterr().err == told
+
+
+def test_its_code_may_not_change_and_data_that_it_reads_may(spec, tmp_path):
+    (tmp_path / "helper.py").touch()
+    count = tmp_path / "count.txt"
+    count.write_text("1")
+    source = """
+import pathlib, helper
+COUNT = pathlib.Path(__file__).with_name("count.txt").read_text()
+def Vut(seen):
+    return 1.0
+"""
+    factory = VutFactory.of(spec(source))
+    assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py"}
+    count.write_text("2")
+    factory(1).close()
+    (tmp_path / "helper.py").write_text("changed = True")
+    with pytest.raises(UserError, match=r"helper\.py, code of the VUT .*, is not as it was"):
+        factory(1)
+
+
+def test_what_it_imports_while_it_drives_is_of_its_files(spec, tmp_path):
+    (tmp_path / "late.py").touch()
+    vut = HostedDriver(1, parse(spec("def Vut(seen):\n    import late\n    return 1.0\n")), OPTIONS)
+    try:
+        assert {f.name for f in vut.files()} == {"my_vut.py"}
+        vut.act(scene(1))
+        assert {f.name for f in vut.files()} == {"my_vut.py", "late.py"}
+    finally:
+        vut.close()
+
+
+def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
+    vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
+    run = run_campaign(
+        campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2),
+        tmp_path / "run",
+    )
+    log = (run.folder / "controller.log").read_bytes()
+    assert log.startswith(b"loading \x1b[31m\nacting\n")
+    assert capfd.readouterr().out == ""
+
+
+def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path):
+    (tmp_path / "others").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "others")
+    with pytest.raises(OSError, match="symbolic link"):
+        append(tmp_path / "link", b"x")
+    assert (tmp_path / "others").read_bytes() == b""
+    os.mkfifo(tmp_path / "pipe")
+    append(tmp_path / "pipe", b"x")
+
+
+def test_the_lane_and_who_has_merged_reach_the_process_and_the_rest_of_the_case_does_not():
+    lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
+    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
+    sent = scene(2)._replace(merged=np.array([False, True]))
+    request = decode_request(encode(Act([(1, Start.of(case))], packed(sent))))
+    ((corridor, start),) = request.starts
+    assert (corridor, start) == (1, Start.of(case))
+    assert start.seen.lane_end_m == 130.0
+    assert {"level", "svo_rad"}.isdisjoint(start.__struct_fields__)
+    told = unpacked(request.scene)
+    assert told.merged.tolist() == [False, True]
+    assert told.facing is None
+    assert np.array_equal(told.x_m, sent.x_m)

@@ -1,0 +1,214 @@
+"""A VUT in Python: the tutorial's example, what it may see, and what it may do wrong."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import random
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from support.campaigning import campaign_settings, run_campaign
+from support.vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
+
+from merge_sumo.errors import UserError
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import US23, VUT
+from merge_sumo.scenario.trajectory import End
+
+
+@pytest.fixture
+def vut(tmp_path):
+    """Return a function that writes a source and returns the spec of a name in it."""
+
+    def write(source: str, name: str = "Vut", file: str = "my_vut.py") -> str:
+        (tmp_path / file).write_text(source, encoding="utf-8")
+        return f"{tmp_path / file}:{name}"
+
+    return write
+
+
+BATCHED = """
+import numpy as np
+class Vut:
+    def __init__(self, corridors):
+        self.resets = [0] * corridors
+    def reset(self, corridor, seen):
+        self.resets[corridor] += 1
+    def act_batch(self, seen):
+        return np.clip((28.0 - seen.v_vut_mps) / 0.1, 0.0, 1.0)
+"""
+
+
+@pytest.mark.parametrize(("source", "name"), [(LEVEL0_CLASS, "Level0"), (BATCHED, "Vut")])
+def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
+    vut, tmp_path, source, name
+):
+    lines: list = []
+    for spec in ("level0", vut(source, name)):
+        settings = campaign_settings(
+            vut=spec, levels=(0, 2), cases=20, batch=10, seed=3, sampler="gpr"
+        )
+        folder = tmp_path / f"run{len(lines)}"
+        run_campaign(settings, folder)
+        lines.append((folder / "outcomes.jsonl").read_bytes())
+    assert lines[0] == lines[1]
+
+
+def test_a_module_in_the_working_folder_is_found(vut, tmp_path, monkeypatch):
+    vut(LEVEL0_CLASS, file="module_of_a_user.py")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
+    assert run_cases(in_process("module_of_a_user:Level0"), cases_of(3))[0].end is End.MERGED
+
+
+def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
+    (tmp_path / "registered_vut.py").write_text(LEVEL0_CLASS)
+    info = tmp_path / "registered_vut-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: registered-vut\nVersion: 1\n")
+    (info / "entry_points.txt").write_text(
+        "[merge_sumo.vuts]\nmine = registered_vut:Level0\nbad = registered_vut:Nothing\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run_cases(in_process("mine"), cases_of(3))[0].end is End.MERGED
+    with pytest.raises(UserError, match="cannot load the VUT bad"):
+        in_process("bad")
+    with pytest.raises(UserError, match=r"choose one of .*mine"):
+        in_process("nobody")
+
+
+WATCHER = """
+import json, pathlib
+class Vut:
+    def reset(self, seen):
+        self.seen = [seen._asdict()]
+    def act(self, seen):
+        self.seen.append(seen._asdict())
+        pathlib.Path(__file__).with_name("seen.json").write_text(json.dumps(self.seen))
+        return 0.5
+"""
+
+
+def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
+    case = MergeCase(
+        level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
+    )
+    (trajectory,) = run_cases(in_process(vut(WATCHER)), [case])
+    at_reset, *steps = json.loads((tmp_path / "seen.json").read_text())
+    start = {"t_s": 0.0, "x_pov_m": -250.0, "v_pov_mps": 30.0, "x_vut_m": -182.0, "v_vut_mps": 17.0}
+    assert at_reset == start
+    assert steps[0] == pytest.approx(start)
+    assert [s["t_s"] for s in steps] == [round(i * 0.1, 1) for i in range(len(steps))]
+    for name in ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps"):
+        until_m = getattr(trajectory, name)[:-1].tolist()
+        assert [s[name] for s in steps][: len(until_m)] == until_m
+    assert len(steps) == len(trajectory.whole) - 1
+
+
+def test_each_corridor_has_an_object_of_its_own(vut):
+    source = """
+class Vut:
+    def reset(self, seen):
+        self.count = 0
+    def act(self, seen):
+        self.count += 1
+        assert self.count == round(seen.t_s * 10) + 1, self.count
+        return 1.0
+"""
+    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(40))} == {End.MERGED}
+
+
+def test_a_batched_vut_cannot_move_the_cars(vut):
+    source = BATCHED.replace("return ", "seen.x_vut_m[:] = 5.0; seen.v_vut_mps[:] = 1.0; return ")
+    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(4))} == {End.MERGED}
+
+
+def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(vut):
+    for answer, clipped in ((7.0, True), (2.0 + 1e-12, False), (2, False)):
+        source = f"def Vut(seen):\n    return {answer}\n"
+        (trajectory,) = run_cases(in_process(vut(source, file=f"v{answer}.py")), cases_of(1))
+        assert trajectory.clipped_steps == (len(trajectory.motion) - 1) * clipped
+        assert (trajectory.a_vut_mps2[:-1] == 2.0).all()
+
+
+def test_what_it_prints_goes_to_standard_error_and_close_is_called(vut, capsys):
+    source = """
+class Vut:
+    def act(self, seen):
+        print("hello")
+        return 1.0
+    def close(self):
+        print("goodbye")
+        raise ValueError("too late")
+"""
+    (trajectory,) = run_cases(in_process(vut(source)), cases_of(1), corridors=1)
+    said = capsys.readouterr()
+    assert trajectory.end is End.MERGED
+    assert said.out == ""
+    assert "hello" in said.err
+    assert "closing the VUT: ValueError: too late" in said.err
+
+
+@pytest.mark.parametrize(
+    ("source", "name", "said"),
+    [
+        ("", "Vut", "has no 'Vut'"),
+        ("Vut = 3", "Vut", "a VUT is a class with `act"),
+        ("Vut = object()", "Vut", "a VUT is a class with `act"),
+        ("class Vut: pass", "Vut", "a VUT is a class with `act"),
+        ("def Vut(): pass", "Vut", "Vut() is called as Vut(seen)"),
+        ("1 / 0", "Vut", "ZeroDivisionError"),
+        ("import sys; sys.exit(1)", "Vut", "SystemExit"),
+        ("def Vut(:", "Vut", "SyntaxError"),
+        ("import not_a_module_at_all", "Vut", "No module named"),
+    ],
+)
+def test_what_cannot_be_a_vut_is_refused_in_a_sentence(vut, source, name, said):
+    with pytest.raises(UserError, match=r"(?i)vut") as refused:
+        in_process(vut(source, name))
+    assert said in str(refused.value)
+
+
+def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
+    page = Path(__file__).parents[2] / "docs" / "tutorials" / "python-vut.md"
+    text = page.read_text(encoding="utf-8")
+    (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
+    assert len(source.strip().splitlines()) <= 10
+    trajectories = run_cases(in_process(vut(source, "MyVut")), cases_of(20))
+    assert {t.end for t in trajectories} == {End.MERGED}
+    assert any(t.a_vut_mps2.min() == -2.0 for t in trajectories)
+
+
+SEEDED = """
+import random
+class Vut:
+    def reset(self, seen, seed):
+        self.a_mps2 = random.Random(seed).uniform(0.0, 1.0)
+    def act(self, seen):
+        return self.a_mps2
+"""
+SEEDED_BATCH = """
+import random
+class Vut:
+    def __init__(self, corridors):
+        self.a_mps2 = [0.0] * corridors
+    def reset(self, corridor, seen, *, seed):
+        self.a_mps2[corridor] = random.Random(seed).uniform(0.0, 1.0)
+    def act_batch(self, seen):
+        return self.a_mps2
+"""
+
+
+@pytest.mark.parametrize("source", [SEEDED, SEEDED_BATCH])
+def test_a_controller_that_takes_a_seed_draws_anew_for_each_draw_and_the_same_again(vut, source):
+    first, *_ = cases_of(1)
+    second = replace(first, draw=1)
+    ran = run_cases(in_process(vut(source)), [first, second, first, second])
+    commands = [trajectory.motion[0, VUT, 2] for trajectory in ran]
+    drawn = [random.Random(case.told_seed).uniform(0.0, 1.0) for case in (first, second)]  # noqa: S311
+    assert commands == drawn * 2

@@ -1,0 +1,136 @@
+"""SUMO's own drivers as VUT: their motion, their options, and that they react to the POV."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.vut_contract import cases_of, factory, run_cases, run_on
+
+from merge_sumo.controllers.sumo_model import LANE_CHANGE_OPTIONS, MODELS
+from merge_sumo.errors import UserError
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23, VUT
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.sumo.binding import sumo_program
+from merge_sumo.sumo.world import World
+
+FREE = MergeCase(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
+"""The POV is gone before the VUT arrives."""
+
+
+@pytest.fixture(scope="module", params=sorted(MODELS))
+def model(request) -> str:
+    return f"sumo:{request.param}"
+
+
+def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
+    cases = cases_of(25)
+    alone, many = (run_cases(factory(model), cases, corridors=k) for k in (1, 8))
+    for one, other in zip(alone, many, strict=True):
+        assert one.end is End.MERGED
+        assert np.array_equal(one.motion, other.motion)
+        x, v, a = one.motion[:, VUT].T
+        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * DT_S, abs=1e-9)
+        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * DT_S, abs=1e-9)
+
+
+def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
+    """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
+    (ours,) = run_cases(factory(model), [FREE], corridors=1)
+    with World(1, vut_type=factory(model).vut.vut_type, scenario=US23) as world:
+        world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
+        x_m, speeds = [], []
+        for _ in range(len(ours.motion) - 1):
+            world._step_simulation()
+            world.read()
+            x_m.append(world.x_m[VUT, 0])
+            speeds.append(world.v_mps[VUT, 0])
+    assert ours.v_vut_mps[1:] == pytest.approx(speeds, abs=0.05)
+    gained = (speeds[-1] - 18.0) * DT_S
+    assert np.abs(ours.x_vut_m[1:] - x_m).max() <= gained + 0.05
+
+
+@pytest.mark.parametrize(
+    ("spec", "said"),
+    [
+        ("sumo:", "choose one of sumo:Krauss"),
+        ("sumo:idm", "choose one of sumo:Krauss"),
+    ],
+)
+def test_what_sumo_does_not_have_is_refused_in_a_sentence(spec, said):
+    with pytest.raises(UserError, match="sumo:") as refused:
+        factory(spec)
+    assert said in str(refused.value)
+
+
+OF_SUBLANES = {
+    *("lcSublane", "lcPushy", "lcPushyGap", "lcImpatience", "lcTimeToImpatience", "lcAccelLat"),
+    *("lcTurnAlignmentDistance", "lcLaneDiscipline", "lcSpeedGainUrgency"),
+}
+UNTOLD = {
+    *("lcContRight", "lcCooperativeMinSpeed", "lcCooperativeHelpTime"),
+    "lcCooperativeHelpThreshold",
+}
+"""What SUMO takes, and does not tell."""
+
+
+def test_the_lane_change_attributes_are_those_of_sumos_schema_and_reach_its_model():
+    schema = Path(sumo_program("sumo")).parents[1] / "data" / "xsd" / "types" / "route.xsd"
+    known = set(re.findall(r'name="(\w+)" type', schema.read_text()))
+    assert {name for name in known if name.startswith("lc")} == LANE_CHANGE_OPTIONS | OF_SUBLANES
+    named = "&".join(f"{name}=0.25" for name in sorted(LANE_CHANGE_OPTIONS))
+    with World(1, vut_type=factory(f"sumo:Krauss?{named}").vut.vut_type, scenario=US23) as world:
+        world.place(0, [(-200.0, 30.0), (-182.0, 18.0)])
+        tell, vut = world._libsumo.vehicle.getParameter, world._ids[VUT]
+        told = {name: tell(vut, f"laneChangeModel.{name}") for name in LANE_CHANGE_OPTIONS - UNTOLD}
+    assert set(told.values()) == {"0.25"}
+
+
+def test_lane_change_parameters_decide_where_it_merges():
+    scenario = named_scenario("us23-lane")
+    early, late = (
+        np.mean([t.x_vut_m[-1] for t in run_on(factory(f"sumo:Krauss{named}"), scenario, 0, 20)])
+        for named in ("?lcAssertive=5", "?lcStrategic=0")
+    )
+    assert early + 50.0 < late
+
+
+def test_a_value_that_sumo_refuses_is_refused_in_its_words():
+    for named, said in (
+        ("lcAssertive=-2", "lcAssertive is -2: give a number from -1 up"),
+        ("lcPushy=1", "it has no parameter 'lcPushy': choose from"),
+        ("lcOvertakeDeltaSpeedFactor=3", "Attribute lcOvertakeDeltaSpeedFactor. Must be between"),
+    ):
+        with pytest.raises(UserError, match=re.escape(said)):
+            run_cases(factory(f"sumo:IDM?{named}"), [FREE])
+
+
+@pytest.mark.parametrize("name", ["IDM", "Krauss", "ACC", "EIDM"])
+def test_sumos_lane_change_model_merges_from_an_acceleration_lane(name):
+    scenario, vut = named_scenario("us23-lane"), factory(f"sumo:{name}")
+    places = []
+    for level in (0, 1, 2):
+        ran = run_on(vut, scenario, level, 40)
+        assert {t.end for t in ran} == {End.MERGED}
+        places += [t.x_vut_m[-1] for t in ran]
+        if level == 0:
+            alone = run_on(vut, scenario, level, 40, corridors=1)
+            assert all(np.array_equal(a.motion, b.motion) for a, b in zip(ran, alone, strict=True))
+            assert all(np.array_equal(a.after, b.after) for a, b in zip(ran, alone, strict=True))
+    assert min(places) >= -70.0
+    assert max(places) < 130.0, "no merge is forced"
+    assert np.ptp(places) > 100.0, "it is the model that chooses the place"
+
+
+@pytest.mark.parametrize("name", ["IDM", "ACC"])
+def test_sumos_lane_change_model_forgets_the_cars_of_other_episodes(name):
+    scenario, vut = named_scenario("us23-lane-traffic"), factory(f"sumo:{name}")
+    together = run_on(vut, scenario, 0, 30)
+    alone = run_on(vut, scenario, 0, 30, corridors=1)
+    assert all(np.array_equal(a.motion, b.motion) for a, b in zip(together, alone, strict=True))

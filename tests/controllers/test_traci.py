@@ -1,0 +1,337 @@
+"""A controller behind TraCI: what it sees, what it may do, and what it may do wrong."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import socket
+import sys
+import threading
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+import traci
+from support.controllers import (
+    RAW_CLIENT,
+    STOCK_CLIENT,
+    assert_drives_as_level0,
+    free_port,
+    program,
+    raw_client,
+)
+from support.processes import none_left
+from support.raw_traci import Client, GoneError
+from support.vut_contract import cases_of, factory, run_cases
+
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.traci import child
+from merge_sumo.controllers.traci.child import user_of
+from merge_sumo.controllers.traci.vut import TraciVut
+from merge_sumo.drivers.base import Scene
+from merge_sumo.errors import UserError
+from merge_sumo.road.merge import road_of
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.trajectory import End
+
+CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
+    encoding="utf-8"
+)
+CONTROLLER, _ = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
+"""The tutorial's controller; its law is that of level 0."""
+
+
+class Played:
+    """Episodes of eq. (4) with a client in a thread: speeds, clipped or not, and reasons."""
+
+    def __init__(self, client, episodes=1, steps=30, deadline_s=5.0, port=None):
+        self.port = port or free_port()
+        self.result = self.error = None
+        self.speeds, self.accelerations, self.reasons = [], [], []
+        thread = threading.Thread(target=self._client, args=(client,))
+        thread.start()
+        options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
+        vut = TraciVut(road_of(), US23, self.port, None, options)
+        try:
+            for _ in range(episodes):
+                self._episode(vut, steps)
+        finally:
+            vut.close()
+            thread.join()
+        if self.error is not None:
+            raise self.error
+
+    def _client(self, client):
+        try:
+            self.result = client(self.port)
+        except (Exception, SystemExit) as error:
+            self.error = error
+
+    def _episode(self, vut, steps):
+        vut.begin(0, CASE)
+        x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
+        for step in range(steps):
+            columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
+            a = vut.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
+            if not np.isfinite(a):
+                self.reasons.append(vut.reason(0))
+                return
+            self.accelerations.append(a)
+            a = min(max(a, US23.a_min_mps2), US23.a_max_mps2)
+            x_pov, x, v = x_pov + v_pov * DT_S, x + v * DT_S, max(v + a * DT_S, 0.0)
+            self.speeds.append(v)
+        self.reasons.append(None)
+
+
+def stock(function):
+    """Return a client that speaks by the stock package: a function of its connection."""
+
+    def client(port):
+        connection = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
+        try:
+            return function(connection)
+        finally:
+            connection.close()
+
+    return client
+
+
+class TestAStockClient:
+    def test_sees_vehicles_depart_and_arrive_episode_after_episode_while_time_runs_on(self):
+        def drive(c):
+            seen: list[tuple] = [
+                (c.simulation.getTime(), c.vehicle.getIDList(), c.vehicle.getIDCount())
+            ]
+            while c.simulation.getMinExpectedNumber() > 0:
+                c.simulationStep()
+                seen.append(
+                    (
+                        c.simulation.getTime(),
+                        c.vehicle.getIDList(),
+                        c.simulation.getDepartedIDList(),
+                        c.simulation.getArrivedIDList(),
+                    )
+                )
+            return seen
+
+        first, *others = Played(stock(drive), episodes=2, steps=3).result
+        assert first == (0.0, (), 0)
+        both, none = ("pov", "vut"), ()
+        episode = [(both, both, none), (both, none, none), (both, none, none), (none, none, both)]
+        assert [(ids, departed, arrived) for _, ids, departed, arrived in others] == episode * 2
+        assert [round(time_s, 6) for time_s, *_ in others] == [
+            round(0.1 * (i + 1), 6) for i in range(8)
+        ]
+
+    def test_holds_the_speed_it_set_until_it_sets_another(self):
+        def drive(c):
+            c.simulationStep()
+            c.vehicle.setSpeedMode("vut", 0)
+            c.vehicle.setSpeed("vut", 18.3)
+            c.simulationStep(c.simulation.getTime() + 0.35)
+            c.vehicle.setSpeed("vut", 18.1)
+            c.simulationStep(c.simulation.getTime() + 0.15)
+
+        played = Played(stock(drive), steps=6)
+        # Clipped to 2 m/s2 by who moves the vehicle; the wish itself is 3 m/s2.
+        assert played.accelerations[:2] == pytest.approx([3.0, 1.0])
+        assert played.speeds == pytest.approx([18.2, 18.3, 18.3, 18.3, 18.1, 18.1])
+
+    def test_gets_what_it_subscribed_to_until_the_vehicles_arrive(self):
+        speed = traci.constants.VAR_SPEED
+
+        def drive(c):
+            c.simulationStep()
+            c.vehicle.subscribe("vut", [speed])
+            c.vehicle.setSpeed("vut", 18.1)
+            seen = []
+            for _ in range(4):
+                c.simulationStep()
+                seen.append(dict(c.vehicle.getAllSubscriptionResults()))
+            return seen
+
+        seen = Played(stock(drive), episodes=2, steps=3).result
+        assert seen == [{"vut": {speed: pytest.approx(18.1)}}] * 2 + [{}] * 2
+
+
+@pytest.mark.slow
+def test_the_controller_of_the_tutorial_drives_like_the_same_law_in_process(tmp_path):
+    command = program(tmp_path, CONTROLLER)
+    assert_drives_as_level0(factory("traci:" + command), cases_of(20))
+
+
+EPISODES = """import sys, traci
+for _ in range(2):
+    traci.init(int(sys.argv[1]))
+    traci.simulationStep()
+    while "vut" in traci.vehicle.getIDList():
+        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
+        traci.simulationStep()
+    traci.close()
+"""
+
+
+def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_has_ended(tmp_path):
+    head = f"open({str(tmp_path / 'started')!r}, 'a').write('.')\n"
+    command, cases = program(tmp_path, head + EPISODES), cases_of(4)
+    assert_drives_as_level0(factory("traci:" + command), cases)
+    assert len((tmp_path / "started").read_text()) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("misdeed", "reason"),
+    [
+        ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
+        ("hangs", "the controller made no step within the deadline of 0.5 s"),
+        ("says goodbye", "the controller closed the connection during the episode"),
+        ("a huge message", "not TraCI: a message of 2147483647 bytes was announced"),
+        ("nan", "the controller commanded vehicle.setSpeed(nan)"),
+        ("half a message", "sent half a message and no more within the deadline of 0.5 s"),
+    ],
+)
+def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
+    vut = factory("traci:" + raw_client(misdeed), deadline_s=0.5)
+    with none_left():
+        trajectories = run_cases(vut, cases_of(2))
+    for trajectory in trajectories:
+        assert trajectory.end is End.VUT_ERROR
+        assert reason in trajectory.error
+        assert len(trajectory.motion) == 4
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("no-such-program {port}", "there is no program 'no-such-program'"),
+        ("'unclosed", "cannot be read"),
+        (f"{sys.executable} -c 'raise SystemExit(3)'", "ended with exit code 3 (before it"),
+    ],
+)
+def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
+    with pytest.raises(UserError, match=r"controller|the command") as refused:
+        run_cases(factory("traci:" + command), cases_of(1))
+    assert said in str(refused.value)
+
+
+def test_a_command_that_never_connects_is_told_how():
+    command = f"{sys.executable} -c 'import time; time.sleep(9)'"
+    with pytest.raises(UserError, match=r"in 0\.3 s: the command is told the port as {port}"):
+        run_cases(factory("traci:" + command, connect_s=0.3), cases_of(1))
+
+
+def test_its_code_must_stay_as_it_is_while_it_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("c.py", "log.txt"):
+        Path(name).write_text("print(1)\n", encoding="utf-8")
+    vut = factory(f"traci:{Path(sys.executable).name} -u c.py {{port}} log.txt")
+    assert list(vut.files) == ["c.py"], "what follows is read and written"
+    Path("c.py").write_text("print(2)\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"c\.py, code of the VUT .* is not as it was"):
+        vut(1)
+
+
+IN_VAIN = """
+while True:
+    traci.simulationStep()
+    if "vut" in traci.vehicle.getIDList():
+        traci.vehicle.changeSublane("vut", 0.5)
+"""
+
+
+def test_what_it_commands_in_vain_is_told_in_the_end(tmp_path, command_line):
+    vut = "traci:" + program(tmp_path, STOCK_CLIENT + IN_VAIN)
+    campaign = ("--cases", 3, "--sampler", "uniform", "--level", 0, "--out", tmp_path / "run")
+    said = "commanded in vain, because it changes nothing here: vehicle.changeSublane in 3 cases"
+    _, out, _ = command_line("campaign", "--vut", vut, *campaign, "-q")
+    assert f"note: {said}" in out.splitlines()
+    assert said[1:] in (tmp_path / "run" / "report.html").read_text(encoding="utf-8")
+    start = ("--level", 0, "--x", -250, "--v", 30)
+    _, out, _ = command_line("run", "--vut", vut, *start, "--json")
+    assert json.loads(out)["in_vain"] == ["vehicle.changeSublane"]
+
+
+def test_what_every_start_of_a_program_prints_is_shown_once(tmp_path, command_line, capfd):
+    crash = "traci.simulationStep()\ntraci.simulationStep()\nraise ValueError('my bug')\n"
+    code, _, err = command_line("check-vut", "traci:" + program(tmp_path, STOCK_CLIENT + crash))
+    said = err + capfd.readouterr().err
+    assert code == 1
+    assert said.count("ValueError: my bug") == 1
+
+
+def test_a_port_that_is_none_or_is_taken_is_refused_and_nobody_is_waited_for_for_ever(capfd):
+    for port in ("0", "70000"):
+        with pytest.raises(UserError, match="the port is a number"):
+            factory(f"traci:{port}")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1:{port}"):
+            run_cases(factory(f"traci:{port}"), cases_of(1))
+    with pytest.raises(UserError, match=r"no TraCI client connected .* in 0.2 s"):
+        run_cases(factory(f"traci:{free_port()}", connect_s=0.2), cases_of(1))
+    assert "waiting up to 0.2 s for a TraCI client on 127.0.0.1:" in capfd.readouterr().err
+
+
+def test_who_asks_and_asks_and_makes_no_step_has_until_the_deadline():
+    def client(port):
+        curious = Client(port)
+        curious.step()
+        with suppress(GoneError):
+            while True:
+                curious.speed()
+
+    (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
+    assert reason.endswith("within the deadline of 0.3 s")
+
+
+@pytest.mark.slow
+def test_a_program_that_ends_while_its_client_goes_on_is_an_error_of_every_case(tmp_path):
+    leaves = "client.step()\nif os.fork():\n    os._exit(0)\nclient.drive(10_000)\n"
+    command = program(tmp_path, RAW_CLIENT + leaves)
+    with none_left():
+        trajectories = run_cases(factory("traci:" + command), cases_of(3))
+    for trajectory in trajectories:
+        assert trajectory.end is End.VUT_ERROR
+        assert "ended with exit code 0, and its connection goes on" in trajectory.error
+
+
+@pytest.mark.skipif(not child.KNOWN_HERE, reason="needs /proc/net/tcp")
+class TestTheUserOfAConnection:
+    @pytest.mark.parametrize(
+        ("family", "source", "target"),
+        [
+            (socket.AF_INET, "127.0.0.1", "127.0.0.1"),
+            (socket.AF_INET, "127.0.0.2", "127.0.0.1"),
+            (socket.AF_INET6, "::ffff:127.0.0.1", "::ffff:127.0.0.1"),
+        ],
+    )
+    def test_is_known(self, family, source, target):
+        with socket.create_server(("127.0.0.1", 0)) as listener, socket.socket(family) as client:
+            client.bind((source, 0))
+            client.connect((target, listener.getsockname()[1]))
+            with listener.accept()[0] as connection:
+                assert user_of(connection) == os.geteuid()
+                client.close()
+                assert user_of(connection) is None, "it is gone"
+
+    def test_who_is_another_is_not_served(self, monkeypatch, tmp_path):
+        server = child.Server(tmp_path)
+        monkeypatch.setattr(child, "user_of", lambda _: os.geteuid() + 1)
+        monkeypatch.setattr(child, "MirrorSimulation", lambda _: NoSumo())
+        port = server.answer("listen", {"port": 0}).port
+        with socket.create_connection(("127.0.0.1", port)):
+            answer = server.answer("accept", {"wait_s": 0.1, "deadline_s": 1.0})
+        server.drop()
+        assert not answer.accepted
+        assert answer.notes[0].startswith(f"a process of the user {os.geteuid() + 1} connected")
+
+
+class NoSumo:
+    def load(self) -> None:
+        """Load nothing: no client comes so far."""

@@ -1,0 +1,83 @@
+"""Registries: what installed packages add, and what they must not."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from merge_sumo.errors import UserError
+from merge_sumo.registry import Registry
+
+GROUP = "merge_sumo.tools"
+
+
+def registry() -> Registry[type]:
+    ours = {"ours": "collections:Counter", "other": "collections:OrderedDict"}
+    return Registry(
+        GROUP, "tool", ours, accepts=lambda item: isinstance(item, type), contract="a class"
+    )
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Install a package with entry points of the group, as pip leaves it."""
+    monkeypatch.syspath_prepend(tmp_path)
+
+    def installed(package: str, entries: str, source: str = "class Tool: ..."):
+        (tmp_path / f"{package}.py").write_text(source)
+        info = tmp_path / f"{package}-1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1\n")
+        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{entries}\n")
+        # A folder on the path that is new to it: what was found before is not looked for again.
+        extra = tmp_path / f"after-{package}"
+        monkeypatch.syspath_prepend(extra)
+
+    return installed
+
+
+@pytest.mark.parametrize(
+    ("entry", "source", "sentence"),
+    [
+        ("bad = broken:Tool", "raise SystemExit(1)", "'bad' of broken cannot be loaded"),
+        ("bad = broken:Nothing", "", "'bad' of broken cannot be loaded"),
+        ("bad = broken:Tool", "Tool = 3", "the tool 'bad' of broken is not a class"),
+        ("ours = broken:Tool", "", "broken and merge-sumo bring a tool 'ours'"),
+    ],
+)
+def test_what_is_no_such_object_is_one_sentence(install, monkeypatch, entry, source, sentence):
+    monkeypatch.delitem(sys.modules, "broken", raising=False)
+    install("broken", entry, source)
+    with pytest.raises(UserError, match=sentence):
+        registry()[entry.split()[0]]
+
+
+def test_a_name_of_two_packages_names_both(install):
+    install("first", "theirs = first:Tool")
+    install("second", "theirs = second:Tool")
+    assert list(registry()) == ["ours", "other", "theirs"]
+    with pytest.raises(UserError, match="first and second bring a tool 'theirs': uninstall"):
+        registry()["theirs"]
+
+
+def test_an_unknown_name_is_one_sentence():
+    with pytest.raises(UserError, match=r"no tool 'our': did you mean ours\? choose one of ours, "):
+        registry()["our"]
+
+
+def test_the_working_folder_is_data(install, tmp_path, monkeypatch):
+    install("received", "theirs = received:Tool")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", ["", ".", *sys.path])
+    assert list(registry()) == ["ours", "other"]
+
+
+def test_an_object_may_be_registered_in_this_process():
+    tools = registry()
+    assert tools.register("mine", int) is int
+    assert (tools["mine"], list(tools)[-1]) == (int, "mine")
+    with pytest.raises(UserError, match="registered already"):
+        tools.register("ours", int)
+    with pytest.raises(UserError, match="not a class"):
+        tools.register("third", 3)  # type: ignore[arg-type]

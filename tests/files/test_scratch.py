@@ -1,0 +1,99 @@
+"""Temporary folders: those of processes that are gone are removed, and nothing else."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from merge_sumo import scratch
+from merge_sumo.scratch import PREFIX, ScratchFolder
+
+BESIDE = (
+    "import sys, time\n"
+    "from merge_sumo.scratch import ScratchFolder\n"
+    "made = ScratchFolder()\n"
+    "open(made.name + '/some', 'w').close()\n"
+    "print(made.name, flush=True)\n"
+    "time.sleep(600.0)\n"
+)
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """Give an own folder for temporary files, in which this process has made nothing yet."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    scratch._remove_remains.cache_clear()
+    return tmp_path
+
+
+@pytest.fixture
+def beside(temporary):
+    """Give another process, and the scratch folder that it has made."""
+    command = [sys.executable, "-c", BESIDE]
+    environment = {**os.environ, "TMPDIR": str(temporary)}
+    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        yield process, Path(process.stdout.readline().rstrip())
+        process.kill()
+
+
+def test_of_a_process_that_was_killed_is_removed_by_the_next(temporary, beside):
+    process, folder = beside
+    assert folder.parent == temporary
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert (folder / "some").is_file()
+    with ScratchFolder() as name:
+        assert list(temporary.iterdir()) == [Path(name)]
+    assert not list(temporary.iterdir())
+
+
+def test_of_a_process_that_goes_on_stays(beside):
+    _, folder = beside
+    with ScratchFolder():
+        assert (folder / "some").is_file()
+
+
+def test_nothing_else_is_removed(temporary, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    (elsewhere / "kept").touch()
+    name = f"{PREFIX}abcd123"
+    (temporary / f"{name}0").symlink_to(elsewhere)
+    (temporary / f"{name}1").touch()
+    for other in (f"{name}-own", "merge-sumo-abcd1234", "merge-sumo-results", f"x{name}2"):
+        (temporary / other).mkdir()
+    before = sorted(temporary.iterdir())
+    with ScratchFolder():
+        pass
+    assert sorted(temporary.iterdir()) == before
+    assert (elsewhere / "kept").is_file()
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="there are no users")
+def test_another_users_is_not_removed(temporary, monkeypatch):
+    (temporary / f"{PREFIX}abcd1234").mkdir()
+    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    with ScratchFolder():
+        pass
+    assert [folder.name for folder in temporary.iterdir()] == [f"{PREFIX}abcd1234"]
+
+
+def test_one_that_was_taken_for_remains_is_made_again(temporary, monkeypatch):
+    locked, tried = scratch._locked, []
+
+    def taken_first(folder):
+        tried.append(folder)
+        if len(tried) == 1:
+            folder.rmdir()
+        return locked(folder)
+
+    monkeypatch.setattr(scratch, "_locked", taken_first)
+    with ScratchFolder() as name:
+        assert tried[0] != Path(name)
+        assert list(temporary.iterdir()) == [Path(name)]

@@ -1,0 +1,259 @@
+"""The verdict on a campaign: what was not tested, gates, JUnit, and the exit codes."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from lxml import etree
+from metrics.test_chance import CASE, outcomes
+from support.calling import Result, invoke
+from support.campaigning import campaign_settings, run_campaign
+from support.handmade import write_run
+
+import merge_sumo as ms
+from merge_sumo.campaigns.run import failures
+from merge_sumo.errors import UserError
+from merge_sumo.interrupt import Stopped
+from merge_sumo.metrics.campaign_verdict import Gate, judge, parse_gates
+from merge_sumo.metrics.summary import LevelSummary, Summary, summarise
+from merge_sumo.printable import counted
+from merge_sumo.reports.junit import write_junit
+from merge_sumo.scenario.trajectory import End
+
+HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
+CHANCE = f"{Path(__file__).parents[1]}/support/chance_vuts.py:Slope"
+VUTS = {
+    "raises": "raise RuntimeError('boom')",
+    "stops": "return -4.0",
+    "mixed": "assert seen.v_pov_mps < 33, 'fast'; return 1.0 if seen.v_pov_mps < 30 else -4.0",
+}
+
+
+@pytest.fixture(scope="module")
+def vuts(tmp_path_factory) -> dict[str, str]:
+    """Return by name what goes behind --vut: one raises, one stops, one does both at times."""
+    folder = tmp_path_factory.mktemp("vuts")
+    specs = {}
+    for name, body in VUTS.items():
+        (folder / f"{name}.py").write_text(f"def act(seen):\n    {body}\n")
+        specs[name] = f"{folder / name}.py:act"
+    return specs
+
+
+def campaign(vut: str, folder: Path, *options: object) -> Result:
+    small = (
+        *("--level", 0, "--cases", 20, "--seed", 1, "--sampler", "uniform"),
+        "-q",
+    )
+    return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
+
+
+class TestErrorsAndTimeouts:
+    def test_are_grouped_by_message_errors_first_then_the_most_frequent(self, tmp_path):
+        errors = {2: "boom", 5: "other", 6: "other"}
+        timeouts = (0, 1, 3, 4)
+        run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=timeouts)
+        found = judge(run.outcomes)
+        assert [(t.end, t.message, t.cases) for t in found.troubles] == [
+            (End.VUT_ERROR, "other", (5, 6)),
+            (End.VUT_ERROR, "boom", (2,)),
+            (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
+        ]
+        assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
+        number = len(failures(run.outcomes))
+        assert found.found == ["3 errors", "4 timeouts", counted(number, "failure")]
+        contacts = counted(found.contacts, "contact")
+        assert found.counts.endswith(f"{counted(number, 'failure')} ({contacts}) in 10 cases")
+
+
+def summary_of(fmc: float, level: int = 1) -> Summary:
+    levels = {0: LevelSummary(10, 10, 0, {}, 0.0, 0), level: LevelSummary(10, 10, 1, {}, fmc, 1)}
+    return Summary(20, 1, {"MERGED": 20}, {}, levels)
+
+
+class TestAGate:
+    def test_has_a_name_however_it_is_written_and_is_there_once(self):
+        gates = parse_gates(["errors", "fmc>0.05", "fmc > 0.050", "errors", "timeouts"])
+        assert [gate.name for gate in gates] == ["errors", "fmc>0.05", "timeouts"]
+
+    @pytest.mark.parametrize(
+        "text", ["", "fmc", "error", "FMC>0.1", "failures>3", "fmc<0.1", "\x1b"]
+    )
+    def test_that_is_none_is_refused(self, text):
+        with pytest.raises(UserError, match="choose failures, errors"):
+            parse_gates([text])
+
+    @pytest.mark.parametrize(("fmc", "met"), [(0.05, False), (0.0501, True), (0.0, False)])
+    def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, tmp_path, fmc, met):
+        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc))
+        assert found.met is met
+        level = 1 if fmc else 0
+        assert found.sentence == (
+            f"gate fmc>0.05: {'met' if met else 'not met'} (FMC {fmc:.4f} at level {level})"
+        )
+
+    def test_on_cases_is_met_by_one_of_them(self, tmp_path):
+        run = write_run(tmp_path / "run", 20, levels=(0,), errors={0: "x"}, timeouts=(1,))
+        summary = summarise(run.outcomes, (0,))
+        for name in ("failures", "errors", "timeouts"):
+            assert Gate(name).check(judge(run.outcomes), summary).met
+            assert not Gate(name).check(judge([]), summary).met
+
+
+def read_junit(file: Path) -> etree._Element:
+    root = etree.parse(file).getroot()
+    etree.XMLSchema(etree.parse(Path(__file__).with_name("junit.xsd"))).assertValid(root)
+    return root
+
+
+class TestJUnit:
+    @pytest.fixture
+    def root(self, tmp_path) -> etree._Element:
+        run = write_run(
+            *(tmp_path / "run", 20, (0, 2)),
+            vut=HOSTILE.replace("\ud800", ""),
+            errors={3: HOSTILE},
+            timeouts=(4, 6),
+        )
+        opened = ms.open_run(run.folder)
+        gates = [Gate(name).check(opened.verdict, opened.summary) for name in ("errors", "fmc")]
+        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.verdict, gates)
+        self.run = run
+        return read_junit(tmp_path / "junit.xml")
+
+    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, root):
+        assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
+        names = root.xpath("//testcase/@name")
+        assert len(set(names)) == len(names) == 3 + 40
+        found = judge(self.run.outcomes)
+        for suite, level in zip(root[1:], (0, 2), strict=True):
+            at = [o for o in self.run.outcomes if o.case.level == level]
+            assert suite.get("tests") == "20"
+            errors = sum(o.measures.end.is_error for o in at)
+            wrong = sum(o.failed or o.measures.end is End.TIMEOUT for o in at)
+            assert (suite.get("errors"), suite.get("failures")) == (str(errors), str(wrong))
+            assert float(suite.get("time")) == pytest.approx(sum(o.measures.t_end_s for o in at))
+        assert root.get("errors") == "1"
+        assert root.get("failures") == str(found.failures + 2 + 2), "and both gates are met"
+
+    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, root):
+        (error,) = root.xpath("//error")
+        assert error.get("type") == "VUT_ERROR"
+        ended = self.run.outcome(3).measures
+        said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
+        assert error.get("message") == error.text == f"VUT_ERROR at {ended.t_end_s:g} s: {said}."
+
+    def test_fails_where_nothing_was_tested(self, tmp_path):
+        run = write_run(tmp_path / "run", 4, levels=(0,), timeouts=range(4))
+        write_junit(tmp_path / "junit.xml", run, [], judge(run.outcomes), [])
+        (failure,) = read_junit(tmp_path / "junit.xml").iter("failure")
+        assert failure.text.startswith("nothing was tested")
+
+
+def test_a_case_that_ran_too_seldom_to_tell_is_no_failure_and_meets_the_gate():
+    """Two failures of two runs decide, one of one does not (posterior of Jeffreys' prior)."""
+    told = outcomes(
+        [(CASE, 0, -600.0), (CASE, 1, -700.0), (replace(CASE, level=0, svo_rad=None), 0, -600.0)]
+    )
+    found, summary = judge(told, 0.2), summarise(told, (0, 2), 0.2)
+    assert found.counts == "1 failure (0 contacts) and 1 undecided in 2 cases"
+    assert (summary.failures, summary.undecided) == (found.failures, found.undecided) == (1, 1)
+    assert [(of.failures, of.undecided) for of in summary.levels.values()] == [(0, 1), (1, 0)]
+    assert all(of.fmc > 0.0 and of.regions == 1 for of in summary.levels.values())
+    gate = Gate("failures").check(judge(told[2:], 0.2), summarise(told[2:], (0,), 0.2))
+    assert gate.sentence == "gate failures: met (0 failures and 1 undecided)"
+
+
+def test_an_undecided_case_is_skipped_in_junit(tmp_path):
+    settings = campaign_settings(vut=CHANCE, cases=40, seed=100, tolerated=0.5, repeat=1)
+    opened = ms.open_run(run_campaign(settings, tmp_path / "run").folder)
+    number = opened.verdict.undecided
+    assert number == len(failures(opened.run.outcomes)) > 0, "each case ran once"
+    write_junit(tmp_path / "junit.xml", opened.run, opened.facts, opened.verdict, [])
+    root = read_junit(tmp_path / "junit.xml")
+    assert (root.get("failures"), root[1].get("skipped")) == ("0", str(number))
+    assert all(one.get("message").startswith("undecided: ") for one in root.iter("skipped"))
+
+
+class TestACampaignThatTestedNothing:
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("raises", "20 VUT_ERROR, the first in case 0"),
+            ("stops", "20 TIMEOUT, the first in case 0"),
+        ],
+    )
+    def test_exits_with_1_and_says_why_first(self, vuts, tmp_path, name, message):
+        said = campaign(vuts[name], tmp_path / "run")
+        assert said.exit_code == 1
+        first, second, *_ = said.stdout.splitlines()
+        assert first.endswith("20 cases")
+        assert second.strip().startswith(message)
+        without = " without an error" if name == "raises" else ""
+        assert said.stderr.endswith(f"the VUT reached the merge point{without} in no case\n")
+        assert "Nothing was tested." in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.fixture(scope="module")
+def mixed(vuts, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("mixed") / "run"
+    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, seed=1)
+    found = judge(run_campaign(settings, folder).outcomes)
+    assert min(found.errors, found.timeouts, found.tested) > 0
+    return folder
+
+
+def again(folder: Path, vuts: dict[str, str]) -> tuple[object, ...]:
+    """Return how to go on with the mixed campaign, whose folder names no code to run."""
+    return ("--resume", folder, "--vut", vuts["mixed"])
+
+
+class TestACampaignWithGates:
+    @pytest.mark.parametrize(
+        ("gates", "code"),
+        [
+            ((), 0),
+            (("errors",), 1),
+            (("fmc>0.99", "timeouts"), 1),
+        ],
+    )
+    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, vuts, mixed, gates, code):
+        before = (mixed / "campaign.json").read_bytes()
+        options = [word for gate in gates for word in ("--gate", gate)]
+        said = invoke("campaign", *again(mixed, vuts), "-q", "--json", *options)
+        assert said.exit_code == code
+        found = json.loads(said.stdout)
+        assert found["passed"] is (code == 0)
+        assert found["gates"] == {gate: gate in ("errors", "timeouts") for gate in gates}
+        assert said.stderr.count("gate ") == len(gates)
+        assert (mixed / "campaign.json").read_bytes() == before
+
+    def test_writes_junit_and_never_over_a_file(self, vuts, tmp_path, mixed):
+        file = tmp_path / "junit.xml"
+        options = ("--junit", file, "--gate", "errors")
+        assert campaign(vuts["mixed"], tmp_path / "run", *options).exit_code == 1
+        root = read_junit(file)
+        assert root.get("tests") == "22"
+        before = file.read_bytes()
+        said = invoke("campaign", *again(mixed, vuts), "--junit", file)
+        assert "choose another name with `junit`" in str(said.exception)
+        assert file.read_bytes() == before
+
+    def test_that_is_stopped_says_them_in_the_command_that_goes_on(self, tmp_path, monkeypatch):
+        def stop(self) -> None:
+            raise Stopped(signal.SIGINT)
+
+        monkeypatch.setattr("merge_sumo.interrupt.Interrupt.check", stop)
+        said: list = []
+        monkeypatch.setattr("merge_sumo.console.say", said.append)
+        file = tmp_path / "a file.xml"
+        with pytest.raises(Stopped):
+            campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)
+        assert said[-1].endswith(f"--gate 'fmc>0.5' --junit '{file}'")
+        assert not file.exists()

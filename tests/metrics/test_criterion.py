@@ -1,0 +1,308 @@
+"""What counts as a failure: conditions by hand, their margins, and campaigns that go by them."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from metrics.test_score import CASE, ending
+from support.campaigning import campaign_settings, run_campaign
+
+from merge_sumo.campaigns.run import Run
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.bodies import SPACING_M, CentreLines, closest_before_m
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
+from merge_sumo.metrics.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
+from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End, Trajectory
+
+WORDS = {"x": None, "y": None, "who": frozenset({"A", "B"})}
+
+AB = st.sampled_from(["A", "B"])
+SIDE = st.one_of(st.sampled_from(["x", "y"]), st.integers(-3, 3).map(str))
+SIGN = st.sampled_from(["<", "<=", ">", ">="])
+CONDITIONS = st.recursive(
+    st.one_of(
+        st.builds("x {} {}".format, SIGN, SIDE),
+        st.builds("{} {} y {} {}".format, SIDE, SIGN, SIGN, SIDE),
+        st.builds("who {} {!r}".format, st.sampled_from(["==", "!="]), AB),
+    ),
+    lambda inner: st.one_of(
+        st.builds("not ({})".format, inner),
+        st.builds("({}) {} ({})".format, inner, st.sampled_from(["and", "or"]), inner),
+    ),
+    max_leaves=8,
+)
+"""Comparisons, chains of them, and what `not`, `and` and `or` make of these, as texts."""
+
+
+def margin(text, **values):
+    """Return the margin of a condition over the values x, y and who."""
+    condition, _ = parse_condition(text, WORDS, "`fail_when`")
+    return condition.margin({"x": 0.0, "y": 0.0, "who": "A", **values})
+
+
+def of(expression, trajectory):
+    """Return the margin of an episode under a criterion."""
+    return Criterion(expression).margin(trajectory, measure(trajectory))
+
+
+def nearest(trajectory, lines):
+    """Return the smallest clearance before M."""
+    return closest_before_m([trajectory], lines)[0]
+
+
+class TestMargins:
+    def test_are_in_units_of_the_threshold(self):
+        # 1.5 is the threshold: 3 is one of it away, 0.75 half of it beyond.
+        assert margin("x < 1.5", x=3.0) == 1.0
+        assert margin("x < 1.5", x=0.75) == -0.5
+        assert margin("x > 4", x=3.0) == 0.25
+        assert margin("-4 < x", x=-6.0) == 0.5
+
+    def test_are_in_units_of_the_measure_where_the_threshold_is_0_or_a_measure(self):
+        assert margin("x < 0", x=2.5) == 2.5
+        assert margin("x < y", x=5.0, y=3.0) == 2.0
+
+    def test_or_is_the_nearest_and_and_the_farthest(self):
+        # x is 1 of its threshold away, y 0.25 of its own.
+        assert margin("x < 1 or y > 4", x=2.0, y=3.0) == 0.25
+        assert margin("x < 1 and y > 4", x=2.0, y=3.0) == 1.0
+        assert margin("x < 1 and y > 4", x=0.5, y=5.0) == -0.25
+
+    def test_texts_are_met_or_not(self):
+        assert margin('who == "A"') == -1.0
+        assert margin('who != "A"') == 1.0
+        assert margin('"B" == who') == 1.0
+
+    def test_are_finite_and_never_0(self):
+        assert margin("x < 1", x=math.inf) == MOST_MARGIN
+        assert margin("x > 1", x=math.inf) == -MOST_MARGIN
+        assert 0.0 < margin("x < 1", x=1.0) < 1e-6
+        assert -1e-6 < margin("x <= 1", x=1.0) < 0.0
+        assert margin("x < y", x=math.inf, y=math.inf) > 0.0
+
+    @given(CONDITIONS, *[st.one_of(st.integers(-3, 3), st.floats(allow_nan=False))] * 2, AB)
+    def test_of_any_condition_are_negative_exactly_where_python_says_it_is_met(
+        self, condition, x, y, who
+    ):
+        values = {"x": float(x), "y": float(y), "who": who}
+        assert (margin(condition, **values) < 0.0) is eval(condition, {}, values)  # noqa: S307
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("text", "said"),
+        [
+            ("speed > 3", "no measure 'speed': choose score, dx_m, "),
+            ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
+            ("zzzzzzzz < 1.5", "choose score, dx_m"),
+            ("papr", "did you mean paper?"),
+            ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is COMPLETED,"),
+            ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
+            ('end < "TIMEOUT"', "compare it with == or !="),
+            ("end == merged_first", "with a text in quotes"),
+            ("ttc_s == 1.5", "compare numbers with <"),
+            ('ttc_s < "soon"', "with a text in quotes"),
+            ("ttc_s", "stands alone"),
+            ("unsafe < 1", "unsafe is a criterion, which is met or not"),
+            ("1 < 2", "two numbers"),
+            ("ttc_s < 1e999", "finite"),
+            ("ttc_s < True", "neither a measure"),
+            ("ttc_s + 1 < 2", "neither a measure"),
+            ("ttc_s < 1 if end else 2", "no condition"),
+            ('__import__("os").system("true")', "no condition"),
+            ("(lambda: 1)() < 2", "neither a measure"),
+            ("ttc_s <", "no expression"),
+            ("", "no expression"),
+            ("ttc_s < 1\0", "no expression"),
+            ("ttc_s < \ud800", "no expression"),
+            ("(" * 500, "no expression"),
+            ("ttc_s < 1 and " * 200 + "ttc_s < 1", "1000 are the most"),
+            ("ttc_s < " + "9" * 900, "finite"),
+        ],
+    )
+    def test_what_is_no_criterion_in_one_sentence(self, text, said):
+        with pytest.raises(UserError, match=r"^`fail_when`") as error:
+            Criterion(text)
+        assert said in str(error.value)
+
+    def test_the_length_is_that_of_what_a_person_typed(self):
+        longest = " or ".join(["ttc_s<1e9"] * 76) + " or ttc_s<1"
+        longest += " " * (MOST_CHARACTERS - len(longest))
+        read = Criterion(longest)
+        assert len(read.fail_when) > MOST_CHARACTERS
+        assert Criterion(read.fail_when) == read
+        assert of(read.fail_when, ending(10.0, 20.0)) is not None
+        with pytest.raises(UserError, match="`fail_when` has 1001 characters: 1000 are the most"):
+            Criterion(f"{longest} ")
+
+
+class TestMeasures:
+    def test_every_name_has_a_value_in_every_episode(self):
+        for end in (End.MERGED, End.TIMEOUT):
+            for name, choices in vocabulary().items():
+                text = f"{name} < 1" if choices is None else f'{name} == "{min(choices)}"'
+                assert math.isfinite(of(text, ending(3.0, end=end)))
+
+    def test_that_are_missing_count_as_never_meeting(self):
+        never = ending(0.0, end=End.TIMEOUT)
+        for harmless in ("ttc_s < 9", "bumper_gap_m < 9", "pet_s < 9", "dx_m < 9", "drac_mps2 > 0",
+                         "brake_after_mps2 > 0", "impact_speed_mps > 0", 'merged_first == "VUT"',
+                         "last_avoidable_s < 99"):  # fmt: skip
+            assert of(harmless, never) > 0.0, harmless
+        assert of('end == "TIMEOUT"', never) == -1.0
+
+    def test_within_6_m_no_braking_would_do(self):
+        crash = ending(0.0)
+        assert measure(crash).drac_mps2 is None
+        assert of("drac_mps2 > 1000", crash) == -MOST_MARGIN
+        assert of("last_avoidable_s < -9", crash) == -MOST_MARGIN
+
+    def test_gaps_are_between_bumpers(self):
+        # The POV is 8 m ahead, and 5 m long.
+        assert of("bumper_gap_m < 2", ending(8.0)) == pytest.approx(0.5)
+        assert of("bumper_gap_m < 2", ending(-8.0)) == pytest.approx(0.5)
+
+    def test_braking_after_the_merge_by_hand(self):
+        # 20 m between bumpers, closing by 10 m/s: 12.5 m are left after 0.75 s, so 100 / 25.
+        behind = ending(-25.0, v_pov=36.0, v_vut=26.0)
+        assert of("brake_after_mps2 > 8", behind) == pytest.approx(0.5)
+        ahead = ending(25.0, v_pov=16.0, v_vut=26.0)
+        assert of("brake_after_mps2 > 8", ahead) == pytest.approx(0.5)
+        assert of("brake_after_mps2 > 8", ending(25.0, v_pov=30.0)) == 1.0
+        # 7 m are gone in 0.75 s at 10 m/s.
+        assert of("brake_after_mps2 > 8", ending(-12.0, v_pov=36.0)) == -MOST_MARGIN
+
+    def test_severity_by_hand(self):
+        assert measure(ending(4.9, v_pov=40.0)).severity == "contact"
+        assert measure(ending(5.1, v_pov=40.0)).severity == "conflict"
+        assert measure(ending(6.0, v_pov=40.0)).severity == "safe"
+        assert measure(ending(0.0, end=End.TIMEOUT)).severity is None
+        assert of('severity == "contact"', ending(0.0)) == -1.0
+        assert of('severity != "contact"', ending(0.0, end=End.TIMEOUT)) == -1.0
+
+
+class TestRecords:
+    def test_hold_every_measure_that_a_criterion_may_name(self):
+        lane = replace(US23, follow_up_s=3.0, lane_m=(-70.0, 130.0))
+        followed = replace(CASE, scenario=lane)
+        after = np.array([[[20.0, 30.0, 0.0], [0.0, 26.0, 0.0]]])
+        episode = replace(ending(20.0), case=followed, after=after)
+        record = PAPER_CRITERION.outcome(0, 0, episode).to_record()
+        assert set(vocabulary()) - {"nearest"} <= set(record)
+
+
+class TestNamed:
+    def test_contact_is_of_bodies_and_not_of_points(self):
+        # 5 m long: at 5.5 m between the fronts, a failure of the paper, they do not touch.
+        assert PAPER_CRITERION.outcome(0, 0, ending(5.5)).failed
+        assert not Criterion("contact").outcome(0, 0, ending(5.5)).failed
+        assert Criterion("contact").outcome(0, 0, ending(-4.9)).failed
+        # 0.1 m of overlap.
+        assert Criterion("contact").outcome(0, 0, ending(-4.9)).margin == pytest.approx(-0.1)
+
+    def test_may_be_part_of_a_condition(self):
+        either = Criterion('unsafe or end == "TIMEOUT"')
+        assert either.text == "unsafe or end == 'TIMEOUT'"
+        assert of(either.text, ending(-25.0, v_pov=36.0, v_vut=26.0)) == pytest.approx(-1.0 / 3.0)
+        assert of(either.text, ending(9.0, end=End.TIMEOUT)) == -1.0
+        assert of("not (contact or paper)", ending(-25.0, v_pov=27.0)) < 0.0
+        with pytest.raises(UserError, match="did you mean unsafe"):
+            Criterion("unsave or ttc_s < 1")
+
+    def test_unsafe_is_also_who_must_brake_harder_than_3(self):
+        # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
+        harsh = ending(-25.0, v_pov=36.0, v_vut=26.0)
+        assert Criterion("unsafe").outcome(0, 0, harsh).margin == pytest.approx(-1.0 / 3.0)
+        assert not Criterion("contact").outcome(0, 0, harsh).failed
+        assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
+
+
+def lines(apart_m, ends_m=-20.0):
+    """Return a mainline along y = 0 and a ramp beside it that only joins in the last metre."""
+    mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+    y = [(-400.0, 50.0), (ends_m - 1.0, 50.0), (ends_m, apart_m), (-1.0, apart_m), (0.0, 0.0)]
+    return CentreLines.of(mainline, np.array([[x, x, side] for x, side in [*y, (400.0, 0.0)]]))
+
+
+def beside(dx, x_vut=-5.0):
+    """Return an episode of one step in which the VUT is still before M."""
+    motion = np.array([[[x_vut + dx, 20.0, 0.0], [x_vut, 20.0, 0.0]]])
+    return Trajectory(CASE, motion, End.TIMEOUT)
+
+
+class TestBodiesBeforeM:
+    @pytest.mark.parametrize(
+        ("dx", "apart", "clearance"),
+        [
+            (0.0, 1.0, -0.8),  # side by side, 1.8 m wide
+            (2.0, 1.5, -0.3),
+            (0.0, 2.0, 0.2),
+            (4.9, 1.0, -0.1),  # 5 m long: one would have to move aside by less, along the lane
+            (-8.0, 1.0, 3.0),
+        ],
+    )
+    def test_clear_each_other_by_hand(self, dx, apart, clearance):
+        found = nearest(beside(dx), lines(apart))
+        assert found == pytest.approx(clearance)
+
+    def test_that_cross_by_hand(self):
+        # A ramp from the right angle: its car's nose, at y = -2, is 1.1 m from the other's side.
+        mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+        ramp = np.array([[-400.0, 0.0, -400.0], [0.0, 0.0, 0.0], [400.0, 400.0, 0.0]])
+        crossing = CentreLines.of(mainline, ramp)
+        assert crossing.together_m == 2.5
+        ahead = Trajectory(CASE, np.array([[[2.5, 20.0, 0.0], [-2.0, 0.0, 0.0]]]), End.TIMEOUT)
+        assert nearest(ahead, crossing) == pytest.approx(1.1)
+
+    def test_are_looked_at_where_the_lanes_run_together(self):
+        assert lines(1.0, ends_m=-20.0).together_m == pytest.approx(20.0, abs=SPACING_M)
+        assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
+        assert nearest(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
+
+    def test_before_m_are_a_measure_of_their_own(self):
+        hit = beside(0.0)
+        assert Criterion("contact").margin(hit, measure(hit)) == MOST_MARGIN
+        touching = measure(hit, lines(1.0))
+        assert Criterion("contact").margin(hit, touching) == MOST_MARGIN
+        overlap = Criterion("before_clearance_m < 0")
+        assert overlap.margin(hit, touching) == pytest.approx(-0.8)
+        assert (touching.severity, touching.impact_speed_mps) == (None, None)
+
+
+class TestOutcomes:
+    @pytest.mark.parametrize("margin", [True, "1", math.nan, [3]])
+    def test_with_a_margin_that_is_none_are_refused(self, margin):
+        record = Criterion("ttc_s < 4").outcome(0, 0, ending(9.0)).to_record()
+        with pytest.raises(UserError, match=r"margin|JSON"):
+            Outcome.from_json(json.dumps(record | {"margin": margin}), scenario=US23)
+
+    def test_have_a_gap_of_1_where_the_criterion_turns(self):
+        # A TTC of 4.2 s, against 4: 1 + 0.05; then 2 s, against 4: 1 / (1 + 0.5).
+        safe = Criterion("ttc_s < 4").outcome(0, 0, ending(-21.0, v_pov=31.0))
+        fails = Criterion("ttc_s < 4").outcome(0, 0, ending(20.0, v_pov=16.0))
+        assert safe.signed_gap == pytest.approx(-1.05)
+        assert fails.signed_gap == pytest.approx(1.0 / 1.5)
+        assert PAPER_CRITERION.outcome(0, 0, ending(-21.0)).signed_gap == pytest.approx(-3.5)
+
+
+class TestCampaigns:
+    def test_by_a_condition_on_the_score_are_those_of_the_paper_and_read_back(self, tmp_path):
+        for name, fail_when in (
+            ("paper", "paper"),
+            ("mine", "score < -500"),
+            ("near", "score < -300"),
+        ):
+            settings = campaign_settings(vut="design1", cases=40, batch=20, fail_when=fail_when)
+            run_campaign(settings, tmp_path / name)
+        paper, mine, near = (Run(tmp_path / name).outcomes for name in ("paper", "mine", "near"))
+        assert mine == paper
+        assert all(o.is_by_score for o in paper)
+        assert not all(o.is_by_score for o in near)

@@ -1,0 +1,83 @@
+"""What is odd about the outcomes of a campaign: one verdict on all cases, and clipped steps."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from merge_sumo.campaigns.run import Run
+from merge_sumo.metrics.criterion import Criterion, condition_of, values_of
+from merge_sumo.metrics.plausibility import doubts, mostly_clipped
+from merge_sumo.scenario.scenario import DT_S
+
+
+class TestAfterTheRun:
+    def test_a_threshold_in_km_h_is_doubted(self, run):
+        criterion = Criterion("dv_mps > 34")
+        (said,) = under(run, criterion)
+        assert said.startswith("no case fails under dv_mps > 34; with dv_mps > 9.44 (34 km/h) ")
+
+    def test_a_threshold_of_the_other_sign_is_doubted(self, run):
+        (said,) = under(run, Criterion("dv_mps < -8"))
+        assert "(the other sign)" in said
+
+    def test_a_verdict_that_differs_between_cases_is_not(self, run):
+        assert under(run, Criterion("dx_m < 0")) == []
+        assert under(run, Criterion("paper")) == []
+
+    def test_one_verdict_without_a_neighbour_is_not(self, run):
+        assert under(run, Criterion("t_end_s < 0.2")) == []
+
+    @pytest.mark.parametrize(("share", "is_headline"), [(0.25, False), (1.0, True)])
+    def test_accelerations_that_are_clipped_are_told(self, run, share, is_headline):
+        rows = [round(o.measures.t_end_s / DT_S) for o in run.outcomes]
+        at_limit = [
+            replace(o, measures=replace(o.measures, clipped_steps=int(share * n)))
+            for o, n in zip(run.outcomes, rows, strict=True)
+        ]
+        clipped = sum(o.measures.clipped_steps for o in at_limit)
+        headline, notes = mostly_clipped(at_limit), doubts(at_limit, Criterion(), {})
+        said = f"in {clipped} of {sum(rows)} steps the VUT asks for an acceleration"
+        assert (headline is not None) is is_headline
+        assert len(notes) == (not is_headline)
+        assert said in (headline or notes[0])
+
+    def test_errors_behind_m_are_told(self, run):
+        first, second, *others = run.outcomes
+        wrong = [
+            replace(o, measures=replace(o.measures, error="answered nan")) for o in (first, second)
+        ]
+        assert doubts([*wrong, *others], Criterion(), {}) == [
+            f"in 2 cases an error ends the follow-up, the first in case {first.index}: answered nan"
+        ]
+
+    def test_the_command_says_it_in_terminal_json_and_report(
+        self, tmp_path, command_line, monkeypatch
+    ):
+        monkeypatch.chdir(tmp_path)
+        Path("hard.py").write_text("def f(seen):\n    return 9.0\n")
+        asked = (
+            *("campaign", "--vut", "hard.py:f", "--level", 0, "--cases", 6),
+            *("--sampler", "uniform"),
+        )
+        code, out, err = command_line(*asked, "--out", "run")
+        assert code == 0, err
+        line = out.splitlines()[1]
+        assert line.startswith("not driven as asked: in ")
+        assert "outside -4 to 2 m/s2" in line
+        assert line[1:] in Path("run/report.html").read_text()
+        _, out, _ = command_line(*asked, "--out", "json", "--json")
+        assert json.loads(out)["notes"] == [line]
+
+
+def under(run: Run, criterion: Criterion) -> list[str]:
+    """Return what is doubted of the outcomes of a run under another criterion."""
+    judged = []
+    for outcome in run.outcomes:
+        condition = condition_of(criterion.words)
+        margin = None if criterion.is_papers else condition.margin(values_of(outcome.measures))
+        judged.append(replace(outcome, margin=margin))
+    return doubts(judged, criterion, {})

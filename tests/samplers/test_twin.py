@@ -1,0 +1,221 @@
+"""The twin of the VUT: it plays as SUMO does, learns, and is believed by its record."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+from support.campaigning import campaign_settings, run_campaign
+from support.plans import POVS, plan_for
+
+from merge_sumo.campaigns.run import Run
+from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.records import decode, to_plain
+from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import road_for
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.samplers.coverage import CoverageSampler
+from merge_sumo.samplers.observation import NOW, Observation
+from merge_sumo.samplers.prediction_skill import PredictionSkill
+from merge_sumo.samplers.rollout import TwinRollout
+from merge_sumo.samplers.twin import Twin
+from merge_sumo.scenario.case import MergeCase, Pool
+from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.povs import Povs
+
+SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=2)
+SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
+
+
+def ran(vut: str, level: int, points, scenario=US23, povs=None):
+    plan = plan_for(vut, scenario=scenario, povs=povs, corridors=16)
+    pool = Pool(levels=(level,), scenario=scenario)
+    done = simulate(plan, pool.cases(points, level))
+    return [
+        Outcome(index, index // 10, one.trajectory.case, one.outcome.measures)
+        for index, one in enumerate(done)
+    ], {index: one.trajectory.motion for index, one in enumerate(done)}
+
+
+def gaps_of(outcomes) -> np.ndarray:
+    return np.array([outcome.signed_gap for outcome in outcomes], dtype=np.float64)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    return ran("design1", 0, np.random.default_rng(3).random((60, 2)))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Run:
+    return run_campaign(SETTINGS, tmp_path_factory.mktemp("whole") / "run")
+
+
+class TestGames:
+    @pytest.mark.parametrize(
+        ("name", "level", "library"),
+        [
+            *(("us23", level, None) for level in (0, 1, 2)),
+            *(("us23-traffic", 1, None), ("roundabout", 2, None)),
+            *(("us23", level, HUMAN) for level in (1, 2)),
+        ],
+    )
+    def test_end_as_sumo_ends_them(self, name, level, library, tmp_path):
+        (tmp_path / "slows.py").write_text(SLOWS)
+        scenario = named_scenario(name)
+        dims = len(scenario.dimensions(level))
+        points = np.random.default_rng(level).random((24, dims))
+        povs = Povs(policies=policies_in(library) if library else policies_of(scenario))
+        outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario, povs)
+        games = TwinRollout(Pool(levels=(level,), scenario=scenario), povs)
+
+        def slows(inputs, _rows):
+            return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+
+        found = games.play(level, points, slows)
+        assert np.isfinite(found).any()
+        # The POV decides in float32 here: one that has no preference may choose otherwise.
+        off = np.abs(found - gaps_of(outcomes)) > 1e-6
+        assert off.sum() <= 1
+
+    def test_go_on_until_the_timeout_for_a_vut_that_stops(self):
+        pool = Pool(levels=(0,), scenario=US23)
+        found = TwinRollout(pool, POVS).play(
+            0, np.full((3, 2), 0.5), lambda inputs, _: np.full(len(inputs), -4.0)
+        )
+        assert np.isnan(found).all()
+
+    @pytest.mark.parametrize(
+        "text", ["unsafe or before_clearance_m < 0", 'pet_s < 2.5 or end == "TIMEOUT"']
+    )
+    def test_are_judged_as_cases_are(self, text, tmp_path):
+        (tmp_path / "slows.py").write_text(SLOWS)
+        criterion, pool, road = Criterion(text), Pool(levels=(0,), scenario=US23), road_for(US23)
+        points = np.random.default_rng(5).random((24, 2))
+        plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
+        done = simulate(plan, pool.cases(points, 0))
+        lines = centre_lines(road)
+        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
+        found = TwinRollout(pool, POVS, criterion, lines).play(
+            0, points, lambda inputs, _: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+        )
+        assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
+        assert (np.abs(found) < 1.0).any()
+
+    def test_cannot_be_played_against_a_program(self):
+        assert not TwinRollout(Pool(levels=(0,), scenario=US23), POVS).can_predict(3)
+
+
+class TestWatching:
+    def test_sees_the_state_and_what_was_before(self):
+        observation = Observation(US23, 1)
+        for step in range(5):
+            x = np.array([[-200.0 + step], [-100.0 + 2.0 * step]])
+            v = np.array([[30.0], [20.0]])
+            seen = observation.see(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
+        assert observation.now == NOW
+        assert seen[:7].tolist() == [-2.0, -104.0, 10.0, -196.0, 30.0, -92.0, 20.0]
+        # The time, steps since the jump, the lowest and the highest acceleration so far.
+        assert seen[NOW : NOW + 4].tolist() == [4.0, 0.0, -2.0, 0.0]
+        # Earlier accelerations, then gap and closing speed 0.3 s ago.
+        assert seen[NOW + 4 : NOW + 8].tolist() == [0.0] * 4
+        assert seen[NOW + 8 : NOW + 10].tolist() == [-101.0, 10.0]
+
+
+class TestTwin:
+    def test_says_the_same_however_it_was_told(self, seen):
+        outcomes, motions = seen
+        points = np.random.default_rng(4).random((7, 2))
+        at_once, in_parts = (Twin(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2))
+        at_once.tell(outcomes, motions)
+        in_parts.tell(outcomes[30:], motions)
+        in_parts.predict(0, points)
+        in_parts.tell(outcomes[:40], motions)
+        assert (at_once.predict(0, points) == in_parts.predict(0, points)).all()
+
+    def test_replays_a_case_by_who_has_not_learned_from_it(self, seen):
+        outcomes, motions = seen
+        odd = {index: motion.copy() for index, motion in motions.items()}
+        odd[8][:, 1, 2] = -4.0  # what this VUT never does
+        points = np.random.default_rng(3).random((60, 2))
+        plain, taught = (Twin(Pool(levels=(0,), scenario=US23), POVS, 0) for _ in range(2))
+        plain.tell(outcomes[:40], motions)
+        taught.tell(outcomes[:40], odd)
+        same = [twin.predict(0, points[8:9], held_out=[8]) for twin in (plain, taught)]
+        assert same[0].tolist() == same[1].tolist()
+
+
+def outcome(
+    index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
+) -> Outcome:
+    case = MergeCase(
+        level=level,
+        x_pov0_m=-300.0,
+        v_pov0_mps=30.0,
+        svo_rad=0.5 if level == 2 else None,
+        scenario=US23,
+    )
+    score = -600.0 if abs(dx_m) < 6.0 else -100.0
+    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
+    return Outcome(index, 0, case, measures, prediction)
+
+
+def said(dx_m: float, p_twin: float, p_surrogate: float) -> Prediction:
+    return Prediction.of(np.full((2, 4), dx_m), p_twin, p_surrogate, p_twin)
+
+
+class TestTheRecord:
+    def test_believes_who_predicted_the_verdicts(self):
+        right = [outcome(i, 2.0, said(2.0, 0.9, 0.1)) for i in range(20)]
+        record = PredictionSkill(right, 0, 6.0)
+        assert record.twin[1] > 0.99
+        assert not record.is_worthless
+        near = record.chance(np.full((2, 4, 1), 0.3))
+        assert near[0] > PredictionSkill([], 0, 6.0).chance(np.full((2, 4, 1), 0.3))[0]
+
+    def test_gives_up_who_predicts_nothing(self):
+        rng = np.random.default_rng(0)
+        outcomes = []
+        for index in range(60):
+            members = rng.uniform(-20.0, 20.0, (2, 4)) if index % 2 else np.full((2, 4), 1.0)
+            outcomes.append(outcome(index, 50.0, Prediction.of(members, 0.9, 0.05, 0.5)))
+        record = PredictionSkill(outcomes, 0, 6.0)
+        assert record.is_worthless
+        assert record.trust < 0.1
+
+    @pytest.mark.parametrize(("cases", "right", "doubted"), [(99, 0, 0), (100, 0, 1), (100, 1, 0)])
+    def test_doubts_who_is_wrong_for_long_where_members_disagree(self, cases, right, doubted):
+        members = np.tile([1.0, 60.0], (2, 2))
+        chances = (0.1, 0.9) if right else (0.9, 0.1)
+        told = [outcome(i, 50.0, Prediction.of(members, *chances, 0.5)) for i in range(cases)]
+        assert PredictionSkill(told, 0, 6.0).is_doubted == bool(doubted)
+
+
+class TestPrediction:
+    def test_is_read_as_it_was_written(self):
+        one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
+        assert one.dx_m == ((1.2346, None),)
+        assert decode(json.dumps(to_plain(one)), Prediction) == one
+
+
+class TestACampaign:
+    def test_says_what_it_predicted(self, whole):
+        known = [o for o in whole.outcomes if o.prediction is not None]
+        assert len(known) >= 40
+        last = known[-20:]
+        off = [abs(np.nanmedian(o.prediction.gaps_m) - o.measures.dx_m) for o in last]
+        assert np.median(off) < 3.0
+
+
+def test_a_sampler_without_games_is_the_surrogate_alone():
+    sampler = CoverageSampler(Pool(levels=(0,), scenario=US23), 1)
+    sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
+    sampler.ask(3)
+    assert [sampler.prediction(place) for place in range(3)] == [None] * 3

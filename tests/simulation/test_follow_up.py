@@ -1,0 +1,129 @@
+"""What happens behind M: both drive on, and it is measured."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from metrics.test_score import CASE, ending
+from support.plans import plan_for
+
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.merge import followed_up
+from merge_sumo.metrics.score import FOLLOWED_UP, Outcome, measure
+from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.scenario import DT_S, US23, VUT
+from merge_sumo.scenario.trajectory import End
+from merge_sumo.simulation.simulator import Simulator
+
+FOLLOWED, AT_M = US23, replace(US23, follow_up_s=0.0)
+CASES = Pool(levels=(0,), scenario=FOLLOWED).cases(np.random.default_rng(3).random((12, 2)), 0)
+
+
+def followed(*states):
+    """Return a merge with (x_pov, v_pov, x_vut, v_vut) at each step of the follow-up."""
+    after = np.array([[[xp, vp, 0.0], [xv, vv, 0.0]] for xp, vp, xv, vv in states])
+    merged = ending(20.0)
+    return replace(merged, case=replace(CASE, scenario=FOLLOWED), after=after)
+
+
+class TestMeasures:
+    def test_by_hand(self):
+        # The VUT is 15 m behind the POV's rear and 5 m/s faster, then 10 m and 4 m/s.
+        episode = followed((20.0, 20.0, 0.0, 25.0), (22.0, 20.0, 7.0, 24.0))
+        assert followed_up(episode) == pytest.approx((10.0, 2.5, max(25.0 / 30.0, 16.0 / 20.0)))
+
+    def test_of_a_gap_that_opens(self):
+        # The POV is behind, 5 m between bumpers, and slower.
+        assert followed_up(followed((-10.0, 20.0, 0.0, 25.0))) == (5.0, math.inf, 0.0)
+        measures = measure(followed((-10.0, 20.0, 0.0, 25.0)))
+        assert [getattr(measures, name) for name in FOLLOWED_UP] == [5.0, None, 0.0, 0.0]
+
+    def test_of_bodies_that_touch(self):
+        episode = followed((-10.0, 30.0, 0.0, 20.0), (-4.0, 30.0, 0.5, 20.0))
+        assert followed_up(episode) == (-0.5, 0.0, math.inf)
+        measures = measure(episode)
+        assert (measures.after_gap_m, measures.after_ttc_s) == (-0.5, 0.0)
+        assert measures.after_drac_mps2 is None
+        for met in ("after_drac_mps2 > 99", "after_ttc_s < 0.1", "contact", "unsafe"):
+            assert Criterion(met).margin(episode, measures) < 0.0, met
+
+    def test_are_in_the_record_where_there_is_a_follow_up(self):
+        outcome = Criterion("contact").outcome(0, 0, followed((-10.0, 20.0, 0.0, 25.0)))
+        record = json.loads(json.dumps(outcome.to_record()))
+        assert list(record)[-5:] == [*FOLLOWED_UP, "margin"]
+        assert Outcome.from_json(json.dumps(record), FOLLOWED) == outcome
+        assert not set(FOLLOWED_UP) & set(
+            Outcome(0, 0, replace(CASE, scenario=AT_M), measure(ending(9.0))).to_record()
+        )
+
+    def test_that_nobody_takes_are_refused(self):
+        with pytest.raises(UserError, match="`follow_up_s` SECONDS"):
+            Criterion("after_ttc_s < 2").check(AT_M)
+        Criterion("after_ttc_s < 2").check(FOLLOWED)
+
+
+def run(vut, scenario):
+    """Return the trajectories of the cases in a scenario."""
+    cases = [replace(case, scenario=scenario) for case in CASES]
+    factory = VutFactory.of(vut, VutOptions(in_process=True))
+    with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
+        return ground.run(cases)
+
+
+class TestSeverity:
+    @pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])
+    def test_is_harsh_where_a_car_behind_did_brake(self, braking, severity):
+        episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))
+        episode.after[0, :, 2] = braking, -4.0  # the VUT, ahead of it, may brake as it likes
+        measures = measure(replace(episode, motion=episode.after[:1]))
+        assert (measures.severity, measures.after_brake_mps2) == (severity, -braking)
+
+
+class TestDrivingOn:
+    def test_changes_nothing_up_to_m(self):
+        at_m, behind = run("design1", AT_M), run("design1", FOLLOWED)
+        for index, merged in enumerate(at_m):
+            on = behind[index]
+            assert np.array_equal(on.motion, merged.motion)
+            assert (on.end, on.clipped_steps) == (merged.end, merged.clipped_steps)
+            assert measure(on).score == measure(merged).score
+            assert merged.after is None
+
+    def test_is_the_motion_of_both_by_eq_4(self):
+        for trajectory in run("level0", FOLLOWED):
+            after = trajectory.after
+            assert after.shape == (31, 2, 3)
+            assert np.array_equal(after[0, :, :2], trajectory.motion[-1, :, :2])
+            x, v, a = (after[:, :, column] for column in range(3))
+            assert np.allclose(x[1:], x[:-1] + v[:-1] * DT_S, atol=1e-9)
+            assert np.allclose(v[1:], np.maximum(v[:-1] + a[:-1] * DT_S, 0.0), atol=1e-9)
+            assert (x[:, VUT] >= 0.0).all()
+
+    def test_a_car_behind_the_vut_brakes_for_it(self):
+        slow = replace(US23, v_vut0_mps=12.0, level0_a_mps2=0.1)
+        behind = [t for t in run("level0", slow) if t.after[0, 0, 0] < t.after[0, VUT, 0]]
+        assert behind
+        assert min(t.after[:, 0, 2].min() for t in behind) < -1.0
+
+    def test_ends_where_the_vut_goes_wrong_and_the_merge_stays(self, tmp_path):
+        (tmp_path / "ends.py").write_text(
+            "def ends(seen):\n    return 1.0 if seen.x_vut_m < 10.0 else 1 / 0\n", encoding="utf-8"
+        )
+        for trajectory in run(f"{tmp_path / 'ends.py'}:ends", FOLLOWED):
+            assert trajectory.end is End.MERGED
+            assert "ZeroDivisionError" in trajectory.error
+            assert trajectory.after[-1, VUT, 0] >= 10.0
+            assert len(trajectory.after) < 10
+            assert measure(trajectory).score == measure(replace(trajectory, error=None)).score
+            words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
+            assert words.endswith("Behind M an error ends the follow-up.")

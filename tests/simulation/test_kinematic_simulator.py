@@ -1,0 +1,170 @@
+"""The kinematic engine: what it says of a case is what SUMO says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.plans import POVS, key_of, plan_for
+
+from merge_sumo.analysis.truth import ground_truth, known_truth
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.drivers.levelk import MANY_ROWS, features
+from merge_sumo.drivers.policies import load_network
+from merge_sumo.errors import UserError
+from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.episode import Episode
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.kinematic_simulator import CHECKED_SHARE, drawn
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.plan import Engine, SimulationPlan
+from merge_sumo.simulation.povs import own_pov
+
+
+def uniform(count: int, level: int, scenario: Scenario = US23) -> list[Case]:
+    points = np.random.default_rng([5, level]).random((count, len(scenario.dimensions(level))))
+    return from_unit(points, level, scenario=scenario)
+
+
+def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[list[Episode], list[Episode]]:
+    """Return the results of SUMO and of the kinematic engine."""
+    return simulate(plan, cases), simulate(plan.with_engine("kinematic"), cases)
+
+
+def assert_alike(sumo: list[Episode], kinematic: list[Episode]) -> None:
+    for one, other in zip(sumo, kinematic, strict=True):
+        assert one.trajectory.end is other.trajectory.end
+        np.testing.assert_allclose(
+            one.trajectory.motion, other.trajectory.motion, rtol=0.0, atol=1e-9
+        )
+        verdict, ours = one.outcome.verdict, other.outcome.verdict
+        assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
+        assert verdict.margin == pytest.approx(ours.margin, abs=1e-9)
+
+
+class TestACase:
+    @pytest.mark.parametrize(
+        ("scenario", "vut", "level"),
+        [("us23", "design1", 0), ("us23", "level2", 1), ("us23-traffic", "design2", 2)],
+    )
+    def test_ends_as_in_sumo(self, scenario, vut, level):
+        road = named_scenario(scenario)
+        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(200, level, road)))
+
+    @pytest.mark.parametrize("fail_when", ["unsafe", "brake_after_mps2 > 2", "after_gap_m < 3"])
+    def test_is_judged_by_any_criterion(self, fail_when):
+        scenario = replace(US23, follow_up_s=2.0)
+        plan = plan_for("design2", scenario=scenario, criterion=Criterion(fail_when))
+        sumo, kinematic = by_both(plan, uniform(200, 1, scenario))
+        assert_alike(sumo, kinematic)
+        assert any(one.outcome.failed for one in sumo)
+
+
+class TestACloseCall:
+    def test_is_what_sumo_says(self):
+        """The front bumpers are 6 m apart at M, to rounding errors."""
+        plan = plan_for("level0")
+        case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        (found,) = simulate(plan, [case])
+        assert found.outcome.measures.dx_m is not None
+        x_m = case.x_pov0_m + US23.dx_crash_m - found.outcome.measures.dx_m
+        cases: list[Case] = [replace(case, x_pov0_m=x_m + k * 1e-13) for k in range(-200, 200, 4)]
+        sumo, kinematic = by_both(plan, cases)
+        assert all(one.in_sumo for one in kinematic)
+        assert {one.outcome.failed for one in sumo} == {
+            True,
+            False,
+        }
+        for one, other in zip(sumo, kinematic, strict=True):
+            assert one.trajectory.motion.tobytes() == other.trajectory.motion.tobytes()
+
+    def test_is_one_of_the_step_in_which_the_episode_ends(self):
+        scenario = replace(US23, x_vut0_m=-180.0, v_vut0_mps=20.0, level0_v_mps=20.0)
+        cases = uniform(20, 0, scenario)
+        sumo, kinematic = by_both(plan_for("level0", scenario=scenario), cases)
+        assert all(one.in_sumo for one in kinematic)
+        assert_alike(sumo, kinematic)
+
+
+class TestTheCheck:
+    @pytest.mark.parametrize("count", [1, 7, 100, 101, 2500])
+    def test_is_of_at_least_one_case_of_a_hundred(self, count):
+        places = drawn(uniform(count, 0))
+        assert CHECKED_SHARE * count <= len(places) <= CHECKED_SHARE * count + 1
+        assert places <= set(range(count))
+
+    @pytest.mark.parametrize("off_m", [2e-6, 1e-3, 5.0])
+    def test_stops_in_a_sentence_where_sumo_says_otherwise(self, monkeypatch, off_m):
+        command = EquationWorld.command
+
+        def drift(world: EquationWorld, a_mps2: np.ndarray, merged: None) -> None:
+            command(world, a_mps2, merged)
+            world.x_m[VUT] += off_m / 80.0
+
+        monkeypatch.setattr(EquationWorld, "command", drift)
+        with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose `engine` sumo"):
+            simulate(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
+
+
+class TestThePlan:
+    @pytest.mark.parametrize("vut", ["sumo:Krauss", "traci"])
+    def test_needs_sumo_for_a_vut_of_others(self, vut):
+        plan = plan_for(vut)
+        assert plan.with_engine(None).engine is Engine.SUMO
+        with pytest.raises(UserError, match=f"the VUT {vut} is none of this package"):
+            plan.with_engine("kinematic")
+
+    def test_needs_sumo_for_a_pov_of_ones_own(self):
+        povs = replace(POVS, own=own_pov("design1", VutOptions()))
+        plan = plan_for("design1", povs=povs)
+        assert plan.with_engine(None).engine is Engine.SUMO
+        assert plan.at_level(OWN).with_engine(None).engine is Engine.SUMO
+        assert plan.at_level(1).with_engine(None).engine is Engine.KINEMATIC
+        with pytest.raises(UserError, match="the POV design1 is none of this package"):
+            plan.with_engine("kinematic")
+
+
+class TestATruth:
+    PLAN = plan_for("design2").with_engine(None)
+
+    def test_is_that_of_sumo(self, tmp_path):
+        ours = ground_truth(self.PLAN, 1, 1000, cache=tmp_path)
+        sumos = ground_truth(plan_for("design2"), 1, 1000, cache=tmp_path)
+        assert (ours.margin < 0.0).tolist() == (sumos.margin < 0.0).tolist()
+        np.testing.assert_allclose(ours.margin, sumos.margin, rtol=0.0, atol=1e-9)
+        assert (ours.in_sumo, sumos.in_sumo) == (10, 1000)
+
+    def test_of_sumo_is_taken_and_not_the_other_way_round(self, tmp_path):
+        counted: list[int] = []
+        ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_cases=counted.append)
+        ground_truth(plan_for("design2"), 0, 50, cache=tmp_path, on_cases=counted.append)
+        assert sum(counted) == 100
+        key_of(vut="design2", cases=50).path(tmp_path).replace(tmp_path / "kept.npz")
+        again = known_truth(self.PLAN, 0, 50, cache=tmp_path)
+        assert again is not None
+        assert again.in_sumo == 1
+        (tmp_path / "kept.npz").replace(key_of(vut="design2", cases=50).path(tmp_path))
+        replace(key_of(vut="design2", cases=50), engine=Engine.KINEMATIC).path(tmp_path).unlink()
+        kept = ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_cases=counted.append)
+        assert kept.in_sumo == 50
+        assert sum(counted) == 100
+
+
+@pytest.mark.parametrize("name", ["pov1", "pov2", "vut1", "vut2"])
+def test_greedy_actions_of_many_rows_are_those_of_one_row(name):
+    rng, n = np.random.default_rng(1), 4000
+    network = load_network(name)
+    x_pov, v_pov, x_vut, v_vut = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
+    svo_rad = rng.uniform(0.0, 1.5, n) if network.sees_svo else None
+    inputs = features(x_pov, v_pov, x_vut, v_vut, svo_rad, scenario=US23)
+    inputs[7] = np.inf
+    values = network.values(inputs)
+    expected = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)
+    assert expected[7] == -1
+    assert network.greedy(inputs).tolist() == expected.tolist()
+    few = inputs[: MANY_ROWS - 1]
+    assert network.greedy(few).tolist() == expected[: MANY_ROWS - 1].tolist()

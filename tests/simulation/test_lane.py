@@ -1,0 +1,147 @@
+"""Merging from an acceleration lane: wishes, cars beside and behind, and SUMO's two lanes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulation.test_kinematic_simulator import uniform
+from support.plans import plan_for
+
+from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
+from merge_sumo.drivers.lane import Merging
+from merge_sumo.metrics.score import measure
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, MergeScenario
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.evaluate import simulate
+
+LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
+
+
+class TestAWish:
+    """Of the VUT: granted from the lane's begin on, in the next step; at its end it is forced."""
+
+    def step(self, x_m: float, wish: int | None, scenario: MergeScenario = LANE) -> bool:
+        merging = Merging(1, scenario)
+        merging.begin(0)
+        state = np.array([[-500.0], [x_m]]), np.full((2, 1), 20.0)
+        wishes = None if wish is None else np.array([wish], dtype=np.int8)
+        merging.take(wishes, np.zeros((2, 1)), *state)
+        return bool(merging.step(*state)[0])
+
+    @pytest.mark.parametrize(
+        ("x_m", "wish", "merged"),
+        [
+            (-72.1, MERGE, False),
+            (-72.0, MERGE, True),
+            (100.0, STAY, False),
+            (127.9, STAY, False),
+            (128.0, STAY, True),
+            (-2.1, NO_WISH, False),
+            (-2.0, NO_WISH, True),
+            (-2.0, None, True),
+        ],
+    )
+    def test_by_hand(self, x_m, wish, merged):
+        assert self.step(x_m, wish) is merged
+
+    def test_that_never_comes_stops_before_the_end(self):
+        merging = Merging(1, replace(LANE, lane_end="stop"))
+        x_m, v_mps = np.array([[-500.0], [60.0]]), np.full((2, 1), 22.0)
+        hardest = 0.0
+        for _ in range(200):
+            answer = np.full((2, 1), 2.0)
+            merging.take(np.array([STAY], dtype=np.int8), answer, x_m, v_mps)
+            assert not merging.step(x_m, v_mps)[0]
+            a = np.clip(answer, -4.0, 2.0)
+            hardest = min(hardest, float(answer[VUT, 0]))
+            x_m, v_mps = x_m + v_mps * DT_S, np.maximum(v_mps + a * DT_S, 0.0)
+        assert v_mps[VUT, 0] == pytest.approx(0.0, abs=1e-9)
+        assert 128.0 < x_m[VUT, 0] < 130.0
+        assert hardest >= -4.0 - 1e-9
+
+
+class TestSumo:
+    @pytest.mark.parametrize("scenario", ["us23-lane", "us23-lane-traffic"])
+    @pytest.mark.parametrize("vut", ["design2", "level0"])
+    def test_moves_as_the_equations(self, scenario, vut):
+        road, level = named_scenario(scenario), 1
+        plan, cases = plan_for(vut, scenario=road), uniform(60, level, road)
+        sumo, kinematic = simulate(plan, cases), simulate(plan.with_engine("kinematic"), cases)
+        for ours, theirs in zip(sumo, kinematic, strict=True):
+            one, other = ours.trajectory, theirs.trajectory
+            assert one.end is other.end is End.MERGED
+            np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
+            assert one.after is not None
+            assert other.after is not None
+            np.testing.assert_allclose(one.after, other.after, rtol=0.0, atol=1e-9)
+
+
+RAISING = """
+class Raises:
+    "Knows nothing behind M."
+
+    def act(self, seen):
+        if seen.merged:
+            raise ValueError("behind M")
+        return {answer}
+"""
+
+
+class TestAControllerThatRaisesAfterItsMerge:
+    def episodes(self, tmp_path, answer):
+        (tmp_path / "raises.py").write_text(RAISING.format(answer=answer))
+        road = named_scenario("us23-lane")
+        cases = uniform(20, 0, road)
+        raising = plan_for(f"{tmp_path / 'raises.py'}:Raises", scenario=road)
+        calm = plan_for("level0", scenario=road).with_engine("kinematic")
+        return ([one.trajectory for one in simulate(plan, cases)] for plan in (raising, calm))
+
+    def test_is_driven_for_where_it_only_accelerates(self, tmp_path):
+        answer = "min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)"
+        for raising, calm in zip(*self.episodes(tmp_path, answer), strict=True):
+            assert raising.end is End.MERGED
+            np.testing.assert_allclose(raising.after, calm.after, rtol=0.0, atol=1e-9)
+
+    def test_is_an_error_where_it_chooses_to_merge(self, tmp_path):
+        for raising, _ in zip(*self.episodes(tmp_path, "1.0, True"), strict=True):
+            assert raising.end is End.VUT_ERROR
+            assert raising.error.startswith("ValueError: behind M")
+            assert raising.after is None
+
+
+class TestAnEpisode:
+    def merged(self, x_pov: float, v_pov: float, x_vut: float, v_vut: float) -> Trajectory:
+        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        before = [[x_pov - v_pov * DT_S, v_pov, 0.0], [x_vut - v_vut * DT_S, v_vut, 0.0]]
+        motion = np.array([before, [[x_pov, v_pov, 0.0], [x_vut, v_vut, 0.0]]])
+        return Trajectory(case, motion, End.MERGED, after=motion[1:])
+
+    def test_is_measured_at_the_place_of_the_merge(self):
+        measures = measure(self.merged(40.0, 30.0, 30.0, 20.0))
+        assert measures.x_merge_m == 30.0
+        assert measures.lane_share == 0.5
+        assert (measures.gap_ahead_m, measures.time_gap_ahead_s) == (5.0, 0.25)
+        assert (measures.gap_behind_m, measures.time_gap_behind_s) == (None, None)
+        assert measures.dx_m == 10.0
+
+    def test_of_a_vut_that_stood_has_the_time_since_the_pov_passed(self):
+        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        motion = np.zeros((31, 2, 3))
+        motion[:, VUT, 0] = 30.0
+        motion[:, POV, 0] = -27.0 + 3.0 * np.arange(31)  # passes the VUT after 1.9 s
+        motion[:, POV, 1] = 30.0
+        measures = measure(Trajectory(case, motion, End.MERGED, after=motion[-1:]))
+        assert measures.stood_s == 3.1
+        assert measures.pet_s == pytest.approx(1.1)
+
+    def test_is_measured_with_a_car_behind(self):
+        measures = measure(self.merged(10.0, 30.0, 30.0, 20.0))
+        assert (measures.gap_behind_m, measures.time_gap_behind_s) == (15.0, 0.5)
+        assert measures.gap_ahead_m is None
+        assert measures.pet_s == pytest.approx(20.0 / 30.0)
+        # 10 m/s, 15 m less the way of the reaction: 7.5 m.
+        assert measures.brake_after_mps2 == pytest.approx(100.0 / 15.0)

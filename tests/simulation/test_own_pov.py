@@ -1,0 +1,207 @@
+"""A POV of one's own: any kind of VUT in the POV's seat, at a level of its own."""
+
+# mypy: no-strict-optional
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.calling import assert_refused
+from support.campaigning import campaign_settings
+from support.misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
+from support.plans import plan_for
+from support.processes import none_left
+from support.vut_contract import cases_of, factory
+
+from merge_sumo.api import open_run
+from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.drivers.policies import policies_of
+from merge_sumo.metrics.score import measure
+from merge_sumo.scenario.case import Case, from_unit
+from merge_sumo.scenario.scenario import LEVELS, OWN, US23
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.povs import Povs, own_pov
+from merge_sumo.simulation.simulator import Simulator
+
+KEEPS = "def Pov(seen):\n    return 0.0\n"
+YIELDS = """
+class Pov:
+    def act(self, seen):
+        gap_m = seen.x_pov_m - seen.x_vut_m
+        return -1.0 if abs(gap_m) < 40.0 and seen.x_vut_m < 0.0 else 0.3
+"""
+SMALL = {
+    "vut": "design2",
+    "levels": (OWN,),
+    "cases": 18,
+    "batch": 6,
+    "seed": 2,
+    "sampler": "uniform",
+}
+
+
+FEW = ("--cases", 8, "--sampler", "uniform")
+
+
+@pytest.fixture(autouse=True)
+def of_a_user(tmp_path, monkeypatch):
+    """Work as a user with a cache and a folder of their own."""
+    monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "mine"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+
+@pytest.fixture
+def call(command_line):
+    """Return what runs the command line, in that folder."""
+    return command_line
+
+
+def pov(source: str, name: str = "my_pov.py") -> str:
+    """Write a POV and return what a person writes for it."""
+    Path(name).write_text(source)
+    return f"{name}:Pov"
+
+
+def settings(spec: str, **changes) -> CampaignSettings:
+    return campaign_settings(pov=spec, **{**SMALL, **changes})
+
+
+def own(cases: list[Case]) -> list[Case]:
+    return [replace(case, level=OWN, svo_rad=None) for case in cases]
+
+
+def run(
+    spec: str | None,
+    cases: list[Case],
+    vut: str = "design2",
+    corridors: int = 4,
+    *,
+    hosted: bool = False,
+    **options,
+) -> list[Trajectory]:
+    """Return what became of every case against a POV of one's own."""
+    options["in_process"] = not hosted
+    povs = Povs(
+        policies=policies_of(US23),
+        own=None if spec is None else own_pov(spec, VutOptions(**options)),
+    )
+    scenario = cases[0].scenario
+    with Simulator(
+        plan_for(
+            factory(vut, in_process=not hosted), scenario=scenario, povs=povs, corridors=corridors
+        )
+    ) as ground:
+        return ground.run(cases)
+
+
+def same(one: list[Trajectory], other: list[Trajectory]) -> bool:
+    return all(
+        np.array_equal(a.motion, b.motion) and a.end is b.end
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+class TestAPov:
+    def test_that_keeps_its_speed_drives_as_level_0_to_the_last_bit(self):
+        cases = cases_of(20)
+        assert same(run(pov(KEEPS), own(cases)), run(None, cases))
+
+    @pytest.mark.parametrize("spec", ["my_pov.py:Pov", "sumo:IDM"])
+    def test_changes_nothing_at_the_other_levels(self, spec):
+        pov(YIELDS)
+        rng = np.random.default_rng(3)
+        points = rng.random((12, 3))
+        others = [
+            from_unit(points[:, : 2 + (level == 2)], level, scenario=US23) for level in LEVELS
+        ]
+        cases = [case for group in zip(*others, own(others[0]), strict=True) for case in group]
+        mixed = run(spec, cases, vut="sumo:IDM", corridors=5)
+        learned = [case for case in cases if case.level != OWN]
+        kept = [motion for motion in mixed if motion.case.level != OWN]
+        assert same(kept, run(None, learned, vut="sumo:IDM", corridors=5))
+        alone = run(spec, [case for case in cases if case.level == OWN], vut="sumo:IDM")
+        assert same([motion for motion in mixed if motion.case.level == OWN], alone)
+
+
+CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])
+
+
+class TestWhatItDoesWrong:
+    @pytest.mark.slow
+    @pytest.mark.parametrize("name", ["os._exit 0", "batched: dies"])
+    def test_is_an_error_of_its_case_and_never_the_vuts(self, name):
+        how = CATALOGUE[name]
+        # Guilty is, as there, the case with the fastest POV: now that is itself.
+        source = how.source.replace("seen.v_pov_mps", "seen.v_vut_mps")
+        spec = pov(source).replace("Pov", "Vut")
+        with none_left():
+            ran = run(spec, CASES, hosted=True, deadline_s=DEADLINE_S)
+        for case, trajectory in zip(CASES, ran, strict=True):
+            if case.v_pov0_mps > GUILTY_MPS:
+                assert trajectory.end is End.SIM_ERROR
+                assert trajectory.error.startswith("the POV: ")
+                assert how.reason in trajectory.error
+                assert measure(trajectory).score is None
+            else:
+                assert trajectory.error is None
+
+    def test_beside_a_vut_that_errs_is_told_apart(self):
+        def wrong(speed: str) -> str:
+            return f"def Pov(seen):\n    assert seen.{speed} < 30.0\n    return 0.0\n"
+
+        vut = pov(wrong("v_pov_mps"), "vut.py")
+        cases = own(cases_of(8))
+        for trajectory in run(pov(KEEPS), cases, vut=vut):
+            erred = trajectory.case.v_pov0_mps >= 30.0
+            assert (trajectory.end is End.VUT_ERROR) == erred
+        for trajectory in run(pov(wrong("v_vut_mps")), cases):
+            erred = trajectory.case.v_pov0_mps >= 30.0
+            assert (trajectory.end is End.SIM_ERROR) == erred
+
+
+class TestACampaign:
+    @pytest.mark.parametrize(
+        ("arguments", "said"),
+        [
+            (("--level", "own"), "--level own is a POV that you bring: name it with --pov"),
+            (("--level", "0", "--pov", "my_pov.py:Pov"), "--pov drives at --level own or all"),
+            (("--level", "3", "--pov", "my_pov.py:Pov"), "there is no POV level '3'"),
+            (("--pov", "traci"), "a TraCI client drives the vehicle named vut and no other"),
+            (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
+            (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot read"),
+            (("--pov", "onnx:nowhere.onnx"), "the POV onnx:nowhere.onnx"),
+        ],
+    )
+    def test_is_refused_in_one_sentence(self, call, arguments, said):
+        pov(YIELDS)
+        for command in ("campaign", "benchmark") if "--level" in arguments else ("campaign",):
+            assert_refused(call(command, "--vut", "design1", *arguments), said)
+        left = {path.name for path in Path().iterdir()} - {"__pycache__"}
+        assert left == {"my_pov.py"}
+
+
+@pytest.mark.parametrize(
+    ("vut", "named", "scenario", "is_said"),
+    [
+        ("gap", "sumo:IDM", "us23-lane", True),
+        ("sumo:Krauss", "sumo:IDM", "us23-lane", False),
+        ("gap", "sumo:IDM", "us23", False),
+        ("gap", "my_pov.py:Pov", "us23-lane", False),
+    ],
+)
+def test_a_campaign_says_where_a_pov_of_sumo_does_not_see_the_vut(
+    call, vut, named, scenario, is_said
+):
+    pov(KEEPS)
+    asked = ("--vut", vut, "--pov", named, "--level", "own", "--scenario", scenario, *FEW)
+    code, _, err = call("campaign", *asked, "--out", "run", "--quiet")
+    assert code == 0
+    said = "until the VUT has merged, the POV sumo:IDM keeps its speed"
+    assert (said in err) is is_said
+    slowed = [one.measures.pov_slowdown_mps > 1e-6 for one in open_run("run").run.outcomes]
+    assert not (is_said and any(slowed))

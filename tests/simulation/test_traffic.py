@@ -1,0 +1,151 @@
+"""Traffic: three cars on the mainline, what they do to each other, and what the VUT sees."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.plans import plan_for
+
+from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.controller import seen_in
+from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
+from merge_sumo.metrics.score import FOLLOWED_UP, measure
+from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.simulator import Simulator
+from merge_sumo.sumo.binding import load_libsumo
+from merge_sumo.sumo.world import World
+
+TRAFFIC = replace(
+    US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
+)
+
+
+def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) -> list[Case]:
+    rng = np.random.default_rng([seed, level])
+    points = rng.random((n, len(scenario.dimensions(level))))
+    return Pool(levels=(level,), scenario=scenario).cases(points, level)
+
+
+def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
+    factory = VutFactory.of(vut, VutOptions(**options))
+    with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
+        return ground.run(cases)
+
+
+class TestThePool:
+    @pytest.mark.parametrize(("level", "dims"), [(0, 4), (1, 4), (2, 5)])
+    def test_has_a_coordinate_for_every_range(self, level, dims):
+        assert len(TRAFFIC.dimensions(level)) == dims
+        points = np.random.default_rng(1).random((20, dims))
+        cases = from_unit(points, level, scenario=TRAFFIC)
+        assert to_unit(cases, level, scenario=US23) == pytest.approx(points, abs=1e-12)
+
+    def test_starts_the_cars_at_their_headways_and_the_speed_of_the_pov(self):
+        (case,) = from_unit(np.array([[0.5, 0.5, 0.0, 1.0]]), 0, scenario=TRAFFIC)
+        assert case.starts() == [
+            (-260.0, 30.0),
+            (-182.0, 18.0),
+            (-260.0 + 1.0 * 30.0, 30.0),
+            (-260.0 - 4.0 * 30.0, 30.0),
+        ]
+
+
+def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
+    libsumo = load_libsumo()
+    attributes = {"carFollowModel": "KraussOrig1", "decel": "4", "tau": "1.3", "accel": "1000"}
+    rng = np.random.default_rng(0)
+    gaps, leaders = rng.uniform(0.5, 200.0, 200), rng.uniform(0.0, 45.0, 200)
+    with World(
+        1, vut_type={**attributes, "minGap": "0", "maxSpeed": "200"}, scenario=US23
+    ) as world:
+        world.place(0, [(-340.0, 0.0), (-182.0, 18.0)])
+        theirs = [
+            libsumo.vehicle.getFollowSpeed("vut.0", 45.0, gap, leader, 4.0)
+            for gap, leader in zip(gaps.tolist(), leaders.tolist(), strict=True)
+        ]
+    assert safe_speed_mps(gaps, leaders, 4.0, 1.3) == pytest.approx(theirs, abs=1e-9)
+
+
+class TestCarsOfTheMainline:
+    @pytest.mark.parametrize("level", [0, 1, 2])
+    def test_that_are_far_away_change_nothing(self, level):
+        alone = cases_of(level, 60, US23)
+        far = [
+            replace(
+                case,  # type: ignore[call-arg]
+                headway_ahead_s=18.0,
+                headway_behind_s=16.0,
+                scenario=TRAFFIC,
+            )
+            for case in alone
+        ]
+        for one, other in zip(run("design2", alone), run("design2", far), strict=True):
+            assert np.array_equal(one.motion, other.motion[:, :2])
+            assert one.end == other.end
+            # A car far behind may still have to brake a little.
+            found = measure(other)
+            assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
+            of_all = ("brake_after_mps2", *FOLLOWED_UP)
+            same = {name: getattr(measure(one), name) for name in of_all}
+            assert replace(found, **same) == measure(one)
+
+    def test_brake_behind_one_that_brakes_and_never_touch_it(self):
+        following, rng = Following(50), np.random.default_rng(0)
+        case = cases_of(0, 1)[0]
+        for k in range(50):
+            following.begin(k, case)
+        v = np.tile(rng.uniform(5.0, 35.0, 50), (4, 1))
+        x = np.zeros((4, 50))
+        x[AHEAD], x[BEHIND] = rng.uniform(1.1, 2.0, (2, 50)) * [[1.0], [-1.0]] * v[0]
+        for step in range(200):
+            a = np.full((4, 50), 2.0)
+            a[AHEAD] = -4.0 if step > 10 else 0.0
+            following.limit(a, x, v)
+            a = np.clip(a, -4.0, 2.0)
+            x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
+            assert (x[[AHEAD, POV]] - x[[POV, BEHIND]]).min() > TRAFFIC.pov_length_m
+        assert v.max(axis=1)[[POV, AHEAD, BEHIND]].max() < 0.2
+
+
+class TestWhatTheVutMeets:
+    def test_is_the_car_that_will_be_nearest_to_m(self):
+        # At 28 m/s already, the VUT is at M in 5 s; then the cars are at -50, 10 and -40 m.
+        x = np.array([[-200.0], [-140.0], [-140.0], [-190.0]])
+        v = np.array([[30.0], [28.0], [30.0], [30.0]])
+        assert car_met(x, v, 1.0, 28.0).tolist() == [AHEAD]
+        assert car_met(x, v, 1.0, 28.0 / 1.5).tolist() == [AHEAD]
+        x[AHEAD] = 0.0
+        assert car_met(x, v, 1.0, 28.0).tolist() == [BEHIND]
+
+    def test_counts_as_pov_and_all_cars_are_seen_from_the_front_to_the_back(self):
+        seen = seen_in(1.5, BEHIND, [-200.0, -140.0, -150.0, -190.0], [30.0, 28.0, 31.0, 29.0])
+        assert seen == (1.5, -190.0, 29.0, -140.0, 28.0)
+        assert seen.others == ((-150.0, 31.0), (-190.0, 29.0), (-200.0, 30.0))
+        assert seen.others[0].x_m == -150.0
+
+
+def ending(gaps_m: dict[int, float], speeds: dict[int, float] | None = None) -> Trajectory:
+    """Return an episode at whose end the cars are so far ahead of the VUT, which is at M."""
+    case = cases_of(0, 1)[0]
+    motion = np.zeros((3, 4, 3))
+    motion[:, :, 1] = 25.0
+    for row, speed in (speeds or {}).items():
+        motion[:, row, 1] = speed
+    motion[-1, :, 0] = [gaps_m.get(row, 0.0) for row in range(4)]
+    for step in (1, 0):
+        motion[step, :, 0] = motion[step + 1, :, 0] - motion[step, :, 1] * DT_S
+    return Trajectory(case, motion, End.MERGED)
+
+
+class TestTheVerdict:
+    @pytest.mark.parametrize(("row", "name"), [(POV, "pov"), (AHEAD, "ahead"), (BEHIND, "behind")])
+    def test_is_a_failure_where_any_car_is_too_near(self, row, name):
+        gaps = {POV: 40.0, AHEAD: 90.0, BEHIND: -50.0}
+        measures = measure(ending({**gaps, row: 4.0}, {row: 27.0}))
+        assert measures.is_close
+        assert (measures.dx_m, measures.dv_mps, measures.nearest) == (4.0, 2.0, name)
