@@ -31,7 +31,7 @@ from merge_sumo.api import truth as truth_of
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.chance import clopper_pearson
+from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.scenario.scenario import US23
 
 SEEDS = range(1000, 1200)

@@ -94,7 +94,7 @@ def samplers_table() -> str:
 
 def criteria_table() -> str:
     """Return the registered criteria as a table."""
-    from merge_sumo.metrics.criteria import CRITERIA
+    from merge_sumo.metrics.criterion import CRITERIA
 
     rows = [f"| `{name}` | `{one.condition}` | {one.about} |" for name, one in CRITERIA.items()]
     return "\n".join(("| `--fail-when` | condition | failure |", "|---|---|---|", *rows))

@@ -14,8 +14,8 @@ from merge_sumo.analysis.comparison import Change, ComparedCase, passes, short
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import Measures, Outcome, record_fields
-from merge_sumo.metrics.severity import Severity
 from merge_sumo.records import (
     Record,
     convert,

@@ -23,7 +23,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.analysis.run_study import StudyFile
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.controllers.factory import VutFactory
 from merge_sumo.controllers.process import LOG

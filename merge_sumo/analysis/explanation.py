@@ -21,8 +21,7 @@ from typing import Annotated, Any, Final
 
 from msgspec import Meta
 
-from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.controllers.base import VutSpec
 from merge_sumo.controllers.parameters import Range

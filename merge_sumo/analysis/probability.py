@@ -34,15 +34,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from merge_sumo import config
-from merge_sumo.analysis.exposure import Distribution, read_distribution
-from merge_sumo.analysis.run_study import RunStudy, check_least
-from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.analysis.exposure import Distribution, Traffic, named_traffic, read_distribution
+from merge_sumo.analysis.run_study import RunStudy, StudyFile, check_least
 from merge_sumo.analysis.surface import learn_surface
-from merge_sumo.analysis.traffic import Traffic, named_traffic
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_new_file, write_new
-from merge_sumo.metrics.chance import clopper_pearson
 from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record, to_json
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case, FloatArray

@@ -14,12 +14,12 @@ from merge_sumo.analysis.comparison import (
     ComparedCase,
     Comparison,
     Step,
+    Version,
     in_order,
     of_two,
     passes_less,
 )
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.analysis.version import Version
 from merge_sumo.campaigns.again import campaign_in, command
 from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run

@@ -4,21 +4,61 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from pathlib import Path
+from typing import Any, Generic, TypeVar
 
 from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.errors import UserError, notice
+from merge_sumo.folders import check_ours, replace_own
 from merge_sumo.hashing import files_now
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.printable import printable
+from merge_sumo.records import Record, read_record, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
-R = TypeVar("R")
+R = TypeVar("R", bound=Record)
+
+
+@dataclass(frozen=True, slots=True)
+class StudyFile(Generic[R]):
+    """A file of a campaign: JSON with one record, or a line for each of some failures.
+
+    Attributes:
+        name: of the file.
+        kind: type of the record, or of a line, which has an `index`.
+    """
+
+    name: str
+    kind: type[R]
+
+    def check(self, folder: Path) -> None:
+        """Raise `UserError` where a file of this name is not ours to replace."""
+        check_ours(folder / self.name, self.kind.__struct_fields__)
+
+    def read(self, folder: Path) -> R | None:
+        """Read the record; None without the file, `UserError` where it is not as it was written."""
+        return read_record(folder / self.name, self.kind)
+
+    def write(self, folder: Path, record: R) -> None:
+        """Write the record, in the place of an older one."""
+        replace_own(folder / self.name, to_json(record, indent=1))
+
+    def read_lines(self, run: Run) -> dict[int, R]:
+        """Read the lines by index; `UserError` for one that is not of a failure of the campaign."""
+        failing = {outcome.index for outcome in run.outcomes if outcome.failed}
+        return run.read_lines(self.name, self.kind, failing)
+
+    def write_lines(self, folder: Path, lines: Iterable[R]) -> None:
+        """Write lines, in the place of older ones."""
+        replace_own(folder / self.name, b"".join(map(to_json, lines)))
+
+
+T = TypeVar("T")
 
 OnPart = Callable[[str, int, int, str, str], None]
 """Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
@@ -52,8 +92,8 @@ class RunStudy:
     on_cases: Callable[[int], None] = lambda _: None
 
     def simulate(
-        self, cases: Sequence[Case], plan: SimulationPlan, keep: Callable[[Episode], R]
-    ) -> list[R]:
+        self, cases: Sequence[Case], plan: SimulationPlan, keep: Callable[[Episode], T]
+    ) -> list[T]:
         """Run cases; return what is kept of each, in their order.
 
         Args:

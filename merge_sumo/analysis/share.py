@@ -16,12 +16,12 @@ from typing import Annotated, Final
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.analysis.run_study import StudyFile
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.chance import clopper_pearson
 from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Pool
 from merge_sumo.simulation.evaluate import evaluate

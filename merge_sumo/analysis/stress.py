@@ -16,8 +16,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.analysis.study_file import StudyFile
+from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode

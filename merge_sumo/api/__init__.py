@@ -74,7 +74,7 @@ from merge_sumo.folders import (
     make_folder,
     write_new,
 )
-from merge_sumo.metrics.conflict import check_from
+from merge_sumo.metrics.merge import check_from
 from merge_sumo.printable import printable, quoted
 from merge_sumo.records import check_toml_size, to_plain
 from merge_sumo.reports import exports, figures

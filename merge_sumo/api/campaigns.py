@@ -20,8 +20,8 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import WorkersLostError, notice
 from merge_sumo.folders import check_new, link_latest
 from merge_sumo.interrupt import Stopped
-from merge_sumo.metrics.campaign_verdict import parse_gates
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import parse_gates
 from merge_sumo.printable import quoted
 from merge_sumo.reports.junit import check_junit, write_junit
 from merge_sumo.reports.progress import CampaignBars

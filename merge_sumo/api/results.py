@@ -14,19 +14,20 @@ from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.config import AnyRun
-from merge_sumo.metrics.campaign_verdict import (
-    MESSAGE_CHARACTERS,
-    GateResult,
-    Verdict,
-    judge,
-    parse_gates,
-    shortened,
-)
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.plausibility import doubts, in_vain, mostly_clipped
 from merge_sumo.metrics.score import Measures, Outcome
-from merge_sumo.metrics.summary import Summary, summarise
+from merge_sumo.metrics.summary import (
+    MESSAGE_CHARACTERS,
+    GateResult,
+    Summary,
+    Verdict,
+    judge,
+    parse_gates,
+    shortened,
+    summarise,
+)
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.comparison_page import AGAINST_PAGE

@@ -26,11 +26,11 @@ from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search
 from merge_sumo.errors import UserError
 from merge_sumo.folders import regular
-from merge_sumo.metrics.chance import one_per_case
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import regions
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import Record, convert, decode, read_indexed
 from merge_sumo.scenario.case import FloatArray, to_unit

@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from merge_sumo.metrics.chance import failing_cases
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import failing_cases
 from merge_sumo.scenario.case import to_unit
 
 WINDOW: Final = 100

@@ -15,9 +15,9 @@ from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
-from merge_sumo.metrics.criteria import CRITERIA, PAPER
 from merge_sumo.metrics.expression import Condition, Value, Vocabulary, parse_condition
 from merge_sumo.metrics.measures import MEASURES
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import (
     FOLLOWED_UP,
     ON_LANE,
@@ -28,12 +28,37 @@ from merge_sumo.metrics.score import (
     measure,
     merge_score,
 )
-from merge_sumo.metrics.severity import Severity
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.suggestions import nearest
+
+PAPER: Final = "paper"
+
+
+@dataclass(frozen=True, slots=True)
+class NamedCriterion:
+    """A criterion that has a name."""
+
+    condition: str  # over measures, under which a case fails
+    about: str  # what fails, in a phrase
+
+
+CRITERIA: Final = {
+    PAPER: NamedCriterion(
+        "score < -500",
+        "the front bumpers are within 6 m as the VUT reaches M: a contact or a conflict",
+    ),
+    "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
+    "unsafe": NamedCriterion(
+        "clearance_m <= 0 or brake_after_mps2 > 3",
+        "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "
+        "No. 79 lets a lane change demand of others",
+    ),
+}
+"""Criteria by the name that follows `fail_when`."""
+
 
 TEXTS: Final = {
     "end": frozenset(end.value for end in End if not end.is_error),

@@ -4,18 +4,23 @@ At M both drive in one lane. The bumper gap is from the front bumper of the one 
 bumper of the one ahead. The one behind has to brake so that the bodies never touch while the one
 ahead keeps its speed; it begins after the time that a driver takes to react. With the gap g and
 the closing speed w that is w^2 / (2 (g - w tau)).
+
+The severity of an encounter follows from the simulated motion at M and behind it; what counts as a
+failure is another question (`criterion.py`).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from enum import StrEnum
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import DT_S, VUT, lane_of
+from merge_sumo.scenario.scenario import DT_S, VUT, MergeScenario, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 REACTION_S: Final = 0.75
@@ -170,3 +175,133 @@ def followed_up(trajectory: Trajectory) -> tuple[float, float, float] | None:
     gap_m, closing_mps = gap_m[closes], closing_mps[closes]
     hardest_mps2 = float((np.square(closing_mps) / (2.0 * gap_m)).max())
     return least_m, float((gap_m / closing_mps).min()), hardest_mps2
+
+
+class Severity(StrEnum):
+    """Classes of encounters, the most severe first; an episode is of the first that fits."""
+
+    CONTACT = "contact"
+    CONFLICT = "conflict"
+    HARSH = "harsh"
+    SAFE = "safe"
+
+
+def meanings(scenario: Scenario) -> dict[Severity, str]:
+    """Return what the words mean in a scenario."""
+    if not isinstance(scenario, MergeScenario):
+        return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
+    soon = f"within {scenario.follow_up_s:g} s after"
+    found = {
+        Severity.CONTACT: f"bodies touch at M or {soon} it",
+        Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
+        Severity.HARSH: f"a car behind brakes harder than {HARSH_MPS2:g} m/s² {soon} M",
+        Severity.SAFE: "none of these",
+    }
+    if not scenario.follow_up_s:
+        del found[Severity.HARSH]
+        found[Severity.CONTACT] = "bodies touch at M"
+    return {severity: scenario.said(meaning) for severity, meaning in found.items()}
+
+
+def severity_of(
+    end: End, clearance_m: float, *, is_close: bool, brake_mps2: float | None
+) -> Severity | None:
+    """Return the class of an encounter; None where the VUT never reached M.
+
+    Args:
+        end: why the episode ended.
+        clearance_m: smallest clearance of bodies from M on.
+        is_close: whether the front bumpers were nearer at M than the paper allows.
+        brake_mps2: hardest braking behind M of those behind; None without a follow-up.
+    """
+    if not end.is_tested:
+        return None
+    if clearance_m <= 0.0:
+        return Severity.CONTACT
+    if is_close:
+        return Severity.CONFLICT
+    return Severity.HARSH if (brake_mps2 or 0.0) > HARSH_MPS2 else Severity.SAFE
+
+
+def check_from(from_s: float | None) -> None:
+    """Raise `UserError` where `from_s` is neither None nor a finite number that is not above 0."""
+    if from_s is not None and not (isinstance(from_s, int | float) and -1e300 <= from_s <= 0.0):
+        raise UserError(f"`from_s` is {from_s!r:.40}: give a number not above 0, such as -3")
+
+
+class Conflict(NamedTuple):
+    """The row of the first conflict of an episode, and what it is.
+
+    With the VUT in the lane of the mainline it is the contact, where bodies first overlap, else the
+    lowest time to collision between bumpers, else the merge. Without a merge it is the end.
+    """
+
+    row: int
+    what: str
+
+    @classmethod
+    def find(cls, motion: FloatArray, merges: int | None, lengths_m: tuple[float, float]) -> Self:
+        """Find it in x and v, (T + 1, A, 2), with a VUT in that lane from a row on, or never."""
+        if merges is None:
+            return cls(len(motion) - 1, "the end of the episode")
+        gap_m, closing_mps = gaps_m(motion[merges:], lengths_m)
+        ttc_s = np.divide(gap_m, closing_mps, out=gap_m + np.inf, where=closing_mps > 0.0)
+        lowest_s = np.where(gap_m <= 0.0, 0.0, ttc_s).min(axis=1)
+        row = int(lowest_s.argmin())
+        found = {0.0: "the contact", np.inf: "the merge" if merges else "the start"}
+        return cls(merges + row, found.get(lowest_s[row], "the lowest time to collision"))
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> Self:
+        """Find it in what happened."""
+        scenario = trajectory.case.scenario
+        merges = len(trajectory.motion) - 1 if trajectory.end is End.MERGED else None
+        in_one_lane = scenario.vut_edges == scenario.pov_edges
+        return cls.find(trajectory.whole, 0 if in_one_lane else merges, scenario.lengths_m)
+
+    def begin(self, from_s: float | None) -> tuple[int, list[str]]:
+        """Return the row so long before it and that in words; the first one, without, for None."""
+        if from_s is None:
+            return 0, []
+        row = round(max(self.row + from_s / DT_S, 0.0))
+        before = f"{(self.row - row) * DT_S:g} s before {self.what} at {self.row * DT_S:.1f} s"
+        return row, [f"from {row * DT_S:.1f} s, {before}"]
+
+
+def last_avoidable_s(trajectory: Trajectory) -> float | None:
+    """Return the last time, in s, at which the VUT could still avoid a conflict; None without one.
+
+    The POV never moves backwards, so of all ways to arrive at M the first and the last possible
+    decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
+    rolled out from every step of the record at once. On an acceleration lane it is about the place
+    where the VUT merged. In traffic every car has to be avoided, and
+    gaps between cars are left out.
+
+    Other cars move as recorded, and keep their last speed after that. The VUT moves by eq. (4), as
+    in the record: by the speed before a step, so what it decides in one moves it from the next on.
+    By the speed after the step the time would be a step later, and up to 0.5 s.
+    """
+    place_m = place_of_merge_m(trajectory)
+    cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario
+    steps = np.arange(1, scenario.max_steps + 1)[:, None]
+    beyond = steps * (cars[-1, :, 1] * DT_S) + cars[-1, :, 0]
+    x_cars = np.concatenate([cars[:, :, 0], beyond])
+    starts = np.arange(len(cars) - 1)
+    avoidable = np.zeros(len(starts), dtype=bool)
+    for acceleration in (scenario.a_max_mps2, scenario.a_min_mps2):
+        x, v = trajectory.x_vut_m[:-1].copy(), trajectory.v_vut_mps[:-1].copy()
+        driving = np.ones(len(starts), dtype=bool)
+        for ahead in range(1, scenario.max_steps + 1):
+            x = x + v * DT_S
+            v = np.maximum(v + acceleration * DT_S, 0.0)
+            arrived = driving & (x >= place_m)
+            dx = x_cars[starts[arrived] + ahead] - x[arrived, None]
+            avoidable[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
+            driving &= ~arrived
+            if not driving.any():
+                break
+            if acceleration < 0.0 and not v[driving].any():
+                # These stop short of M and can wait there, if the POV moves on.
+                avoidable[driving] |= bool((cars[-1, :, 1] > 0.0).all())
+                break
+    return round(float(starts[avoidable][-1]) * DT_S, 1) if avoidable.any() else None

@@ -16,7 +16,6 @@ from typing import Any, Final, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 
-from merge_sumo.metrics.avoidability import last_avoidable_s
 from merge_sumo.metrics.bodies import CentreLines, closest_before_m
 from merge_sumo.metrics.measures import (
     MEASURES,
@@ -28,16 +27,18 @@ from merge_sumo.metrics.measures import (
     with_values,
 )
 from merge_sumo.metrics.merge import (
+    Severity,
     brake_after_mps2,
     braked_after_mps2,
     closest_after_m,
     followed_up,
+    last_avoidable_s,
     neighbours,
     on_lane,
     place_of_merge_m,
+    severity_of,
 )
 from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.severity import Severity, severity_of
 from merge_sumo.pickling import quickly_pickled
 from merge_sumo.records import convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray

@@ -16,12 +16,11 @@ from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_
 from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
 from merge_sumo.campaigns.run import Run, spread_failures
 from merge_sumo.folders import check_ending, make_place, write_new
-from merge_sumo.metrics.campaign_verdict import judge
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.chance import one_per_case
 from merge_sumo.metrics.criterion import condition_of
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import judge, one_per_case
 from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX

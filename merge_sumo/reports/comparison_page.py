@@ -12,8 +12,8 @@ import numpy as np
 from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.folders import replace_own
-from merge_sumo.metrics.campaign_verdict import judge
 from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.summary import judge
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import FloatArray

@@ -19,12 +19,10 @@ from merge_sumo.analysis.stress import STRESS
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.metrics.campaign_verdict import Verdict
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.chance import by_case, undecided
 from merge_sumo.metrics.fmc import radius_for
-from merge_sumo.metrics.severity import Severity
-from merge_sumo.metrics.summary import LevelSummary, Summary
+from merge_sumo.metrics.merge import Severity
+from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import lane_of, level_name
 

@@ -21,9 +21,8 @@ from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.folders import check_ending, check_new, check_new_file, write_new
-from merge_sumo.metrics.campaign_verdict import GateResult, Verdict
-from merge_sumo.metrics.chance import by_case, undecided
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.text import change_in_words, step_headline

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from merge_sumo.metrics.cause import cause, met
-from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.score import Outcome, measures_in
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name

@@ -13,10 +13,9 @@ from typing import Final, Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from merge_sumo.metrics.campaign_verdict import judge
-from merge_sumo.metrics.chance import one_per_case
-from merge_sumo.metrics.diagnosis import failure_boxes
+from merge_sumo.metrics.cause import failure_boxes
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import judge, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import level_name

@@ -11,13 +11,11 @@ import numpy as np
 
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.surface import Grid, Surface, nodes
-from merge_sumo.metrics.campaign_verdict import shortened
-from merge_sumo.metrics.chance import RunsOfCase
-from merge_sumo.metrics.conflict import Conflict
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.measures import Measure
+from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.score import Outcome, measures_in
-from merge_sumo.metrics.severity import Severity
+from merge_sumo.metrics.summary import RunsOfCase, shortened
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel

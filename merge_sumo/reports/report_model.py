@@ -16,12 +16,10 @@ from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.campaign_verdict import Trouble, judge
-from merge_sumo.metrics.chance import by_case, undecided
-from merge_sumo.metrics.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.metrics.summary import Summary, summarise
+from merge_sumo.metrics.summary import Summary, Trouble, by_case, judge, summarise, undecided
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of

@@ -7,9 +7,9 @@ from typing import Any, Final
 from markupsafe import Markup
 
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.metrics.diagnosis import BRAKED_MPS
+from merge_sumo.metrics.cause import BRAKED_MPS
 from merge_sumo.metrics.fmc import radius_for
-from merge_sumo.metrics.severity import meanings
+from merge_sumo.metrics.merge import meanings
 from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
 from merge_sumo.reports.pages import fragment, source_of
 from merge_sumo.reports.report_data import pairs_of

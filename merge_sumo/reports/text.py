@@ -30,10 +30,10 @@ from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.again import again, command
-from merge_sumo.metrics.campaign_verdict import judge
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.plausibility import behind
+from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case

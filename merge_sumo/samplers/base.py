@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
-from merge_sumo.metrics.chance import RunsOfCase, by_case
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import RunsOfCase, by_case
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit

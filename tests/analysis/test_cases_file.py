@@ -20,7 +20,7 @@ import merge_sumo as ms
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import ComparedCase, passes
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.severity import Severity
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.cases_toml import write_cases
 from merge_sumo.reports.text import comparison_headline
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios

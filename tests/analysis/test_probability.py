@@ -12,7 +12,13 @@ from scipy.stats import kstest, norm, truncnorm
 from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo import config
-from merge_sumo.analysis.exposure import Normal, read_distribution
+from merge_sumo.analysis.exposure import (
+    Normal,
+    Traffic,
+    named_traffic,
+    read_distribution,
+    shipped_traffics,
+)
 from merge_sumo.analysis.probability import (
     EXPECTED_LEAST,
     PROBABILITY,
@@ -24,11 +30,10 @@ from merge_sumo.analysis.probability import (
 )
 from merge_sumo.analysis.probability import failure_probability as failure_probability_of
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.analysis.traffic import Traffic, named_traffic, shipped_traffics
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.chance import clopper_pearson
+from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import US23
 

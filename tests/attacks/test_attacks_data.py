@@ -26,7 +26,7 @@ from merge_sumo.api import open_run
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.severity import Severity
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import US23

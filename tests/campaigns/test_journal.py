@@ -21,8 +21,8 @@ from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_s
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import further_measures
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
-from merge_sumo.metrics.severity import Severity
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, MergeCase

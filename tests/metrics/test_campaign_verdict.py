@@ -20,8 +20,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped
-from merge_sumo.metrics.campaign_verdict import Gate, judge, parse_gates
-from merge_sumo.metrics.summary import LevelSummary, Summary, summarise
+from merge_sumo.metrics.summary import Gate, LevelSummary, Summary, judge, parse_gates, summarise
 from merge_sumo.printable import counted
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.scenario.trajectory import End

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.metrics.chance import (
+from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.metrics.summary import (
     by_case,
     clopper_pearson,
     failing_cases,
@@ -21,7 +22,6 @@ from merge_sumo.metrics.chance import (
     runs_needed,
     undecided,
 )
-from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.scenario.case import MergeCase, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End

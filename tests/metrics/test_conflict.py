@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.conflict import Conflict, check_from
+from merge_sumo.metrics.merge import Conflict, check_from
 from merge_sumo.scenario.case import FloatArray, MergeCase
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at

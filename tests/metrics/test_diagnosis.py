@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.metrics.diagnosis import Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import MergeCase

@@ -16,7 +16,7 @@ from support.handmade import write_run
 
 from merge_sumo.analysis.explanation import EXPLANATIONS, Axis, Explanation
 from merge_sumo.campaigns.run import Run, failures, spread_failures
-from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.merge import Conflict
 from merge_sumo.records import to_plain
 from merge_sumo.reports import report
 from merge_sumo.reports.text import changes

@@ -10,7 +10,7 @@ import pytest
 from merge_sumo.campaigns.campaign import twin_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.criteria import PAPER
+from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.belief import learn_chance
 from merge_sumo.samplers.history import bounded

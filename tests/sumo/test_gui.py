@@ -18,7 +18,7 @@ import merge_sumo
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.merge import Conflict
 from merge_sumo.scenario.colours import rgb
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo.replay_folder import LABELS, VIEW

@@ -12,7 +12,7 @@ from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.metrics.conflict import Conflict
+from merge_sumo.metrics.merge import Conflict
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo import replay as replay_module
