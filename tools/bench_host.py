@@ -26,7 +26,7 @@ import numpy as np
 import traci
 from bench_record import add_record_option, append_record
 
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.road.merge import road_of
@@ -50,7 +50,7 @@ VUT = "design1"
 def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
     pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
-    vut = VutFactory.of(VUT)(world.corridors)
+    vut = load(VUT).open(world.corridors)
     start = time.perf_counter()
     trajectories = Rollout(world, pov, vut, cases).run()
     return time.perf_counter() - start, trajectories
@@ -122,7 +122,7 @@ def process_s(cases: list[Case]) -> list[float]:
                     case,
                     hosted_paths(road),
                     PovLibrary(1, Povs(policies=policies_of(US23))),
-                    VutFactory.of(VUT)(1),
+                    load(VUT).open(1),
                 )
             finally:
                 traci.close()

@@ -34,8 +34,8 @@ from bench_record import add_record_option, append_record
 from build_fmu import build_fmu
 from export_policy import export_onnx
 
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import MergeCase
@@ -177,13 +177,13 @@ def main() -> None:
         command = shlex.join([sys.executable, str(folder / "client.py"), "{port}"])
         subscribing = command.replace("client.py", "subscriber.py")
 
-        in_process = VutOptions(in_process=True)
+        in_process = ControllerOptions(in_process=True)
 
         # A TraCI controller is told the road and the scenario; no SUMO of ours runs here.
         world: Any = SimpleNamespace(road=road_of(), scenario=US23)
 
-        def driver(spec: str, corridors: int = 1, given: VutOptions | None = None) -> Driver:
-            return VutFactory.of(spec, given or VutOptions())(corridors, world)
+        def driver(spec: str, corridors: int = 1, given: ControllerOptions | None = None) -> Driver:
+            return load(spec, given or ControllerOptions()).open(corridors, world)
 
         drivers = {
             "python": driver(f"{folder / 'law.py'}:Vut"),

@@ -77,7 +77,7 @@ WRITTEN: dict[str, Callable[[], str]] = {
 
 def vut_kinds_table() -> str:
     """Return the registered kinds of VUT as a table."""
-    from merge_sumo.controllers.registry import KINDS
+    from merge_sumo.controllers.kinds import KINDS
 
     kinds = [kind for kind in KINDS.values() if kind.form]
     rows = [f"| `{kind.form}` | {kind.what} | `{kind.example}` |" for kind in kinds]

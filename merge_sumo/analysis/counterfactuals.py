@@ -25,7 +25,7 @@ import numpy as np
 
 from merge_sumo.analysis.run_study import StudyFile
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import LOG
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import follow_mps2
@@ -138,7 +138,7 @@ def avoidance(
     if not failing:
         return []
     # No code of the VUT: a driver of the package is in its place.
-    plan = replace(plan, vut=VutFactory.of(CAREFUL)).for_verdicts()
+    plan = replace(plan, vut=load(CAREFUL)).for_verdicts()
     plan = plan.with_log(run.folder.resolve() / LOG)
     avoided: list[Avoidance] = []
     with workers_or_here(workers) as processes:

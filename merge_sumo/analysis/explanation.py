@@ -23,8 +23,8 @@ from msgspec import Meta
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.controllers.base import VutSpec
-from merge_sumo.controllers.parameters import Range
+from merge_sumo.controllers.parameters import Range, values_of
+from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
@@ -48,7 +48,7 @@ ROUNDED: Final = 1e-6
 PSI: Final = 0.0
 """Orientation of a POV that becomes one of level 2."""
 
-Trial = tuple[VutSpec, Case]
+Trial = tuple[ControllerSpec, Case]
 """The spec of a VUT, and a case that it drives."""
 
 
@@ -258,7 +258,7 @@ class _Neighbours:
         """Take the plan, the failure, the parameters that are searched, and where cases run."""
         self._check = check
         self._plan, self._outcome, self._workers = plan, outcome, workers
-        case, present = outcome.case, plan.vut.values_of(ranges)
+        case, present = outcome.case, values_of(plan.vut, ranges)
         self._axes = [
             _axis(c.field, getattr(case, c.field), c.dimension.low, c.dimension.high, c.digits)
             for c in coordinates(case.scenario, (case.level,))

@@ -23,7 +23,7 @@ from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.again import campaign_in, command
 from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
-from merge_sumo.controllers.spec import waits_for_client
+from merge_sumo.controllers.kinds import waits_for_client
 from merge_sumo.errors import UserError
 from merge_sumo.folders import free
 from merge_sumo.metrics.episode import Episode

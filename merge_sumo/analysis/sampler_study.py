@@ -166,7 +166,7 @@ class Study:
     def truths(self, settings: CampaignSettings, asked: config.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
         by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
-        if not self.plan.vut.kind.files_are_known and not is_here(settings.vut):
+        if not self.plan.vut.files_are_known and not is_here(settings.vut):
             notice(
                 "note: nobody can tell what the program behind this VUT loads; this truth is kept "
                 "for its command and the files that are named there"

@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from merge_sumo.controllers.base import HERE
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
+from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.controllers.python import installed_vuts
-from merge_sumo.controllers.registry import KINDS
+from merge_sumo.controllers.spec import HERE
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
@@ -158,7 +158,7 @@ def _differences(
 def _why(plan: SimulationPlan, difference: _Difference) -> str:
     """Return why a VUT drives differently; a case that runs first, twice, tells it."""
     spec = plan.vut.spec
-    if spec.kind == HERE or plan.vut.kind.waits(spec.argument):
+    if spec.kind == HERE or plan.vut.waits(spec.argument):
         return (
             "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
             "perhaps in its module or its class."

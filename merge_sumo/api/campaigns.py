@@ -154,9 +154,9 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Camp
             f"note: the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"
             f"{f': {check} says in what it differs' if name else ''}"
         )
-    own, by_sumo = plan.povs.own, plan.vut.vut.vut_type is not None
+    own, by_sumo = plan.povs.own, plan.vut.vut_type is not None
     on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None
-    if on_lane and own is not None and own.vut.vut_type is not None and not by_sumo:
+    if on_lane and own is not None and own.vut_type is not None and not by_sumo:
         # SUMO's drivers make room for a car next to them where its lane-change model asks them to.
         notice(
             f"note: until the VUT has merged, the POV {own.spec} keeps its speed: on an "

@@ -14,10 +14,11 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.controllers.base import HERE, PYTHON
-from merge_sumo.controllers.here import object_of
-from merge_sumo.controllers.python import is_code
-from merge_sumo.controllers.spec import names_code, parse
+from merge_sumo.controllers.in_memory import names_code
+from merge_sumo.controllers.kinds import parse
+from merge_sumo.controllers.python import object_of
+from merge_sumo.controllers.signatures import is_code
+from merge_sumo.controllers.spec import HERE, PYTHON
 from merge_sumo.printable import quoted
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import US23, Scenario

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.road.merge import road_for
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.povs import Povs, own_pov, policies_folder
@@ -27,14 +27,14 @@ def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPla
     options = settings.vut_options(policies)
     if debug:
         options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
-    vut = VutFactory.of(settings.vut, options)
+    vut = load(settings.vut, options)
     own = None if settings.pov is None else own_pov(settings.pov, options)
     povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
     for level in settings.levels:
         povs.check_level(level)
     against = None
     if settings.against is not None:
-        against = VutFactory.of(settings.against, settings.earlier.vut_options(policies))
+        against = load(settings.against, settings.earlier.vut_options(policies))
     return SimulationPlan(
         scenario=settings.scenario,
         road=road_for(settings.scenario),

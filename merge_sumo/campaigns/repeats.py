@@ -23,7 +23,7 @@ import numpy as np
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.controllers.spec import is_built_in, waits_for_client
+from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.folders import replace_own
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome

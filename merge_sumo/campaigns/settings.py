@@ -12,8 +12,9 @@ from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search, changed
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.spec import is_built_in, names_code, waits_for_client
+from merge_sumo.controllers.in_memory import names_code
+from merge_sumo.controllers.kinds import is_built_in, waits_for_client
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
@@ -155,9 +156,9 @@ class CampaignSettings(Search):
         """What counts as a failure."""
         return Criterion(self.fail_when, self.require)
 
-    def vut_options(self, policies: Path | None) -> VutOptions:
+    def vut_options(self, policies: Path | None) -> ControllerOptions:
         """Return how the VUT is hosted, with the learned drivers of a folder."""
-        return VutOptions(
+        return ControllerOptions(
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
             policies=policies,

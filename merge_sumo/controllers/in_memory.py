@@ -11,11 +11,11 @@ from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
 from typing import Any, Final, Protocol, SupportsFloat
 
-from merge_sumo.controllers.base import HERE, VutOptions, VutSpec
 from merge_sumo.controllers.controller import Seen
-from merge_sumo.controllers.here import HereKind, object_of, objects
-from merge_sumo.controllers.python import SeenBatch, is_code
-from merge_sumo.controllers.spec import parse
+from merge_sumo.controllers.kinds import parse, runs_code
+from merge_sumo.controllers.python import HereKind, SeenBatch, object_of, objects
+from merge_sumo.controllers.signatures import is_code
+from merge_sumo.controllers.spec import HERE, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError, notice
 from merge_sumo.workers import AnyWorkers
 
@@ -59,10 +59,10 @@ def spec_of(vut: Any) -> str:
     while objects.get(unique, vut) is not vut:
         number += 1
         unique = f"{name}-{number}"
-    spec = VutSpec(HERE, unique)
+    spec = ControllerSpec(HERE, unique)
     objects[unique] = vut
     try:
-        HereKind(spec, VutOptions())
+        HereKind(spec, ControllerOptions())
     except UserError:
         del objects[unique]
         raise
@@ -74,7 +74,15 @@ def is_here(text: str) -> bool:
     return parse(text).kind == HERE
 
 
-def travels(spec: VutSpec) -> bool:
+def names_code(text: str) -> bool:
+    """Return whether who writes a spec says which code of a user's is run.
+
+    An object of this process was put there by who runs it.
+    """
+    return runs_code(text) and object_of(parse(text)) is None
+
+
+def travels(spec: ControllerSpec) -> bool:
     """Return whether other processes can be given a VUT: by name, or as a copy of the object.
 
     What the main module defines cannot be found there.

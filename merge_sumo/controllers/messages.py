@@ -1,99 +1,85 @@
 """Messages between a process that runs cases and the process that hosts their controller.
 
-Each request has one answer. While a request takes long, `Alive` says that it proceeds. Nothing is
-pickled: the hosting process runs a user's code, so what it sends is data of known types.
+Each request has one answer. While a request takes long, an answer of None says that it proceeds.
+Nothing is pickled: the hosting process runs a user's code, so what it sends is data of known types.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
+from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.signals import Left, as_signals
-
-MOST_BYTES: Final = 1 << 24
-"""Maximum size of a message."""
+from merge_sumo.scenario.signals import Left
 
 
-class Message(msgspec.Struct, tag=True, array_like=True):
-    """A request or an answer."""
+class HostRequest(msgspec.Struct, omit_defaults=True):
+    """Load a controller, make its drivers, let them act, list its files, or close them.
+
+    Attributes:
+        action: what to do.
+        kind: "MODULE:CLASS" of the kind of the controller to load.
+        spec: the controller to load.
+        deadline_s: time for one call of it.
+        corridors: number of corridors to make drivers for.
+        starts: episodes that begin before the drivers act, by corridor.
+        scene: arrays of the scene in which they act.
+    """
+
+    action: Literal["load", "make", "act", "files", "close"]
+    kind: str = ""
+    spec: ControllerSpec | None = None
+    deadline_s: float = 0.0
+    corridors: int = 0
+    starts: list[tuple[int, Start]] = []
+    scene: tuple[bytes | None, ...] = ()
 
 
-class Make(Message):
-    """Make the drivers of a number of corridors; the answer is `Made`."""
+class HostReply(msgspec.Struct, omit_defaults=True):
+    """The answer to a request.
 
-    corridors: int
+    Attributes:
+        failed: why the request failed; "" where it did not.
+        max_corridors: corridors that one driver can serve.
+        max_workers: processes that can have a driver.
+        files: files of code that were loaded so far.
+        parameters: those of the controllers that were made.
+        accelerations_mps2: answers of the drivers.
+        wishes: whether they wish to merge.
+        reasons: what is wrong with an answer, by corridor.
+        signals: signals of the answers, by corridor.
+    """
 
-
-class Act(Message):
-    """Begin episodes, by corridor, then act in a scene; the answer is `Acted`."""
-
-    starts: list[tuple[int, Start]]
-    scene: tuple[bytes | None, ...]
-
-
-class ListFiles(Message):
-    """List the code that was loaded; the answer is `Loaded`."""
-
-
-class Close(Message):
-    """Close the controllers; the answer is `Loaded`, and the process ends."""
-
-
-class Ready(Message):
-    """The controller is loaded, with what its kind knows of it; sent without a request."""
-
-    max_corridors: int | None
-    max_workers: int | None
-    files: list[bytes]
-
-
-class Made(Message):
-    """The controllers are made, with their parameters."""
-
-    parameters: dict[str, float]
-
-
-class Loaded(Message):
-    """Files of code that were loaded."""
-
-    files: list[bytes]
-
-
-class Failed(Message):
-    """The request failed, for a reason."""
-
-    reason: str
-
-
-class Alive(Message):
-    """The request proceeds from one controller to the next."""
-
-
-class Acted(Message):
-    """The answers of the controllers, with reasons and signals by corridor."""
-
-    accelerations_mps2: bytes
-    reasons: dict[int, str]
-    signals: dict[int, Left]
-    wishes: bytes | None
+    failed: str = ""
+    max_corridors: int | None = None
+    max_workers: int | None = None
+    files: list[bytes] = []
+    parameters: dict[str, float] = {}
+    accelerations_mps2: bytes = b""
+    wishes: bytes | None = None
+    reasons: dict[int, str] = {}
+    signals: dict[int, Left] = {}
 
     @classmethod
-    def of(cls, driver: ControllerDriver, scene: Scene) -> Acted:
+    def of(cls, driver: ControllerDriver, scene: Scene) -> HostReply:
         """Return what a driver answers to a scene."""
         answers, reasons = driver.act(scene), dict[int, str]()
         for corridor in np.flatnonzero(~np.isfinite(answers) & scene.active).tolist():
             if (reason := driver.reason(corridor)) is not None:
                 reasons[corridor] = reason
         wishes = driver.wishes()
-        packed = None if wishes is None else wishes.astype(np.int8).tobytes()
-        return cls(answers.tobytes(), reasons, dict(driver.signals()), packed)
+        return cls(
+            accelerations_mps2=answers.tobytes(),
+            wishes=None if wishes is None else wishes.astype(np.int8).tobytes(),
+            reasons=reasons,
+            signals=dict(driver.signals()),
+        )
 
     def numbers(self, corridors: int) -> tuple[FloatArray, NDArray[np.int8] | None]:
         """Return accelerations and wishes, (K,); ValueError for what no driver answers."""
@@ -105,10 +91,6 @@ class Acted(Message):
             raise ValueError("an answer has a number that is not a wish")
         return answers, wishes
 
-    def checked_signals(self) -> dict[int, Left]:
-        """Return the signals, bounded as those of any controller."""
-        return {corridor: as_signals(left) for corridor, left in self.signals.items()}
-
 
 _DTYPES: Final = (np.bool_, np.int64, np.float64, np.float64, np.int64, np.bool_)
 """Of the arrays of a `Scene`."""
@@ -116,22 +98,22 @@ _DTYPES: Final = (np.bool_, np.int64, np.float64, np.float64, np.int64, np.bool_
 
 def packed(scene: Scene) -> tuple[bytes | None, ...]:
     """Return the arrays of a scene as bytes."""
-    pairs = zip(scene, _DTYPES, strict=True)
-    return tuple(None if a is None else np.ascontiguousarray(a, t).tobytes() for a, t in pairs)
+    contents: list[bytes | None] = []
+    for array, dtype in zip(scene, _DTYPES, strict=True):
+        contents.append(None if array is None else np.ascontiguousarray(array, dtype).tobytes())
+    return tuple(contents)
 
 
-def unpacked(arrays: tuple[bytes | None, ...]) -> Scene:
+def unpacked(contents: tuple[bytes | None, ...]) -> Scene:
     """Return the scene of arrays as bytes."""
-    found: list[Any] = []
-    for content, dtype in zip(arrays, _DTYPES, strict=True):
-        found.append(None if content is None else np.frombuffer(content, dtype))
-    active, step, x_m, v_mps, facing, merged = found
+    arrays: list[Any] = []
+    for content, dtype in zip(contents, _DTYPES, strict=True):
+        arrays.append(None if content is None else np.frombuffer(content, dtype))
+    active, step, x_m, v_mps, facing, merged = arrays
     shape = -1, len(active)
     return Scene(active, step, x_m.reshape(shape), v_mps.reshape(shape), facing, merged)
 
 
 encode: Final = msgspec.msgpack.Encoder().encode
-decode_request: Final = msgspec.msgpack.Decoder(Make | Act | ListFiles | Close).decode
-decode_answer: Final = msgspec.msgpack.Decoder(
-    Ready | Made | Acted | Loaded | Failed | Alive
-).decode
+decode_request: Final = msgspec.msgpack.Decoder(HostRequest).decode
+decode_answer: Final = msgspec.msgpack.Decoder(HostReply | None).decode

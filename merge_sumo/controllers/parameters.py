@@ -1,113 +1,19 @@
-"""Parameters of a controller: the numbers that a spec sets, as in `my_vut.py:MyVut?gain=2`.
-
-A parameter of a controller in Python is a keyword of the constructor, or of the function, that is
-the controller. One that the constructor does not have is an attribute, with a number, that the
-object has once it is made.
-"""
+"""Ranges of the parameters of a controller, as `explain` varies them."""
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
-from inspect import Parameter
-from types import MemberDescriptorType
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
-
-from merge_sumo.controllers.base import VutSpec
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
+from merge_sumo.printable import quoted
+from merge_sumo.suggestions import meant
 
 DIGITS: Final = 3
 """A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
-MOST_DIGITS: Final = 100
-BY_NAME: Final = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
-
-
-class Parameters:
-    """How the parameters of a spec reach the objects of a controller.
-
-    Those that the constructor or the function knows are its keywords; the others are attributes
-    that an object is given after it was made.
-    """
-
-    def __init__(
-        self, target: Any, spec: VutSpec, given: Mapping[str, float], in_order: int
-    ) -> None:
-        """Sort `given` parameters of a class, a function or an object.
-
-        `in_order` arguments are given by their place. Raises `UserError` for a parameter that a
-        function does not have.
-        """
-        defaults: dict[str, Any] = {}
-        if isinstance(target, type) or inspect.isroutine(target):
-            with suppress(TypeError, ValueError):  # Python does not know the signature
-                known = list(inspect.signature(target).parameters.values())[in_order:]
-                defaults = {p.name: p.default for p in known if p.kind in BY_NAME}
-        self.spec = spec
-        self.keywords = {name: value for name, value in given.items() if name in defaults}
-        self.attributes = {name: value for name, value in given.items() if name not in defaults}
-        if self.attributes and inspect.isroutine(target):
-            raise spec.has_no(next(iter(self.attributes)), defaults)
-        both = defaults | self.keywords
-        self._numbers = {n: v for n, value in both.items() if (v := _number(value)) is not None}
-
-    def bound(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that has its keywords, and is called with what the VUT sees."""
-        if not self.keywords:
-            return function
-
-        def called(seen: Any) -> Any:
-            return function(seen, **self.keywords)
-
-        return called
-
-    def set_in(self, made: Any) -> Any:
-        """Give an object its attributes, and return it; `UserError` where it has none of them."""
-        if self.attributes:
-            present = self.present(made)
-            for name, value in self.attributes.items():
-                if name not in present:
-                    raise self.spec.has_no(name, present)
-                try:
-                    setattr(made, name, value)
-                except Exception as error:
-                    raise UserError(f"{self.spec}: {name} cannot be set") from error
-        return made
-
-    def present(self, made: Any) -> dict[str, float]:
-        """Return all parameters of an object, or of a function, that have a number."""
-        return ({} if inspect.isroutine(made) else _attributes(made)) | self._numbers
-
-
-def _attributes(made: Any) -> dict[str, float]:
-    """Return the public attributes of an object that are numbers; no code of it runs."""
-    try:
-        names = set(object.__getattribute__(made, "__dict__"))
-    except AttributeError:
-        names = set()
-    for owner in type(made).__mro__:
-        names |= set(vars(owner))
-    found: dict[str, float] = {}
-    for name in sorted(names, key=str):
-        value = inspect.getattr_static(made, name, None)
-        if isinstance(value, MemberDescriptorType):  # of __slots__
-            value = getattr(made, name, None)
-        number = _number(value)
-        if number is not None and not name.startswith("_"):
-            found[name] = number
-    return found
-
-
-def _number(value: Any) -> float | None:
-    """Return a value as a number; None for what is no finite one."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        return None
-    number = value.item() if isinstance(value, np.generic) else value
-    return number if math.isfinite(number) else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,4 +47,33 @@ class Range:
     @property
     def digits(self) -> int:
         """Digits behind the point of a rounded value."""
-        return min(max(0, DIGITS - math.floor(math.log10(self.high - self.low))), MOST_DIGITS)
+        return min(max(0, DIGITS - math.floor(math.log10(self.high - self.low))), 100)
+
+
+def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, float]:
+    """Return the present values of the parameters of some ranges, by name.
+
+    Raises `UserError` where one is unknown, named twice, or out of its range.
+    """
+    known = controller.parameters() if ranges else {}
+    values: dict[str, float] = {}
+    for each in ranges:
+        name = each.name
+        if name in values:
+            raise UserError(f"`params` {name} is given twice: give each parameter once")
+        if name not in known and controller.vut_type is not None:
+            named = quoted(str(controller.spec.with_values({name: each.low})))
+            raise UserError(
+                f"`params` {name}: its value today is not known; name it, as in `vut` {named}"
+            )
+        if name not in known:
+            hint = meant(name, known)
+            choice = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
+            raise UserError(f"`params` {name}: {controller.spec} has no such parameter: {choice}")
+        if not each.low <= known[name] <= each.high:
+            raise UserError(
+                f"`params` {name}={each.low:g}..{each.high:g}: it is {known[name]:g} today, "
+                "which is not in that range: give a range around it"
+            )
+        values[name] = float(known[name])
+    return values

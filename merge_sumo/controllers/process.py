@@ -1,24 +1,33 @@
-"""A controller that is a program: started, watched and stopped; what it prints is kept in a log."""
+"""Processes that run a controller: started, watched and stopped; what they print is kept in a log.
+
+`Program` is a user's own program. `ChildProcess` runs a function of this package, which answers
+messages.
+"""
 
 from __future__ import annotations
 
-import itertools
 import os
 import shlex
 import shutil
 import signal
+import socket
 import stat
+import struct
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Any, Final
 
 from merge_sumo.errors import UserError
-from merge_sumo.printable import counted, printable
+from merge_sumo.limits import lower_limits
+from merge_sumo.printable import printable
 from merge_sumo.scenario.trajectory import as_reason
+from merge_sumo.scratch import ScratchFolder
+from merge_sumo.spawning import end_with, python_command
 
 LOG: Final = "controller.log"
 """In the folder of a campaign."""
@@ -28,68 +37,40 @@ MOST_BYTES: Final = 4 << 20
 KEPT_BYTES: Final = 1 << 20
 PENDING_BYTES: Final = 1 << 16
 """What is kept of what is printed before the folder of the log is there."""
-LINE_BYTES: Final = 200
 PATIENCE_S: Final = 1.0
 """Time that the end of what is printed has to come."""
-_CAREFUL: Final = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-"""Whatever stands in the place of a log is neither followed nor waited for."""
-
-
-class Echo:
-    """What the starts of a program print, on standard error: once what they print alike."""
-
-    def __init__(self) -> None:
-        self._last, self._again = b"", 0
-        self._text = self._held = b""
-
-    def close(self) -> None:
-        """Say how often the last was printed again."""
-        if self._again:
-            sys.stderr.write(f"(printed {counted(self._again, 'more time')})\n")
-        self._again = 0
-
-    def show(self, part: bytes) -> None:
-        """Show what a start prints, from where it differs from the start before."""
-        self._text, self._held = (self._text + part)[:PENDING_BYTES], self._held + part
-        if len(self._text) == PENDING_BYTES or not self._last.startswith(self._text):
-            self._write()
-
-    def end(self) -> None:
-        """Take note that a start has printed all."""
-        if self._held and self._held == self._last:
-            self._again += 1
-        else:
-            self._write()
-            self._last = self._text or self._last
-        self._text = self._held = b""
-
-    def _write(self) -> None:
-        if self._held:
-            self.close()
-            sys.stderr.write(self._held.decode("utf-8", errors="replace"))
-        self._held = b""
+LINES: Final = 40
+"""Of the end of a log that is shown."""
+LINE_BYTES: Final = 200
 
 
 class Output:
-    """Reads what a program prints until it ends, so that a full pipe never holds it up.
+    """Reads what a process prints until it ends, so that a full pipe never holds it up.
 
     Attributes:
         log: file to which it is added; None shows it on standard error. A log that is set later
             has what was printed before, too.
+        tail: the last bytes that were printed.
     """
 
-    def __init__(self, pipe: IO[bytes], log: Path | None, echo: Echo) -> None:
-        """Read a pipe; what comes goes to `log`, or to `echo` where that is None."""
-        self.log = log
-        self._pipe, self._echo = pipe, echo
-        self._tail = self._pending = b""
+    def __init__(self, pipe: IO[bytes], log: Path | None, *, is_shown: bool = True) -> None:
+        """Read a pipe.
+
+        Args:
+            pipe: what the process prints.
+            log: file to which it is added.
+            is_shown: whether it is shown where there is no log.
+        """
+        self.log, self.tail = log, b""
+        self._pipe, self._is_shown = pipe, is_shown
+        self._pending = b""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
     def last_line(self) -> str:
         """Return the last line that was printed, after a little wait for the end; "" for none."""
         self.close()
-        lines = self._tail.decode("utf-8", errors="replace").strip().splitlines()
+        lines = self.tail.decode("utf-8", errors="replace").strip().splitlines()
         return as_reason(lines[-1]) if lines else ""
 
     def close(self) -> None:
@@ -99,52 +80,55 @@ class Output:
     def _read(self) -> None:
         with self._pipe as pipe:
             while part := os.read(pipe.fileno(), 1 << 16):
-                self._tail = (self._tail + part)[-TAIL_BYTES:]
+                self.tail = (self.tail + part)[-TAIL_BYTES:]
                 self._pending = (self._pending + part)[-PENDING_BYTES:]
-                if self.log is None:
-                    self._echo.show(part)
-                else:
-                    self._keep(self.log)
-        self._echo.end()
-        if self.log is not None:
-            self._keep(self.log)
+                if self.log is None and self._is_shown:
+                    sys.stderr.write(part.decode("utf-8", errors="replace"))
+                self._keep()
+        self._keep()
 
-    def _keep(self, log: Path) -> None:
-        if self._pending and log.parent.is_dir():
+    def _keep(self) -> None:
+        if self.log is not None and self._pending and self.log.parent.is_dir():
             with suppress(OSError):  # a full disk costs what was printed, not the campaign
-                append(log, self._pending)
+                append(self.log, self._pending)
             self._pending = b""
 
 
-LINES: Final = 40
-"""Of the end of a log that is shown."""
+def _opened(log: Path, flags: int) -> IO[bytes] | None:
+    """Open a log; None where something else is in its place, which is not followed or waited for.
+
+    Raises OSError where it cannot be opened.
+    """
+    careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    descriptor = os.open(log, flags | careful, 0o644)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb" if flags == os.O_RDONLY else "r+b", buffering=0)
+    os.close(descriptor)
+    return None
 
 
 def end_of(log: Path) -> str:
     """Return the last lines of a log, printable; "" where there is no such file."""
-    try:
-        descriptor = os.open(log, os.O_RDONLY | _CAREFUL)
-        with os.fdopen(descriptor, "rb") as file:
-            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                return ""
-            file.seek(max(file.seek(0, os.SEEK_END) - LINES * LINE_BYTES, 0))
-            text = file.read(LINES * LINE_BYTES).decode("utf-8", errors="replace")
-    except OSError:
-        return ""
-    return "\n".join(printable(line) for line in text.splitlines()[-LINES:])
+    text = ""
+    with suppress(OSError):
+        file = _opened(log, os.O_RDONLY)
+        if file is not None:
+            with file:
+                file.seek(max(file.seek(0, os.SEEK_END) - LINES * LINE_BYTES, 0))
+                text = file.read(LINES * LINE_BYTES).decode("utf-8", errors="replace")
+    return "\n".join(map(printable, text.splitlines()[-LINES:]))
 
 
 def append(log: Path, content: bytes) -> None:
     """Add to a log, from whichever of several processes; OSError when that cannot be done."""
-    flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | _CAREFUL
-    descriptor = os.open(log, flags, 0o644)
-    with os.fdopen(descriptor, "r+b", buffering=0) as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            return
+    opened = _opened(log, os.O_RDWR | os.O_CREAT | os.O_APPEND)
+    if opened is None:
+        return
+    with opened as file:
         if sys.platform != "win32":  # several processes may write
             import fcntl
 
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+            fcntl.flock(file, fcntl.LOCK_EX)
         file.write(content)
         size = file.seek(0, os.SEEK_END)
         if size > MOST_BYTES:
@@ -154,10 +138,172 @@ def append(log: Path, content: bytes) -> None:
             file.write(b"[what was printed before is gone]\n" + end)
 
 
-PORT_FIELD: Final = "{port}"
-PORT_VARIABLE: Final = "MERGE_SUMO_PORT"
-GRACE_S: Final = 2.0
-"""Time that a program has to end by itself before it is killed."""
+MOST_MESSAGE_BYTES: Final = 1 << 24
+BROKEN: Final = "broke the channel to its process"
+ENDING_S: Final = 2.0
+"""Time that a process has to end by itself."""
+
+
+class ProcessDiedError(Exception):
+    """A process ended, for a reason; `hung` if it was killed for its silence."""
+
+    def __init__(self, reason: str, *, hung: bool = False) -> None:
+        super().__init__(reason)
+        self.hung = hung
+
+
+class ChildProcess:
+    """A Python process that answers messages, and ends with this process.
+
+    Attributes:
+        alive: whether messages can be sent.
+        output: what it prints.
+    """
+
+    alive = False
+
+    def __init__(
+        self,
+        main: str,
+        settings: Mapping[str, Any],
+        folder: ScratchFolder,
+        environment: Mapping[str, str],
+        *,
+        cwd: str | None = None,
+        log: Path | None = None,
+        is_shown: bool = True,
+    ) -> None:
+        """Start a process.
+
+        Args:
+            main: "MODULE:FUNCTION" of this package, which gets its connection by `connected`.
+            settings: argument of the function.
+            folder: is removed when the process ends.
+            environment: of the process.
+            cwd: its working folder, by default that of this process.
+            log: file to which what it prints is added.
+            is_shown: whether what it prints is shown where there is no log.
+
+        Raises:
+            UserError: if no process can be started.
+        """
+        self._folder = folder
+        self._socket, theirs = socket.socketpair()
+        self._patience_s = 0.0
+        their_lifeline, self._lifeline = os.pipe()
+        inherited = {"lifeline": their_lifeline, "connection": theirs.fileno()}
+        try:
+            self._process = subprocess.Popen(
+                python_command(main, {**settings, **inherited}),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                pass_fds=tuple(inherited.values()),
+                cwd=cwd,
+                env=environment,
+                # Ctrl-C in a terminal is for this process, which then ends the other.
+                start_new_session=True,
+            )
+        except OSError as error:
+            self._socket.close()
+            os.close(self._lifeline)
+            folder.cleanup()
+            raise UserError(f"cannot start a process for the VUT: {error.strerror}") from error
+        finally:
+            theirs.close()
+            os.close(their_lifeline)
+        self.alive = True
+        self._connection = Connection(os.dup(self._socket.fileno()))
+        assert self._process.stdout is not None  # noqa: S101 (piped)
+        self.output = Output(self._process.stdout, log, is_shown=is_shown)
+
+    def ask(self, content: bytes, patience_s: float) -> bytes:
+        """Send a message, and return the answer; see `receive`."""
+        try:
+            self._connection.send_bytes(content)
+        except OSError:
+            raise self._died() from None
+        return self.receive(patience_s)
+
+    def receive(self, patience_s: float) -> bytes:
+        """Return the next message.
+
+        Args:
+            patience_s: time for it to come; also for each of its parts, where it is sent in parts.
+
+        Raises:
+            ProcessDiedError: if it does not come in time or the process ended; it is then killed.
+        """
+        if patience_s != self._patience_s:
+            self._patience_s = patience_s
+            time_us = int(1e6 * min(max(patience_s, 0.01), 1e9))  # 0 would be for ever
+            time = struct.pack("ll", *divmod(time_us, 1_000_000))
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time)
+        try:
+            return self._connection.recv_bytes(MOST_MESSAGE_BYTES)
+        except BlockingIOError:
+            if self._process.poll() is not None:
+                raise self._died() from None
+            self.kill()
+            raise ProcessDiedError("does not answer", hung=True) from None
+        except (EOFError, OSError):
+            raise self._died() from None
+        except BaseException:  # Ctrl-C, too: the answer is awaited no longer
+            self.kill()
+            raise
+
+    def ended(self) -> int | None:
+        """Wait a little for the process to end; return its exit code, None where it goes on."""
+        with suppress(subprocess.TimeoutExpired):
+            return self._process.wait(ENDING_S)
+        return None
+
+    def kill(self) -> None:
+        """End the process, and what it started."""
+        if not self.alive:
+            return  # what its descriptors were may be others' by now
+        self.alive = False
+        self._connection.close()
+        self._socket.close()
+        os.close(self._lifeline)
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self.output.close()
+        self._folder.cleanup()
+
+    def __del__(self) -> None:
+        """End a process that nothing refers to."""
+        self.kill()
+
+    def _died(self) -> ProcessDiedError:
+        """End the process; return how it ended."""
+        code = self.ended()
+        self.kill()
+        if code is None:  # it closed the connection and goes on
+            return ProcessDiedError(BROKEN)
+        if code >= 0:
+            return ProcessDiedError(f"ended its process with exit code {code}")
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:  # a real-time signal
+            name = "unknown"
+        return ProcessDiedError(f"ended its process by signal {-code} ({name})")
+
+
+def connected(settings: Mapping[str, Any], **limits: int) -> Connection:
+    """Return the connection of a process that a `ChildProcess` started, in that process.
+
+    Args:
+        settings: argument of its main function.
+        limits: of the system for this process, as RLIMIT_DATA.
+    """
+    lower_limits(**limits, RLIMIT_CORE=0)
+    end_with(settings["lifeline"])
+    inherited = settings["connection"]
+    connection = Connection(os.dup(inherited))  # not inherited by what a controller starts
+    os.close(inherited)
+    return connection
 
 
 def split_command(command: str) -> list[str]:
@@ -174,10 +320,6 @@ def split_command(command: str) -> list[str]:
     return arguments
 
 
-CODE_FOLLOWS: Final = ("-c", "-e", "-m")
-"""Behind these an interpreter is given its code by name or as a text."""
-
-
 def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     """Return the files of a command that are code: others are what it reads and writes.
 
@@ -187,26 +329,39 @@ def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     program, *others = arguments
     words = [program]
     if shutil.which(Path(program).name) is not None:
-        options = itertools.takewhile(lambda word: word not in CODE_FOLLOWS, others)
-        words += itertools.islice(filter(os.path.isfile, options), 1)
+        for word in others:
+            if word in ("-c", "-e", "-m"):  # the code follows by name or as a text
+                break
+            if os.path.isfile(word):  # noqa: PTH113 (any text)
+                words.append(word)
+                break
     return tuple(filter(Path.is_file, map(Path, words)))
 
 
 class Program:
     """A running program in a process group of its own; what it prints goes to a log."""
 
-    def __init__(self, arguments: list[str], port: int, log: Path | None, echo: Echo) -> None:
-        """Start it, told the port as `{port}` in its arguments and by the environment.
+    def __init__(
+        self, arguments: list[str], port: int, log: Path | None, *, is_shown: bool = True
+    ) -> None:
+        """Start it.
 
-        What it prints goes to `log`, or to `echo` where that is None.
+        Args:
+            arguments: its command, in which `{port}` stands for the port.
+            port: where it is to connect, also in MERGE_SUMO_PORT.
+            log: file to which what it prints is added.
+            is_shown: whether it is shown where there is no log.
+
+        Raises:
+            UserError: if it cannot be started.
         """
         try:
             self._process = subprocess.Popen(
-                [argument.replace(PORT_FIELD, str(port)) for argument in arguments],
+                [argument.replace("{port}", str(port)) for argument in arguments],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, PORT_VARIABLE: str(port)},
+                env={**os.environ, "MERGE_SUMO_PORT": str(port)},
                 start_new_session=True,
             )
         except OSError as error:
@@ -214,7 +369,7 @@ class Program:
                 f"the command {arguments[0]!r} cannot be started: {error.strerror}"
             ) from error
         assert self._process.stdout is not None, "piped"  # noqa: S101
-        self._output = Output(self._process.stdout, log, echo)
+        self._output = Output(self._process.stdout, log, is_shown=is_shown)
         self.process = self._process.pid
         """Id of its process, which is that of its session."""
 
@@ -235,7 +390,7 @@ class Program:
         except subprocess.TimeoutExpired:
             self._signal(signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
-                self._process.wait(GRACE_S)
+                self._process.wait(ENDING_S)
         finally:
             # The group, because a program may have started others that are left.
             self._signal(signal.SIGKILL)

@@ -7,8 +7,10 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -17,7 +19,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
 from merge_sumo.controllers.controller import (
     Controller,
     ControllerArray,
@@ -27,8 +28,17 @@ from merge_sumo.controllers.controller import (
     WrongAnswerError,
 )
 from merge_sumo.controllers.deadline import Deadline, closed, text_of
-from merge_sumo.controllers.parameters import Parameters
-from merge_sumo.controllers.signatures import check_call, check_methods, fits, takes_seed
+from merge_sumo.controllers.signatures import (
+    attributes_of,
+    check_call,
+    check_methods,
+    defaults_of,
+    fits,
+    is_code,
+    number_of,
+    takes_seed,
+)
+from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.registry import entries_of
@@ -38,24 +48,22 @@ from merge_sumo.scenario.signals import Left, as_signals
 from merge_sumo.source_files import module_of_file
 from merge_sumo.trust import check_code
 
-GROUP: Final = "merge_sumo.vuts"
-"""Entry points of this group are VUTs by their name."""
+objects: Final[dict[str, Any]] = {}
+"""The objects of this process that are controllers, by the arguments of their specs."""
+
+
+def object_of(spec: ControllerSpec) -> Any:
+    """Return the object that a spec names; None for a spec that every process can load."""
+    return objects.get(spec.argument) if spec.kind == HERE else None
 
 
 def installed_vuts() -> dict[str, EntryPoint]:
     """Return the VUTs that installed packages register, by name."""
-    return {name: entry for name, found in entries_of(GROUP).items() for entry in found.values()}
-
-
-def is_code(target: Any) -> bool:
-    """Return whether something is a class or a function, and no other object."""
-    return isinstance(target, type) or inspect.isroutine(target)
-
-
-NO_VUT: Final = (
-    "a VUT is a class with `act(self, seen)`, a class with `act_batch(self, seen)`, or a function "
-    "`f(seen)`"
-)
+    vuts: dict[str, EntryPoint] = {}
+    for name, entries in entries_of("merge_sumo.vuts").items():
+        for entry in entries.values():
+            vuts[name] = entry
+    return vuts
 
 
 class OfPython(ControllerKind):
@@ -63,27 +71,38 @@ class OfPython(ControllerKind):
 
     Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
     in all corridors at once is not copied, unless parameters are given.
+
+    A parameter is a keyword of the constructor, or of the function. One that the constructor does
+    not have is an attribute, with a number, that the object has once it is made.
     """
 
     asks_sumo = False
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
-        """Check the target; `UserError` where it cannot be called as a VUT is."""
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+        """Check the target and the parameters; `UserError` where it cannot be called as a VUT."""
         super().__init__(spec, options)
-        self._given = spec.numbers()
         self._target = target = self.target()
-        if inspect.isroutine(target):
+        self._is_function, self._is_class = inspect.isroutine(target), isinstance(target, type)
+        if self._is_function:
             check_call(target, ("seen",))
         else:
             check_methods(target)
-        self._is_class = isinstance(target, type)
         self._is_batched = callable(getattr(target, "act_batch", None))
-        self._acts = callable(getattr(target, "act", None))
-        called = not self._is_class and callable(target) and fits(target, 1)
-        if not (self._is_batched or self._acts or called):
+        acts = self._is_batched or callable(getattr(target, "act", None))
+        if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
             raise self.refused(target)
-        in_order = int(not self._is_class or self._is_batched)
-        self._parameters = Parameters(target, spec, self._given, in_order)
+        by_place = int(not self._is_class or self._is_batched)  # what is seen, or the corridors
+        defaults = defaults_of(target, by_place)
+        self._keywords: dict[str, float] = {}
+        self._attributes: dict[str, float] = {}
+        for name, value in spec.numbers().items():
+            (self._keywords if name in defaults else self._attributes)[name] = value
+        if self._attributes and self._is_function:
+            raise spec.has_no(next(iter(self._attributes)), defaults)
+        self._numbers: dict[str, float] = {}
+        for name, value in (defaults | self._keywords).items():
+            if (number := number_of(value)) is not None:
+                self._numbers[name] = number
 
     def target(self) -> Any:
         """Return the class, function or object; `UserError` where it cannot be loaded."""
@@ -91,47 +110,56 @@ class OfPython(ControllerKind):
 
     def refused(self, target: Any) -> UserError:
         """Return the error for a target that is not a VUT."""
-        return UserError(f"{self.spec} is {text_of(target, repr)[:80]}: {NO_VUT}")
+        return UserError(
+            f"{self.spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)` "
+            "or `act_batch(self, seen)`, or a function `f(seen)`"
+        )
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
-        return PythonController(self._new(), self._parameters, acts=self._acts)
+        return PythonController(self.make(), self.present)
 
     def driver(self, corridors: int, _world: object) -> Driver:
         """Return the driver of all corridors."""
-        deadline_s = self.options.deadline_s
         if self._is_batched:
-            new = lambda: self._new(corridors)  # noqa: E731
-            return BatchedVut(corridors, new, deadline_s, self._parameters)
-        return ControllerArray(corridors, self.controller, deadline_s)
+            return BatchedVut(corridors, self)
+        return ControllerArray(corridors, self.controller, self.options.deadline_s)
 
-    def _new(self, *corridors: int) -> Any:
+    def make(self, *corridors: int) -> Any:
         """Return a new object, made with the number of corridors where it acts in all of them."""
-        parameters, target = self._parameters, self._target
-        if inspect.isroutine(target):
-            return parameters.bound(target)
-        if self._is_class:
-            return parameters.set_in(self._made(*corridors))
-        return parameters.set_in(target if self._is_batched and not self._given else self._copy())
-
-    def _made(self, *corridors: int) -> Any:
+        target = self._target
+        if self._is_function:
+            return partial(target, **self._keywords) if self._keywords else target
         try:
-            return self._target(*corridors, **self._parameters.keywords)
+            if self._is_class:
+                made = target(*corridors, **self._keywords)
+            elif self._is_batched and not self._attributes:
+                return target
+            else:
+                made = copy.deepcopy(target)
         except (Exception, SystemExit) as error:
+            if not self._is_class:
+                raise UserError(
+                    f"{self.spec} cannot be copied for the episodes that run at a time "
+                    f"({text_of(error)}): give its class, or a function that makes no difference "
+                    "between them"
+                ) from error
             given = f" with {corridors[0]} corridors" if corridors else " without arguments"
             what = f"{type(error).__name__}: {text_of(error)}"
             raise UserError(f"{self.spec} cannot be made{given}: {what}") from error
+        present = self.present(made) if self._attributes else {}
+        for name, value in self._attributes.items():
+            if name not in present:
+                raise self.spec.has_no(name, present)
+            try:
+                setattr(made, name, value)
+            except Exception as error:
+                raise UserError(f"{self.spec}: {name} cannot be set") from error
+        return made
 
-    def _copy(self) -> Any:
-        """Return a copy of the object as it was given: no episode changes that of another."""
-        try:
-            return copy.deepcopy(self._target)
-        except Exception as error:
-            raise UserError(
-                f"{self.spec} cannot be copied for the episodes that run at a time "
-                f"({text_of(error)}): give its class, or a function that makes no difference "
-                "between them"
-            ) from error
+    def present(self, made: Any) -> dict[str, float]:
+        """Return the parameters of a made object, or of the function, with their values."""
+        return ({} if self._is_function else attributes_of(made)) | self._numbers
 
 
 class PythonKind(OfPython):
@@ -141,12 +169,6 @@ class PythonKind(OfPython):
     what = "a class with act(seen), a function of seen, or a batched class"
     example = "--vut my_vut.py:MyVut"
     hosted = True
-
-    @classmethod
-    def file_of(cls, argument: str) -> str:
-        """Return the file that an argument names."""
-        source = argument.rpartition(":")[0]
-        return source if source.endswith(".py") else ""
 
     def target(self) -> Any:
         """Return what the module has by that name."""
@@ -164,7 +186,7 @@ class PythonKind(OfPython):
         if not is_code(target):
             raise self.refused(target)
         if file := getattr(module, "__file__", None):
-            self.files = (Path(file),)
+            self.code = (Path(file),)
         return target
 
 
@@ -173,19 +195,53 @@ class InstalledKind(PythonKind):
 
     form = what = example = ""
 
-    @classmethod
-    def file_of(cls, _argument: str) -> str:
-        """Return that a name is not a file."""
-        return ""
-
     def target(self) -> Any:
         """Return what the package registers."""
         name = self.spec.argument
         try:
             target = installed_vuts()[name].load()
         except (Exception, SystemExit) as error:
-            raise UserError(_cannot_load(name, error)) from error
+            raise _cannot_load(name, error) from error
         return self.code_of(target, sys.modules.get(getattr(target, "__module__", "")))
+
+
+class HereKind(OfPython):
+    """An object of this process, `here:NAME`, which drives in the process of the cases."""
+
+    files_are_known = False
+
+    def target(self) -> Any:
+        """Return the object; `UserError` where that was an object of another process."""
+        if self.spec.argument not in objects:
+            raise UserError(
+                f"{self.spec} was an object of a Python process: name a VUT, or give the object "
+                "again"
+            )
+        target = objects[self.spec.argument]
+        try:
+            file = inspect.getsourcefile(target if is_code(target) else type(target))
+        except (TypeError, OSError):
+            file = None
+        if file and Path(file).is_file():
+            self.code = (Path(file),)
+        return target
+
+    def refused(self, target: Any) -> UserError:
+        """Return the error for an object that is not a VUT."""
+        return UserError(
+            f"{text_of(target, repr)[:80]} is no VUT: give a spec, a class or an object with "
+            "`act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
+        )
+
+    def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
+        """Travel with the object."""
+        load, arguments = super().__reduce__()
+        return _with_object, (self._target, load, arguments)
+
+
+def _with_object(target: Any, load: Callable[..., HereKind], arguments: tuple[Any, ...]) -> Any:
+    objects[arguments[1].argument] = target
+    return load(*arguments)
 
 
 class PythonController(Controller):
@@ -195,12 +251,13 @@ class PythonController(Controller):
     function has nothing to reset.
     """
 
-    def __init__(self, thing: Any, parameters: Parameters, *, acts: bool) -> None:
-        """Drive by a thing; `acts` says whether it has `act`."""
-        self._thing, self._parameters = thing, parameters
-        self._act = thing.act if acts else thing
+    def __init__(self, thing: Any, present: Callable[[Any], dict[str, float]]) -> None:
+        """Drive by a thing; `present` gives its parameters."""
+        self._thing, self._present = thing, present
+        self._act: Callable[[Seen], Any] = getattr(thing, "act", thing)
         self._reset = getattr(thing, "reset", None)
-        self.single_use = self._reset is None and not inspect.isroutine(thing)
+        is_function = inspect.isroutine(thing) or isinstance(thing, partial)
+        self.single_use = self._reset is None and not is_function
 
     def reset(self, start: Start) -> None:
         """Call `reset`, if there is one."""
@@ -218,7 +275,7 @@ class PythonController(Controller):
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
-        return self._parameters.present(self._thing)
+        return self._present(self._thing)
 
     def close(self) -> None:
         """Call `close`, if there is one."""
@@ -233,25 +290,11 @@ class BatchedVut(ControllerDriver):
     or `reset(corridor, seen, seed)`, and `close()`.
     """
 
-    def __init__(
-        self,
-        corridors: int,
-        new: Callable[[], Any],
-        deadline_s: float,
-        parameters: Parameters,
-    ) -> None:
-        """Make the object.
-
-        Args:
-            corridors: number of corridors.
-            new: makes an object.
-            deadline_s: time for one call.
-            parameters: its parameters.
-        """
+    def __init__(self, corridors: int, kind: OfPython) -> None:
+        """Make the object of a kind."""
         super().__init__(corridors)
-        self._deadline = Deadline(deadline_s)
-        self._new, self._parameters = new, parameters
-        self._object = new()
+        self._kind, self._deadline = kind, Deadline(kind.options.deadline_s)
+        self._object = kind.make(corridors)
         self._replace = False
         self._raised: str | None = None
         self._wrong: dict[int, str] = {}
@@ -269,7 +312,7 @@ class BatchedVut(ControllerDriver):
             with self._deadline as deadline:
                 deadline.start()
                 if self._replace:
-                    self._object, self._replace = self._new(), False
+                    self._object, self._replace = self._kind.make(self.corridors), False
                 reset = getattr(self._object, "reset", None)
                 if reset is not None:
                     _reset(reset, corridor, start.seen, seed=start.seed)
@@ -317,7 +360,7 @@ class BatchedVut(ControllerDriver):
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
-        return self._parameters.present(self._object)
+        return self._kind.present(self._object)
 
     def reason(self, corridor: int) -> str | None:
         """Return what went wrong in a corridor."""
@@ -325,7 +368,7 @@ class BatchedVut(ControllerDriver):
 
     def close(self) -> None:
         """Call `close`, if there is one."""
-        closed(self._deadline.deadline_s, lambda: _close(self._object))
+        closed(self._deadline.deadline_s, partial(_close, self._object))
 
 
 @dataclass(frozen=True, slots=True)
@@ -395,26 +438,38 @@ def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
         reset(*arguments)
 
 
+@contextmanager
+def _working_folder_in_path() -> Iterator[None]:
+    """Let modules in the working folder be imported, as a user who starts Python there expects."""
+    folder = str(Path.cwd())
+    if folder in sys.path:
+        yield
+        return
+    sys.path.append(folder)
+    try:
+        yield
+    finally:
+        sys.path.remove(folder)
+
+
 def _module_of(source: str) -> ModuleType:
     """Return the module of a file or of a name; `UserError` where it cannot be loaded."""
-    is_file = source.endswith(".py")
-    # A program does not look for modules in the folder where it is started; a person does.
-    if not is_file and str(Path.cwd()) not in sys.path:
-        sys.path.append(str(Path.cwd()))
     try:
-        if is_file:
+        if source.endswith(".py"):
+            check_code(Path(source))
             return module_of_file(Path(source))
-        found = importlib.util.find_spec(source.partition(".")[0])
-        if found is not None and found.has_location and found.origin is not None:
-            check_code(Path(found.origin))
-        return importlib.import_module(source)
+        with _working_folder_in_path():
+            found = importlib.util.find_spec(source.partition(".")[0])
+            if found is not None and found.has_location and found.origin is not None:
+                check_code(Path(found.origin))
+            return importlib.import_module(source)
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        if is_file and isinstance(error, OSError):
+        if source.endswith(".py") and isinstance(error, OSError):
             raise UserError(f"cannot read the VUT {source}: {error.strerror}") from error
-        raise UserError(_cannot_load(source, error)) from error
+        raise _cannot_load(source, error) from error
 
 
-def _cannot_load(what: str, error: BaseException) -> str:
-    return f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}"
+def _cannot_load(what: str, error: BaseException) -> UserError:
+    return UserError(f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}")

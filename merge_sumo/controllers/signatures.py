@@ -1,13 +1,21 @@
-"""Whether a class, object or function can be called as VUTs are; if not, its file and line."""
+"""How a class, a function or an object is called, and which numbers it has.
+
+A VUT that cannot be called is refused by a sentence with the file and line of its method.
+"""
 
 from __future__ import annotations
 
 import inspect
+import math
 import os
 from collections.abc import Callable
 from functools import partial
+from inspect import Parameter
 from pathlib import Path
+from types import MemberDescriptorType
 from typing import Any, Final
+
+import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable
@@ -17,24 +25,23 @@ OF_A_BATCH: Final = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "clo
 """Methods of a VUT, and what each is called with; a `reset` may have a `seed` besides."""
 
 
+def is_code(target: Any) -> bool:
+    """Return whether something is a class or a function, and no other object."""
+    return isinstance(target, type) or inspect.isroutine(target)
+
+
 def check_methods(vut: Any) -> None:
     """Raise `UserError` where a method of a class or object cannot be called as a VUT's is.
 
-    The sentence names the file and line of the method. Methods whose signature Python does not know
-    are left alone, as are attributes that are no methods.
+    Only plain methods are checked: what else is called fails when it is called.
     """
+    owner = vut if isinstance(vut, type) else type(vut)
     batched = callable(getattr(vut, "act_batch", None))
     for name, arguments in (OF_A_BATCH if batched else OF_ONE).items():
-        method = inspect.getattr_static(vut, name, None)
-        first: tuple[str, ...] = ("self",)
-        if isinstance(method, staticmethod | classmethod):
-            first = ("cls",) if isinstance(method, classmethod) else ()
-            method = method.__func__
-        elif not isinstance(vut, type) and name in getattr(vut, "__dict__", {}):
-            first = ()  # an attribute of the object is called as it is
+        method = inspect.getattr_static(owner, name, None)
         if inspect.isfunction(method):
             seeded = name == "reset" and takes_seed(method)
-            check_call(method, (*first, *arguments), seeded=seeded)
+            check_call(method, ("self", *arguments), seeded=seeded)
 
 
 def takes_seed(reset: Callable[..., Any]) -> bool:
@@ -48,9 +55,12 @@ def takes_seed(reset: Callable[..., Any]) -> bool:
 def check_call(
     function: Callable[..., Any], arguments: tuple[str, ...], *, seeded: bool = False
 ) -> None:
-    """Raise `UserError` where a function cannot be called with so many arguments in order.
+    """Raise `UserError` where a function cannot be called with some arguments in order.
 
-    One that is `seeded` is called with `seed` besides.
+    Args:
+        function: what is called.
+        arguments: names of the arguments, for the sentence.
+        seeded: whether it is called with the keyword `seed` besides.
     """
     known = partial(function, seed=0) if seeded else function
     if fits(known, len(arguments)) is not False:
@@ -82,3 +92,50 @@ def _place(function: Callable[..., Any]) -> str:
     path = os.path.relpath(code.co_filename)
     path = code.co_filename if path.startswith(os.pardir) else path
     return f"{path}:{code.co_firstlineno}: "
+
+
+def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
+    """Return the keywords of a class or function with their defaults; {} for another object.
+
+    Args:
+        target: the class, function or object.
+        by_place: number of its first arguments that are given by their place.
+    """
+    defaults: dict[str, Any] = {}
+    if not is_code(target):
+        return defaults
+    try:
+        parameters = list(inspect.signature(target).parameters.values())
+    except (TypeError, ValueError):  # Python does not know the signature
+        return defaults
+    for parameter in parameters[by_place:]:
+        if parameter.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
+            defaults[parameter.name] = parameter.default
+    return defaults
+
+
+def attributes_of(made: Any) -> dict[str, float]:
+    """Return the public attributes of an object that are numbers; no code of it runs."""
+    try:
+        names = set(object.__getattribute__(made, "__dict__"))
+    except AttributeError:
+        names = set()
+    for owner in type(made).__mro__:
+        names |= set(vars(owner))
+    found: dict[str, float] = {}
+    for name in sorted(names, key=str):
+        value = inspect.getattr_static(made, name, None)
+        if isinstance(value, MemberDescriptorType):  # of __slots__
+            value = getattr(made, name, None)
+        number = number_of(value)
+        if number is not None and not name.startswith("_"):
+            found[name] = number
+    return found
+
+
+def number_of(value: Any) -> float | None:
+    """Return a value as a number; None for what is not a finite one."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    number = value.item() if isinstance(value, np.generic) else value
+    return number if math.isfinite(number) else None

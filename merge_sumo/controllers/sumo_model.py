@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
@@ -80,7 +80,7 @@ class SumoKind(ControllerKind):
     example = '--vut "sumo:IDM?tau=1.2"'
     own_code = False
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Take model and options; `UserError` for what SUMO does not have."""
         super().__init__(spec, options)
         model = spec.argument
@@ -88,7 +88,7 @@ class SumoKind(ControllerKind):
             raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
         own, defaults = MODELS[model]
         known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
-        self.parameters = chosen = spec.numbers()
+        self.settable = chosen = spec.numbers()
         for name, value in chosen.items():
             if name not in known:
                 raise spec.has_no(name, known)

@@ -11,8 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.controllers.factory import VutFactory
-from merge_sumo.controllers.spec import runs_code
+from merge_sumo.controllers.kinds import runs_code
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import MEASURES
@@ -70,10 +70,10 @@ class SimulationPlan:
 
     scenario: Scenario
     road: Corridor
-    vut: VutFactory
+    vut: ControllerKind
     povs: Povs
     criterion: Criterion
-    against: VutFactory | None = None
+    against: ControllerKind | None = None
     engine: Engine = Engine.SUMO
     corridors: int = MAX_CORRIDORS
     substeps: int = 1
@@ -85,7 +85,7 @@ class SimulationPlan:
 
         Raises `UserError` where the VUT cannot sense as the scenario says.
         """
-        if not self.scenario.sense.is_perfect and self.vut.vut.vut_type is not None:
+        if not self.scenario.sense.is_perfect and self.vut.vut_type is not None:
             raise UserError(
                 f"the VUT {self.vut.spec} sees other cars in SUMO itself, where `sense` does not "
                 "reach: leave it away (`act` is for every VUT)"
@@ -153,7 +153,7 @@ class SimulationPlan:
         """Why cases run in SUMO alone, in a clause; None where eq. (4) moves vehicles as well."""
         if self.povs.own is not None:
             return f"the POV {self.povs.own.spec} is none of this package"
-        if not self.vut.kind.by_arrays:
+        if not self.vut.by_arrays:
             return f"the VUT {self.vut.spec} is none of this package"
         return None
 
@@ -161,7 +161,7 @@ class SimulationPlan:
     def asks_sumo(self) -> bool:
         """Whether the VUT, or a POV that is none of this package, asks SUMO anything."""
         own = self.povs.own
-        return self.vut.kind.asks_sumo or (own is not None and own.kind.asks_sumo)
+        return self.vut.asks_sumo or (own is not None and own.asks_sumo)
 
     def workers(self, requested: AnyWorkers) -> int | str:
         """Return the number of processes that run cases: as many as VUT and POV can serve.

@@ -8,9 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
-from merge_sumo.controllers.spec import parse
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.controllers.sumo_model import SumoVut
 from merge_sumo.drivers.base import Driver, DriverWrapper, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.level0 import Level0Pov
@@ -52,7 +51,7 @@ class Povs:
     """
 
     policies: Path
-    own: VutFactory | None = None
+    own: ControllerKind | None = None
     scenario_levels: tuple[int, ...] = ALL_LEVELS
 
     @property
@@ -79,9 +78,9 @@ class Povs:
 
     def corridors(self, asked: int, cars: int) -> int:
         """Return how many corridors with `cars` cars on the mainline are served of those asked."""
-        if self.own is None or self.own.vut.max_corridors is None:
+        if self.own is None or self.own.max_corridors is None:
             return asked
-        most = self.own.vut.max_corridors
+        most = self.own.max_corridors
         if most < cars:
             raise UserError(f"the POV {self.own.spec}: it drives {most} car at a time, not {cars}")
         return min(asked, most // cars)
@@ -155,16 +154,16 @@ def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
     return policies_of(scenario) if policies is None else policies_in(policies)
 
 
-def own_pov(text: str, options: VutOptions) -> VutFactory:
+def own_pov(text: str, options: ControllerOptions) -> ControllerKind:
     """Return what makes the POV that a spec names; `UserError` for what cannot be one.
 
     It is any VUT that can drive on the mainline, and is hosted with the same options.
     """
     try:
-        own = VutFactory(parse(text), options)
+        own = load(text, options)
     except UserError as error:
         raise UserError(f"the POV {text}: {str(error).removeprefix(f'{text}: ')}") from error
-    if why := own.vut.no_pov:
+    if why := own.no_pov:
         raise UserError(f"the POV {text}: {why}")
     return own
 
@@ -179,7 +178,7 @@ class PovLibrary(Driver):
         for level in set(povs.levels) & set(POLICIES):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         if povs.own is not None:
-            driver = povs.own(corridors, world)
+            driver = povs.own.open(corridors, world)
             if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
                 mainline = [row for row in range(driver.world.vehicles) if row != VUT]
                 self._drivers[OWN] = SumoVut(corridors, driver.world, mainline)

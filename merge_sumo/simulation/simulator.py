@@ -38,10 +38,10 @@ class Simulator:
     def __init__(self, plan: SimulationPlan) -> None:
         """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
         own = plan.povs.own
-        car_type = None if own is None else own.vut.vut_type
+        car_type = None if own is None else own.vut_type
         with ExitStack() as opened:
             world = World(
-                *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut.vut_type),
+                *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut_type),
                 scenario=plan.scenario,
                 car_type=car_type,
             )
@@ -58,7 +58,7 @@ class Simulator:
         """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
         self.world = world
         scenario = plan.scenario
-        self.vut = plan.vut(world.corridors, sumo)
+        self.vut = plan.vut.open(world.corridors, sumo)
         if not scenario.sense.is_perfect:
             self.vut = SensedDriver(self.vut, scenario)
         if not scenario.act.is_perfect:
@@ -88,7 +88,7 @@ class Simulator:
 
 def corridors_of(plan: SimulationPlan, most: int) -> int:
     """Return the number of corridors, at most so many, that VUT and POVs of a plan can serve."""
-    corridors = min(most, plan.vut.vut.max_corridors or most)
+    corridors = min(most, plan.vut.max_corridors or most)
     return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
 
 

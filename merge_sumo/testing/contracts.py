@@ -21,7 +21,8 @@ import numpy as np
 
 from merge_sumo import api
 from merge_sumo.campaigns.run import Run
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.criterion import Criterion
@@ -117,7 +118,7 @@ LATE_STEPS: Final = 2
 """By so many steps the sensors are late."""
 
 
-def assert_sees_late(factory: VutFactory) -> None:
+def assert_sees_late(factory: ControllerKind) -> None:
     """Assert that a VUT with late sensors answers to the log of its episode, shifted.
 
     It drives once with such sensors; then it is asked again, without any, about the positions and
@@ -134,7 +135,7 @@ def assert_sees_late(factory: VutFactory) -> None:
     assert ran.error is None
     seen = shifted(ran.motion, LATE_STEPS)
     told = tuple(map(tuple, seen[0, :, :2].tolist()))
-    with World(1, road, scenario=US23) as world, closing(factory(1, world)) as driver:
+    with World(1, road, scenario=US23) as world, closing(factory.open(1, world)) as driver:
         driver.begin(0, ToldCase(level=1, scenario=US23, told=told))
         answers = []
         for step, state in enumerate(seen[:-1]):
@@ -186,12 +187,12 @@ class VutContract:
 
     def test_sees_with_late_sensors_what_was_before(self) -> None:
         """SUMO's own drivers see in SUMO, and have no sensors."""
-        factory = VutFactory.of(self.vut)
-        if factory.vut.vut_type is None:
+        factory = load(self.vut)
+        if factory.vut_type is None:
             assert_sees_late(factory)
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""
-        first, second = (VutFactory.of(self.vut) for _ in range(2))
+        first, second = (load(self.vut) for _ in range(2))
         assert first == second
         assert first.files == second.files

@@ -23,8 +23,8 @@ from merge_sumo.analysis.counterfactuals import (
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
@@ -111,7 +111,7 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path):
     run = run_campaign(settings, tmp_path / "run")
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= 10
-    plan = replace(resolve(settings), vut=VutFactory.of("careful"))
+    plan = replace(resolve(settings), vut=load("careful"))
     with opened_simulator(plan) as ground:
         in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
     assert run_counterfactuals(plan, failing) == in_sumo
@@ -144,7 +144,7 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
     path = tmp_path / "keeps.py"
     path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
     povs = Povs(
-        policies=policies_of(US23), own=own_pov(f"{path}:keeps", VutOptions(in_process=True))
+        policies=policies_of(US23), own=own_pov(f"{path}:keeps", ControllerOptions(in_process=True))
     )
     failing = []
     for one in found[:4]:

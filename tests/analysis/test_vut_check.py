@@ -9,7 +9,7 @@ from support.calling import invoke
 
 from merge_sumo import check_vut
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
-from merge_sumo.controllers.registry import KINDS
+from merge_sumo.controllers.kinds import KINDS
 
 GOOD = "def Vut(seen):\n    return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)\n"
 CLASS = "class Vut:\n    shared = [0]\n    def reset(self, seen):\n        {reset}\n"

@@ -17,8 +17,8 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
-from merge_sumo.controllers.factory import VutFactory
-from merge_sumo.controllers.spec import names_code
+from merge_sumo.controllers.in_memory import names_code
+from merge_sumo.controllers.kinds import load
 from merge_sumo.errors import UserError
 from merge_sumo.hashing import files_now
 
@@ -169,7 +169,7 @@ class TestCodeThatOthersMayWrite:
         require(os.geteuid() == 0, "needs root to give a file away")
         os.chown(mine / "my_vut.py", 12345, 12345)
         with pytest.raises(UserError, match=r"my_vut\.py is not run: it belongs to the user 12345"):
-            VutFactory.of(SPEC)
+            load(SPEC)
         assert not ran(mine)
 
 

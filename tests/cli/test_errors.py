@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from merge_sumo import api, cli
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.signatures import check_call, check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
@@ -47,10 +47,10 @@ def test_a_condition_is_refused_with_what_was_meant(text, said):
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: VutFactory.of("desgin2"), "did you mean design2"),
-        (lambda: VutFactory.of("Design2"), r"did you mean design2\? choose"),
-        (lambda: VutFactory.of("tracy"), "did you mean traci"),
-        (lambda: VutFactory.of(""), "name the vehicle under test, as in `vut` design2: careful, "),
+        (lambda: load("desgin2"), "did you mean design2"),
+        (lambda: load("Design2"), r"did you mean design2\? choose"),
+        (lambda: load("tracy"), "did you mean traci"),
+        (lambda: load(""), "name the vehicle under test, as in `vut` design2: careful, "),
         (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
         (lambda: named_scenario("us23-trafic"), "did you mean us23-traffic"),
         (lambda: Criterion("contat"), "did you mean contact"),
@@ -68,14 +68,6 @@ class TestAWrongSignature:
             (
                 "class V:\n\n    def act(self):\n        return 0.0\n",
                 "my.py:3: act(self) is called as act(self, seen)",
-            ),
-            (
-                "class V:\n    @staticmethod\n    def act(): return 0.0\n",
-                "my.py:2: act() is called as act(seen)",
-            ),
-            (
-                "class V:\n    @classmethod\n    def act(cls, a, b): return 0.0\n",
-                "my.py:2: act(cls, a, b) is called as act(cls, seen)",
             ),
             (
                 "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",

@@ -225,7 +225,7 @@ def test_runs_of_an_object_of_a_notebook(place):
 class TestACommand:
     def test_names_an_object_as_its_process_does(self, monkeypatch):
         here = {"MyVut": type("MyVut", (), {}), "MyVut-2": object()}
-        monkeypatch.setattr("merge_sumo.controllers.here.objects", here)
+        monkeypatch.setattr("merge_sumo.controllers.python.objects", here)
         for spec, said in {
             "here:MyVut": "MyVut",
             "here:MyVut-2": "MyVut(...)",

@@ -72,7 +72,7 @@ def test_variables_of_32_bits_are_as_good_as_those_of_64(unit):
         for one, other in zip(run_cases(in_process(f"fmu:{path}"), cases), expected, strict=True):
             assert one.error is None, name
             assert one.motion[1:] == pytest.approx(other.motion[1:], abs=1e-3), name
-    lane = in_process(f"fmu:{unit('3.0', kind='single', merge='single')}")(2)
+    lane = in_process(f"fmu:{unit('3.0', kind='single', merge='single')}").open(2)
     begin(lane)
     assert lane.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
     assert lane.wishes().tolist() == [STAY, MERGE]
@@ -151,7 +151,7 @@ def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
 @pytest.mark.parametrize("wish", some(["number", "boolean"], "boolean"))
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
 def test_an_output_merge_is_whether_to_merge(unit, version, wish):
-    vut = in_process(f"fmu:{unit(version, merge=wish)}")(2)
+    vut = in_process(f"fmu:{unit(version, merge=wish)}").open(2)
     begin(vut)
     assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
     assert vut.wishes().tolist() == [STAY, MERGE]

@@ -18,19 +18,17 @@ from support.campaigning import campaign_settings, run_campaign
 from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
 
-from merge_sumo.controllers.base import VutOptions
 from merge_sumo.controllers.controller import Start
-from merge_sumo.controllers.factory import VutFactory
-from merge_sumo.controllers.hosting import HostedDriver
-from merge_sumo.controllers.messages import Act, decode_request, encode, packed, unpacked
-from merge_sumo.controllers.process import Echo, append
-from merge_sumo.controllers.spec import parse
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.messages import HostRequest, decode_request, encode, packed, unpacked
+from merge_sumo.controllers.process import append
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import MergeCase
 from merge_sumo.scenario.scenario import US23
 
-OPTIONS = VutOptions(deadline_s=0.3)
+OPTIONS = ControllerOptions(deadline_s=0.3)
 HANGS = f"""
 import pathlib, signal, time
 signal.signal(signal.SIGIO, signal.SIG_IGN)
@@ -90,7 +88,7 @@ def scene(corridors: int) -> Scene:
 
 
 def test_after_a_death_it_starts_again_and_knows_which_files_there_were(spec):
-    vut = HostedDriver(2, parse(spec("import os\ndef Vut(seen):\n    os._exit(3)\n")), OPTIONS)
+    vut = load(spec("import os\ndef Vut(seen):\n    os._exit(3)\n"), OPTIONS).open(2)
     try:
         for _ in range(2):
             with pytest.raises(VutLostError, match="exit code 3"):
@@ -112,24 +110,37 @@ def Vut(seen):
     assert len((tmp_path / "opened").read_text().split()) == 1
 
 
-def test_controllers_that_take_long_together_are_not_late(spec):
-    source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
-    vut = HostedDriver(10, parse(spec(source)), OPTIONS)  # 2 s, and the process has 1.7 s
+def test_half_an_answer_and_no_more_ends_at_the_deadline(spec):
+    source = """
+import os, time
+def Vut(seen):
+    for descriptor in range(3, 64):
+        try:
+            if os.readlink(f"/proc/self/fd/{descriptor}").startswith("socket"):
+                os.write(descriptor, (1000).to_bytes(4, "big") + b"half")
+        except OSError:
+            pass
+    while True:
+        try:
+            time.sleep(60)
+        except BaseException:
+            pass
+"""
+    vut = load(spec(source), OPTIONS).open(2)
     try:
-        assert vut.act(scene(10)).tolist() == [1.0] * 10
+        with pytest.raises(VutLostError, match=r"the deadline of 0\.3 s"):
+            vut.act(scene(2))
     finally:
         vut.close()
 
 
-def test_what_starts_print_is_shown_from_where_it_differs(capsys):
-    echo = Echo()
-    for parts in ([b"a", b"b"], [b"ab"], [b"a", b"b"], [b""], [b"a", b"c"], [b"a"], [b"a"]):
-        for part in parts:
-            echo.show(part)
-        echo.end()
-    echo.close()
-    told = "ab(printed 2 more times)\naca(printed 1 more time)\n"
-    assert capsys.readouterr().err == told
+def test_controllers_that_take_long_together_are_not_late(spec):
+    source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
+    vut = load(spec(source), OPTIONS).open(10)  # 2 s, and the process has 1.7 s
+    try:
+        assert vut.act(scene(10)).tolist() == [1.0] * 10
+    finally:
+        vut.close()
 
 
 def test_its_code_may_not_change_and_data_that_it_reads_may(spec, tmp_path):
@@ -142,18 +153,18 @@ COUNT = pathlib.Path(__file__).with_name("count.txt").read_text()
 def Vut(seen):
     return 1.0
 """
-    factory = VutFactory.of(spec(source))
+    factory = load(spec(source))
     assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py"}
     count.write_text("2")
-    factory(1).close()
+    factory.open(1).close()
     (tmp_path / "helper.py").write_text("changed = True")
     with pytest.raises(UserError, match=r"helper\.py, code of the VUT .*, is not as it was"):
-        factory(1)
+        factory.open(1)
 
 
 def test_what_it_imports_while_it_drives_is_of_its_files(spec, tmp_path):
     (tmp_path / "late.py").touch()
-    vut = HostedDriver(1, parse(spec("def Vut(seen):\n    import late\n    return 1.0\n")), OPTIONS)
+    vut = load(spec("def Vut(seen):\n    import late\n    return 1.0\n"), OPTIONS).open(1)
     try:
         assert {f.name for f in vut.files()} == {"my_vut.py"}
         vut.act(scene(1))
@@ -187,7 +198,9 @@ def test_the_lane_and_who_has_merged_reach_the_process_and_the_rest_of_the_case_
     lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
     case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
     sent = scene(2)._replace(merged=np.array([False, True]))
-    request = decode_request(encode(Act([(1, Start.of(case))], packed(sent))))
+    request = decode_request(
+        encode(HostRequest("act", starts=[(1, Start.of(case))], scene=packed(sent)))
+    )
     ((corridor, start),) = request.starts
     assert (corridor, start) == (1, Start.of(case))
     assert start.seen.lane_end_m == 130.0

@@ -12,7 +12,7 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.controllers.in_memory import is_here, spec_of, travels
-from merge_sumo.controllers.spec import parse
+from merge_sumo.controllers.kinds import parse
 
 SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 

@@ -55,12 +55,12 @@ def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp
         ("eight", [0, 0, 0, 0, 0, 3, 1, 9], MERGE, 1.0),
     ):
         path = network(tmp_path / f"{name}.onnx", answer=answer)
-        vut = in_process(f"onnx:{path}?decision_period_s=0.5")(1)
+        vut = in_process(f"onnx:{path}?decision_period_s=0.5").open(1)
         begin(vut)
         for step in (5, 6):
             assert vut.act(on_lane([-51.0])._replace(step=np.array([step]))).tolist() == [a_mps2]
             assert vut.wishes().tolist() == [wish]
-    wrong = in_process(f"onnx:{network(tmp_path / 'nan.onnx', answer=[0.5, np.inf])}")(1)
+    wrong = in_process(f"onnx:{network(tmp_path / 'nan.onnx', answer=[0.5, np.inf])}").open(1)
     begin(wrong)
     assert np.isnan(wrong.act(on_lane([-51.0])))[0]
     assert wrong.reason(0) == "WrongAnswerError: wishes inf instead of a number, to merge or not"

@@ -6,10 +6,10 @@ from dataclasses import asdict
 
 import pytest
 
-from merge_sumo.controllers.base import VutOptions
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
-from merge_sumo.controllers.factory import VutFactory
-from merge_sumo.controllers.here import objects
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.python import objects
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.errors import UserError
 
 SOURCE = """
@@ -54,7 +54,7 @@ def file(tmp_path):
 
 
 def parameters(spec: str, *, in_process: bool = True) -> dict[str, float]:
-    return VutFactory.of(spec, VutOptions(in_process=in_process)).parameters()
+    return load(spec, ControllerOptions(in_process=in_process)).parameters()
 
 
 @pytest.mark.parametrize(
@@ -112,4 +112,4 @@ def test_a_built_in_vut_keeps_what_is_not_set(name):
     known = asdict(BUILT_IN_VUTS[name].design)  # type: ignore[arg-type]
     first = next(iter(known))
     assert parameters(f"{name}?{first}=150") == {**known, first: 150.0}
-    VutFactory.of(f"{name}?{first}=150")(2).close()
+    load(f"{name}?{first}=150").open(2).close()

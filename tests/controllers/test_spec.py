@@ -1,11 +1,11 @@
-"""Specs: how a text becomes a `VutSpec`, and how a VUT of this package becomes one."""
+"""Specs: how a text becomes a `ControllerSpec`, and how a VUT of this package becomes one."""
 
 from __future__ import annotations
 
 import pytest
 
-from merge_sumo.controllers.base import VutSpec
-from merge_sumo.controllers.spec import parse
+from merge_sumo.controllers.kinds import parse
+from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.errors import UserError
 
 
@@ -28,7 +28,7 @@ from merge_sumo.errors import UserError
     ],
 )
 def test_a_text_is_parsed_into_parts_that_print_as_the_text(text, parts):
-    assert parse(text) == VutSpec(*parts)
+    assert parse(text) == ControllerSpec(*parts)
     assert str(parse(text)) == text
 
 

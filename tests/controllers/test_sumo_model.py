@@ -43,7 +43,7 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
 def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
     """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
     (ours,) = run_cases(factory(model), [FREE], corridors=1)
-    with World(1, vut_type=factory(model).vut.vut_type, scenario=US23) as world:
+    with World(1, vut_type=factory(model).vut_type, scenario=US23) as world:
         world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
         x_m, speeds = [], []
         for _ in range(len(ours.motion) - 1):
@@ -85,7 +85,7 @@ def test_the_lane_change_attributes_are_those_of_sumos_schema_and_reach_its_mode
     known = set(re.findall(r'name="(\w+)" type', schema.read_text()))
     assert {name for name in known if name.startswith("lc")} == LANE_CHANGE_OPTIONS | OF_SUBLANES
     named = "&".join(f"{name}=0.25" for name in sorted(LANE_CHANGE_OPTIONS))
-    with World(1, vut_type=factory(f"sumo:Krauss?{named}").vut.vut_type, scenario=US23) as world:
+    with World(1, vut_type=factory(f"sumo:Krauss?{named}").vut_type, scenario=US23) as world:
         world.place(0, [(-200.0, 30.0), (-182.0, 18.0)])
         tell, vut = world._libsumo.vehicle.getParameter, world._ids[VUT]
         told = {name: tell(vut, f"laneChangeModel.{name}") for name in LANE_CHANGE_OPTIONS - UNTOLD}

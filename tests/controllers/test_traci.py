@@ -28,7 +28,7 @@ from support.processes import none_left
 from support.raw_traci import Client, GoneError
 from support.vut_contract import cases_of, factory, run_cases
 
-from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.controllers.traci import child
 from merge_sumo.controllers.traci.child import user_of
 from merge_sumo.controllers.traci.vut import TraciVut
@@ -56,7 +56,7 @@ class Played:
         self.speeds, self.accelerations, self.reasons = [], [], []
         thread = threading.Thread(target=self._client, args=(client,))
         thread.start()
-        options = VutOptions(deadline_s=deadline_s, connect_s=10.0)
+        options = ControllerOptions(deadline_s=deadline_s, connect_s=10.0)
         vut = TraciVut(road_of(), US23, self.port, None, options)
         try:
             for _ in range(episodes):
@@ -234,7 +234,7 @@ def test_its_code_must_stay_as_it_is_while_it_runs(tmp_path, monkeypatch):
     assert list(vut.files) == ["c.py"], "what follows is read and written"
     Path("c.py").write_text("print(2)\n", encoding="utf-8")
     with pytest.raises(UserError, match=r"c\.py, code of the VUT .* is not as it was"):
-        vut(1)
+        vut.open(1)
 
 
 IN_VAIN = """

@@ -9,16 +9,13 @@ import pytest
 from conftest import some
 from support.vut_contract import ON_LANE, begin, factory, in_process, on_lane
 
-from merge_sumo.controllers.base import VutOptions
 from merge_sumo.controllers.controller import Seen, Start, seen_in
-from merge_sumo.controllers.hosting import HostedDriver
-from merge_sumo.controllers.spec import parse
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
 
 
 def begun(vut, corridors, **options):
     """Return a driver with an episode in each corridor."""
-    driver = factory(vut, **options)(corridors) if isinstance(vut, str) else vut
+    driver = factory(vut, **options).open(corridors) if isinstance(vut, str) else vut
     begin(driver)
     return driver
 
@@ -105,7 +102,7 @@ def test_a_batched_controller_answers_one_row_or_two(spec, process):
         assert driver.wishes().tolist() == [STAY, MERGE, NO_WISH]
     finally:
         driver.close()
-    one_row = begun(in_process(spec(OF_ALL.replace(", seen.may_merge", "")))(3), 3)
+    one_row = begun(in_process(spec(OF_ALL.replace(", seen.may_merge", ""))).open(3), 3)
     assert one_row.act(on_lane([-90.0, -71.0, -50.0], [False] * 3)).tolist() == [1.0] * 3
     assert one_row.wishes() is None
 
@@ -140,7 +137,7 @@ def Vut(seen):
 
 @pytest.mark.parametrize("wish", WISHES)
 def test_a_wish_is_true_or_false(spec, wish):
-    driver = begun(in_process(spec(ANSWERS.format(f"(1, {wish})")))(1), 1)
+    driver = begun(in_process(spec(ANSWERS.format(f"(1, {wish})"))).open(1), 1)
     assert driver.act(on_lane([-71.0], [False])).tolist() == [1.0]
     assert driver.wishes().tolist() == [WISHES[wish]]
 
@@ -169,7 +166,7 @@ def test_another_answer_is_an_error_of_its_own_corridor(spec, answer, process):
 )
 def test_a_batch_of_another_shape_is_an_error_of_all(spec, answer, said):
     source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
-    driver = begun(in_process(spec(source))(2), 2)
+    driver = begun(in_process(spec(source)).open(2), 2)
     with pytest.raises(VutLostError, match=r".*") as lost:
         driver.act(on_lane([-71.0, -90.0], [False, False]))
     assert said in lost.value.reason
@@ -177,7 +174,7 @@ def test_a_batch_of_another_shape_is_an_error_of_all(spec, answer, said):
 
 def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
     wishes = "np.where(seen.x_vut_m > -80.0, np.nan, 0.0)"
-    driver = begun(in_process(spec(OF_ALL.replace("seen.may_merge", wishes)))(3), 3)
+    driver = begun(in_process(spec(OF_ALL.replace("seen.may_merge", wishes))).open(3), 3)
     idle = on_lane([-71.0, -90.0, -71.0], [False] * 3)
     idle = idle._replace(active=np.array([True, True, False]))
     assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
@@ -187,12 +184,14 @@ def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
 
 def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(spec):
     source = """
-from merge_sumo.controllers.messages import Acted
-Acted.of = lambda driver, scene: Acted(driver.act(scene).tobytes(), {}, {}, bytes([7, 7]))
+from merge_sumo.controllers.messages import HostReply
+HostReply.of = lambda driver, scene: HostReply(
+    accelerations_mps2=driver.act(scene).tobytes(), wishes=bytes([7, 7])
+)
 def Vut(seen):
     return 1.0, True
 """
-    driver = HostedDriver(2, parse(spec(source)), VutOptions(deadline_s=1.0))
+    driver = factory(spec(source), deadline_s=1.0).open(2)
     try:
         begun(driver, 2)
         with pytest.raises(VutLostError, match="broke the channel to its process"):

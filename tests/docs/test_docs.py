@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from docs_pages import DOCS, ROOT, SHOWN, TABLE, TABLES, WRITTEN, on_page_markdown
 
-from merge_sumo.controllers.registry import KINDS
+from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.samplers.registry import SAMPLERS
 
 LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")

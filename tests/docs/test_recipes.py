@@ -74,15 +74,15 @@ RECIPES = {
     ),
     "a kind of controller with two parameters": Recipe(
         new={
-            "controllers/hold.py": "from merge_sumo.controllers.base import ControllerKind\n"
+            "controllers/hold.py": "from merge_sumo.controllers.spec import ControllerKind\n"
             "from merge_sumo.controllers.controller import Controller\n\n\n"
             "class HoldKind(ControllerKind):\n"
             '    form, what = "hold:START?a_mps2=A&until_s=T", "accelerates for a while"\n\n'
             "    def __init__(self, spec, options):\n"
             "        super().__init__(spec, options)\n"
-            '        self.parameters = {"a_mps2": 1.0, "until_s": 2.0} | spec.numbers()\n\n'
+            '        self.settable = {"a_mps2": 1.0, "until_s": 2.0} | spec.numbers()\n\n'
             "    def controller(self):\n"
-            "        return HoldController(**self.parameters)\n\n\n"
+            "        return HoldController(**self.settable)\n\n\n"
             "class HoldController(Controller):\n"
             "    def __init__(self, a_mps2, until_s):\n"
             "        self.a_mps2, self.until_s = a_mps2, until_s\n\n"
@@ -90,7 +90,7 @@ RECIPES = {
             "        return self.a_mps2 if seen.t_s < self.until_s else 0.0\n"
         },
         more={
-            "controllers/registry.py": {
+            "controllers/kinds.py": {
                 '        HERE: "merge': '        "hold": "merge_sumo.controllers.hold:HoldKind",\n'
             }
         },

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
@@ -109,9 +109,9 @@ class TestRuleBased:
 
 def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
     for name in BUILT_IN_VUTS:
-        driver = VutFactory.of(name)(4)
+        driver = load(name).open(4)
         for k in range(4):
             driver.begin(k, CASE)
         assert driver.act(scene(x_pov=[-300.0, -250.0, -200.0, -180.0])).shape == (4,)
     with pytest.raises(UserError, match=r"no VUT 'design9': did you mean design[12] or "):
-        VutFactory.of("design9")
+        load("design9")

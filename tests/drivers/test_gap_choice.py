@@ -63,7 +63,7 @@ def test_it_wishes_nothing_before_the_gore_and_on_the_mainline():
 
 def test_without_a_lane_it_is_the_level_0_vut():
     case = replace(ON_LANE, scenario=US23)
-    vut, level0 = GapChoiceVut(1), factory("level0")(1)
+    vut, level0 = GapChoiceVut(1), factory("level0").open(1)
     begin(vut, case)
     begin(level0, case)
     at_m = scene([-45.0, -40.0], [30.0, 27.95])._replace(merged=None)

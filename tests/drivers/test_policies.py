@@ -9,7 +9,7 @@ import pytest
 from support.merges import HALF, SMALLER
 from support.plans import POVS
 
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.levelk import (
     FEATURES,
     LevelKDriver,
@@ -53,7 +53,7 @@ def uniform_cases(level, count, seed=0):
 def played(vut, cases, corridors=32):
     """Return the measures of cases, in order, and the trajectories."""
     with World(corridors, scenario=US23) as world:
-        driver = VutFactory.of(vut)(corridors)
+        driver = load(vut).open(corridors)
         trajectories = Rollout(world, PovLibrary(corridors, POVS), driver, cases).run()
     return [measure(t) for t in trajectories], trajectories
 
@@ -145,7 +145,7 @@ class TestTheLibraryOfPeople:
     def test_brakes_no_harder_than_people_did(self, level):
         cases = uniform_cases(level, 300, seed=4)
         with World(32, scenario=US23) as world:
-            pov, vut = PovLibrary(32, self.POVS), VutFactory.of("design2")(32)
+            pov, vut = PovLibrary(32, self.POVS), load("design2").open(32)
             found = [measure(t) for t in Rollout(world, pov, vut, cases).run()]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0

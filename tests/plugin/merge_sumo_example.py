@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
 from merge_sumo.controllers.controller import Controller, Seen
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.measures import Measure
@@ -69,7 +69,7 @@ class ConstantKind(ControllerKind):
     what = "one acceleration in every step"
     example = "--vut constant:0.5"
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Read the acceleration; `UserError` where it is not a number."""
         super().__init__(spec, options)
         try:

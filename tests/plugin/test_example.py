@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from merge_sumo_example import CLOSEST, MiddleSampler
 
-from merge_sumo.controllers.registry import KINDS
+from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.testing import MeasureContract, SamplerContract, VutContract
 
 installed = pytest.mark.skipif(

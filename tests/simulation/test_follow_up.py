@@ -13,8 +13,8 @@ import pytest
 from metrics.test_score import CASE, ending
 from support.plans import plan_for
 
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
@@ -75,7 +75,7 @@ class TestMeasures:
 def run(vut, scenario):
     """Return the trajectories of the cases in a scenario."""
     cases = [replace(case, scenario=scenario) for case in CASES]
-    factory = VutFactory.of(vut, VutOptions(in_process=True))
+    factory = load(vut, ControllerOptions(in_process=True))
     with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
         return ground.run(cases)
 

@@ -9,7 +9,7 @@ import pytest
 from support.plans import POVS, key_of, plan_for
 
 from merge_sumo.analysis.truth import ground_truth, known_truth
-from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.levelk import MANY_ROWS, features
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
@@ -119,7 +119,7 @@ class TestThePlan:
             plan.with_engine("kinematic")
 
     def test_needs_sumo_for_a_pov_of_ones_own(self):
-        povs = replace(POVS, own=own_pov("design1", VutOptions()))
+        povs = replace(POVS, own=own_pov("design1", ControllerOptions()))
         plan = plan_for("design1", povs=povs)
         assert plan.with_engine(None).engine is Engine.SUMO
         assert plan.at_level(OWN).with_engine(None).engine is Engine.SUMO

@@ -18,7 +18,7 @@ from support.vut_contract import cases_of, factory
 
 from merge_sumo.api import open_run
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.controllers.base import VutOptions
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.score import measure
 from merge_sumo.scenario.case import Case, from_unit
@@ -88,7 +88,7 @@ def run(
     options["in_process"] = not hosted
     povs = Povs(
         policies=policies_of(US23),
-        own=None if spec is None else own_pov(spec, VutOptions(**options)),
+        own=None if spec is None else own_pov(spec, ControllerOptions(**options)),
     )
     scenario = cases[0].scenario
     with Simulator(

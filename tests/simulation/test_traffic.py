@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from support.plans import plan_for
 
-from merge_sumo.controllers.base import VutOptions
 from merge_sumo.controllers.controller import seen_in
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
 from merge_sumo.metrics.score import FOLLOWED_UP, measure
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
@@ -32,7 +32,7 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
 
 
 def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
-    factory = VutFactory.of(vut, VutOptions(**options))
+    factory = load(vut, ControllerOptions(**options))
     with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
         return ground.run(cases)
 

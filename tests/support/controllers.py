@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from support.vut_contract import factory, run_cases
 
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.scenario.case import Case
 
 SUPPORT = Path(__file__).parent
 RAW_CLIENT = f"""import os, sys, time
-sys.path.insert(0, {str(SUPPORT)!r})
+sys.path.insert(0, {str(SUPPORT.parent)!r})
 from support.raw_traci import Client
 client = Client(int(sys.argv[1]))
 """
@@ -39,7 +39,7 @@ def raw_client(misdeed: str = "") -> str:
     return f"{sys.executable} {SUPPORT / 'raw_traci.py'} {{port}} {misdeed and repr(misdeed)}"
 
 
-def assert_drives_as_level0(vut: VutFactory, cases: list[Case], within: float = 1e-9) -> None:
+def assert_drives_as_level0(vut: ControllerKind, cases: list[Case], within: float = 1e-9) -> None:
     """Assert that a VUT drives by the law of level 0, and makes no error."""
     level0 = run_cases(factory("level0"), cases)
     for one, other in zip(run_cases(vut, cases), level0, strict=True):

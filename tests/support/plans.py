@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from merge_sumo.analysis.truth import TruthKey
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.road.merge import road_for
@@ -17,7 +17,7 @@ POVS = Povs(policies=policies_of(US23))
 
 
 def plan_for(
-    vut: str | VutFactory,
+    vut: str | ControllerKind,
     *,
     scenario: Scenario = US23,
     criterion: Criterion = PAPERS,
@@ -25,11 +25,11 @@ def plan_for(
     corridors: int = MAX_CORRIDORS,
 ) -> SimulationPlan:
     povs = povs or Povs(policies=policies_of(scenario))
-    options = VutOptions(policies=povs.policies)
+    options = ControllerOptions(policies=povs.policies)
     return SimulationPlan(
         scenario=scenario,
         road=road_for(scenario),
-        vut=vut if isinstance(vut, VutFactory) else VutFactory.of(vut, options),
+        vut=vut if isinstance(vut, ControllerKind) else load(vut, options),
         povs=povs,
         criterion=criterion,
         corridors=corridors,
@@ -45,7 +45,5 @@ def key_of(
     seed: int = 0,
 ) -> TruthKey:
     """Return what a truth is kept under."""
-    options = VutOptions(policies=POVS.policies, deadline_s=deadline_s)
-    return TruthKey(
-        plan_for(VutFactory.of(vut, options)).for_verdicts().key(level), level, cases, seed
-    )
+    options = ControllerOptions(policies=POVS.policies, deadline_s=deadline_s)
+    return TruthKey(plan_for(load(vut, options)).for_verdicts().key(level), level, cases, seed)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from support.plans import plan_for
 
-from merge_sumo.controllers.base import VutOptions
-from merge_sumo.controllers.factory import VutFactory
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.scenario.case import Case, MergeCase, from_unit
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -48,23 +48,23 @@ def cases_of(count: int, seed: int = 0) -> list[Case]:
     return from_unit(np.random.default_rng(seed).random((count, 2)), level=0, scenario=US23)
 
 
-def factory(spec: object, **options: Any) -> VutFactory:
-    return VutFactory.of(str(spec), VutOptions(**options))
+def factory(spec: object, **options: Any) -> ControllerKind:
+    return load(str(spec), ControllerOptions(**options))
 
 
-def in_process(spec: object, **options: Any) -> VutFactory:
+def in_process(spec: object, **options: Any) -> ControllerKind:
     """Return a VUT that drives in this process; `test_hosted.py` has those in another one."""
     return factory(spec, in_process=True, **options)
 
 
-def run_cases(vut: VutFactory, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
+def run_cases(vut: ControllerKind, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
     """Return what became of every case, in order."""
     with Simulator(plan_for(vut, corridors=corridors)) as ground:
         return ground.run(cases)
 
 
 def run_on(
-    vut: VutFactory, scenario: Scenario, level: int, count: int, corridors: int = 8
+    vut: ControllerKind, scenario: Scenario, level: int, count: int, corridors: int = 8
 ) -> list[Trajectory]:
     """Return what became of some cases of a scenario, in order."""
     points = np.random.default_rng(0).random((count, len(scenario.dimensions(level))))

@@ -12,8 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
-from merge_sumo.controllers.registry import KINDS
+from merge_sumo.controllers.kinds import KINDS
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
@@ -153,7 +153,7 @@ class FrozenKind(ControllerKind):
 
     own_code, by_arrays = False, True
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Find the VUT; `UserError` for another name."""
         super().__init__(spec, options)
         if spec.argument not in FROZEN_VUTS:

@@ -10,22 +10,18 @@ from __future__ import annotations
 
 import math
 import os
-import signal
 import socket
-import subprocess
 import sys
 from collections import deque
 from collections.abc import Mapping
-from contextlib import ExitStack, suppress
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
+from contextlib import suppress
 from pathlib import Path
 from time import monotonic
 from typing import Any, Final
 
 import msgspec
 
-from merge_sumo.controllers.process import GRACE_S
+from merge_sumo.controllers.process import ENDING_S, ChildProcess, connected
 from merge_sumo.controllers.traci.protocol import (
     CLOSE,
     STEP,
@@ -39,11 +35,10 @@ from merge_sumo.controllers.traci.protocol import (
 )
 from merge_sumo.controllers.traci.session import NotFiniteError, Session
 from merge_sumo.errors import UserError
-from merge_sumo.limits import lower_limits
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.scenario import Scenario
-from merge_sumo.spawning import end_with, python_command
-from merge_sumo.sumo.binding import scratch_folder, sumo_environment
+from merge_sumo.scratch import ScratchFolder
+from merge_sumo.sumo.binding import sumo_environment
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, State, write_files
 
 HOST: Final = "127.0.0.1"
@@ -57,9 +52,6 @@ FAREWELL_STEPS: Final = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
 MOST_MEMORY_BYTES: Final = 4 << 30
 MOST_FILE_BYTES: Final = 16 << 20
-MOST_MESSAGE_BYTES: Final = 1 << 24
-MESSAGES: Final = "messages"
-"""File with what the child, and SUMO, write to standard error."""
 ROUNDING_S: Final = 1e-9
 
 
@@ -93,14 +85,6 @@ class Answer(msgspec.Struct, omit_defaults=True):
     in_vain: list[str] = []
 
 
-class ChildDiedError(Exception):
-    """The process is gone; the text says how it ended, and `killed` whether by SIGKILL."""
-
-    def __init__(self, how: str, *, killed: bool = False) -> None:
-        super().__init__(how)
-        self.killed = killed
-
-
 class FaultError(Exception):
     """The client's fault; where its connection is `gone`, its program may say why."""
 
@@ -113,20 +97,26 @@ class ClosedError(Exception):
     """The client said goodbye while no vehicle was on the road."""
 
 
-class Child:
-    """The serving process; `listen` starts it when it does not run."""
+class Child(ChildProcess):
+    """The serving process, with the road and the vehicles of a scenario."""
 
     def __init__(self, road: Corridor, scenario: Scenario) -> None:
+        """Start the process; `UserError` if it cannot be started."""
         if os.name != "posix":
             raise UserError("a controller by TraCI needs Linux or macOS")
-        self._road, self._scenario = road, scenario
-        self._opened = ExitStack()
-        self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Connection | None = None
-        self._messages = Path()
+        folder = ScratchFolder()
+        write_files(Path(folder.name), road, scenario)
+        super().__init__(
+            f"{__name__}:{main.__name__}",
+            {"folder": folder.name},
+            folder,
+            sumo_environment(),
+            cwd=folder.name,
+            is_shown=False,
+        )
 
-    def ask(self, action: str, patience_s: float = START_S, **values: Any) -> Answer:
-        """Have the process do something; without an answer it is ended.
+    def do(self, action: str, patience_s: float = START_S, **values: Any) -> Answer:
+        """Have the process do something.
 
         Args:
             action: name of a method of `Server`.
@@ -134,93 +124,22 @@ class Child:
             values: arguments of the method.
 
         Raises:
-            ChildDiedError: if the process is gone.
-            TimeoutError: if there is no answer in time.
-            UserError: if the process cannot be started, or cannot do it.
+            ProcessDiedError: if there is no answer in time, or the process is gone.
+            UserError: if it cannot do it.
         """
-        if self._connection is None:
-            if action != "listen":
-                raise ChildDiedError("has ended")
-            self._start()
-        assert self._connection is not None, "started"  # noqa: S101
-        try:
-            self._connection.send_bytes(msgspec.msgpack.encode((action, values)))
-            if not self._connection.poll(patience_s):
-                raise TimeoutError
-            content = self._connection.recv_bytes(MOST_MESSAGE_BYTES)
-            answer = msgspec.msgpack.decode(content, type=Answer)
-            if answer.refused:
-                raise UserError(self._message() or answer.refused)
-        except (OSError, EOFError, msgspec.DecodeError) as error:
-            died = error if isinstance(error, TimeoutError) else self._death()
-            self.close()
-            raise died from error
-        except BaseException:
-            self.close()
-            raise
+        content = self.ask(msgspec.msgpack.encode((action, values)), patience_s)
+        answer = msgspec.msgpack.decode(content, type=Answer)
+        if answer.refused:
+            self.kill()
+            said, *_ = self.output.tail.decode("utf-8", errors="replace").strip().split("\n")
+            raise UserError(said.removeprefix("Error: ") or answer.refused)
         return answer
-
-    def close(self) -> None:
-        """End it, whatever it does."""
-        self._process = self._connection = None
-        self._opened.close()
-
-    def _start(self) -> None:
-        with ExitStack() as opened:
-            folder = opened.enter_context(scratch_folder())
-            write_files(folder, self._road, self._scenario)
-            ours, theirs = Pipe()
-            lifeline, kept_open = os.pipe()
-            opened.callback(ours.close)
-            opened.callback(os.close, kept_open)
-            descriptors = (theirs.fileno(), lifeline)
-            settings = {"descriptors": descriptors, "folder": str(folder)}
-            self._messages = folder / MESSAGES
-            try:
-                with self._messages.open("wb") as messages:
-                    self._process = subprocess.Popen(  # noqa: S603 (our own code)
-                        python_command(f"{__name__}:{main.__name__}", settings),
-                        stdin=subprocess.DEVNULL,
-                        stdout=subprocess.DEVNULL,
-                        stderr=messages,
-                        pass_fds=descriptors,
-                        cwd=folder,
-                        env=sumo_environment(),
-                        # Ctrl-C in a terminal is for this process, which then ends the child.
-                        start_new_session=True,
-                    )
-            except OSError as error:
-                raise UserError(f"cannot start a process for SUMO: {error.strerror}") from error
-            finally:
-                os.close(lifeline)
-                theirs.close()
-            opened.callback(self._process.wait)
-            opened.callback(self._process.kill)
-            self._connection, self._opened = ours, opened.pop_all()
-
-    def _message(self) -> str:
-        """Return the first line that the process, or SUMO, wrote to standard error."""
-        text = self._messages.read_bytes()[:2000].decode("utf-8", errors="replace")
-        return text.strip().partition("\n")[0].removeprefix("Error: ")
-
-    def _death(self) -> ChildDiedError:
-        assert self._process is not None, "started"  # noqa: S101
-        with suppress(subprocess.TimeoutExpired):
-            code = self._process.wait(2.0)
-            if code < 0:
-                killed = code == -signal.SIGKILL
-                return ChildDiedError(f"was ended by signal {-code}", killed=killed)
-            return ChildDiedError(f"ended with exit code {code}")
-        return ChildDiedError("sends no messages that can be read")
 
 
 def main(settings: Mapping[str, Any]) -> None:
     """Serve clients, one after the other, until the parent ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    descriptor, lifeline = settings["descriptors"]
-    end_with(lifeline)
-    lower_limits(RLIMIT_DATA=MOST_MEMORY_BYTES, RLIMIT_FSIZE=MOST_FILE_BYTES, RLIMIT_CORE=0)
-    connection, server = Connection(descriptor), Server(Path(settings["folder"]))
+    limits = {"RLIMIT_DATA": MOST_MEMORY_BYTES, "RLIMIT_FSIZE": MOST_FILE_BYTES}
+    connection, server = connected(settings, **limits), Server(Path(settings["folder"]))
     with suppress(EOFError, OSError):
         while True:
             action, values = msgspec.msgpack.decode(connection.recv_bytes())
@@ -356,7 +275,7 @@ class Server:
             if self._until_step_s is not None:
                 self._until_step_s = 0.0  # the time that it asked for will not come
             self._answer_step()
-            self._serve_until_step(GRACE_S)
+            self._serve_until_step(ENDING_S)
         return Answer()
 
     def _answer_step(self) -> None:

@@ -18,15 +18,21 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.controllers.base import ControllerKind, VutOptions, VutSpec
-from merge_sumo.controllers.process import GRACE_S, Echo, Program, append, code_of, split_command
+from merge_sumo.controllers.process import (
+    ENDING_S,
+    ProcessDiedError,
+    Program,
+    append,
+    code_of,
+    split_command,
+)
+from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.controllers.traci.child import (
     HOST,
     START_S,
     WORK_S,
     Answer,
     Child,
-    ChildDiedError,
     FaultError,
 )
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
@@ -65,7 +71,7 @@ class TraciKind(ControllerKind):
         "FMU, a network or sumo:MODEL"
     )
 
-    def __init__(self, spec: VutSpec, options: VutOptions) -> None:
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Read the port or the command.
 
         Raises `UserError` for a port or a command that is none, and for code that others may write.
@@ -79,8 +85,8 @@ class TraciKind(ControllerKind):
             self.max_workers = 1
         else:
             self._command = split_command(spec.argument)
-            self.files = code_of(self._command)
-        for file in self.files:
+            self.code = code_of(self._command)
+        for file in self.code:
             check_code(file)
 
     @classmethod
@@ -110,7 +116,7 @@ class TraciVut(Driver):
         scenario: Scenario,
         port: int,
         command: list[str] | None,
-        options: VutOptions,
+        options: ControllerOptions,
     ) -> None:
         """Start the command, or wait for a client.
 
@@ -126,15 +132,15 @@ class TraciVut(Driver):
         """
         super().__init__(1)
         self._port, self._command, self._options = port, command, options
+        self._road, self._scenario = road, scenario
         self._child = Child(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
         self._begins_m[VUT] = -road.ramp.before_m
         self._lane_m = lane_of(scenario)
         self._limits_mps2 = scenario.a_min_mps2, scenario.a_max_mps2
         self._program: Program | None = None
-        self._connected = False
+        self._connected = self._has_started = False
         self._reason: str | None = None
-        self._echo = Echo()
         self._noted: set[str] = set()
         self._in_vain: set[str] = set()
         self._before_mps: dict[str, float] = {}
@@ -182,8 +188,7 @@ class TraciVut(Driver):
             with suppress(FaultError, VutLostError):
                 ends = self._ask("farewell").closed
         self._stop_program(grace=ends)
-        self._child.close()
-        self._echo.close()
+        self._child.kill()
 
     def _acceleration_mps2(self, scene: Scene) -> float:
         """Show the vehicles, and return what the client commands for the coming step."""
@@ -245,15 +250,15 @@ class TraciVut(Driver):
         """Return what the serving process answers; raises `FaultError` and `VutLostError`."""
         patience_s += self._options.deadline_s + WORK_S
         try:
-            answer = self._child.ask(action, patience_s, **values)
-        except ChildDiedError as died:
+            answer = self._child.do(action, patience_s, **values)
+        except ProcessDiedError as died:
+            if died.hung:
+                raise FaultError(
+                    "the SUMO that answers the controller did not come to an end with what it asked"
+                ) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
             raise VutLostError(f"the SUMO that answers the controller {died}") from died
-        except TimeoutError as error:
-            raise FaultError(
-                "the SUMO that answers the controller did not come to an end with what it asked"
-            ) from error
         for note in answer.notes:
             self._note(note)
         self._in_vain.update(answer.in_vain)
@@ -272,12 +277,16 @@ class TraciVut(Driver):
         patience_s = self._patience_s
         # A client that did not come once is not waited for as long again.
         self._patience_s = min(patience_s, self._options.deadline_s)
+        if not self._child.alive:
+            self._child = Child(self._road, self._scenario)
         port = self._ask("listen", START_S, port=self._port).port
         if self._program is not None and not self._accept(self._options.deadline_s):
             self._stop_program(grace=True)
         if not self._connected:
             if self._command is not None:
-                self._program = Program(self._command, port, self._options.log, self._echo)
+                log = self._options.log
+                self._program = Program(self._command, port, log, is_shown=not self._has_started)
+                self._has_started = True
             else:
                 sys.stderr.write(
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
@@ -330,10 +339,10 @@ class TraciVut(Driver):
         """
         self._stop_program(grace=False)
         self._connected = False
-        with suppress(ChildDiedError, TimeoutError):
-            self._child.ask("drop", WORK_S)
+        with suppress(ProcessDiedError):
+            self._child.do("drop", WORK_S)
 
     def _stop_program(self, *, grace: bool) -> None:
         if self._program is not None:
-            self._program.stop(GRACE_S if grace else 0.0)
+            self._program.stop(ENDING_S if grace else 0.0)
             self._program = None

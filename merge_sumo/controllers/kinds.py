@@ -1,0 +1,111 @@
+"""The kinds of controllers by name, and the way from a text, as after `--vut`, to a controller."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from merge_sumo.controllers.built_in import BUILT_IN_VUTS
+from merge_sumo.controllers.hosting import SUPPORTED, HostedKind
+from merge_sumo.controllers.python import installed_vuts
+from merge_sumo.controllers.spec import (
+    BUILT_IN,
+    HERE,
+    INSTALLED,
+    PYTHON,
+    WITHOUT_PREFIX,
+    ControllerKind,
+    ControllerOptions,
+    ControllerSpec,
+)
+from merge_sumo.errors import UserError
+from merge_sumo.registry import Registry
+from merge_sumo.suggestions import meant
+
+KINDS: Final[Registry[type[ControllerKind]]] = Registry(
+    "merge_sumo.vut_kinds",
+    "kind of VUT",
+    {
+        PYTHON: "merge_sumo.controllers.python:PythonKind",
+        "traci": "merge_sumo.controllers.traci.vut:TraciKind",
+        "sumo": "merge_sumo.controllers.sumo_model:SumoKind",
+        "onnx": "merge_sumo.controllers.onnx:OnnxKind",
+        "fmu": "merge_sumo.controllers.fmu:FmuKind",
+        HERE: "merge_sumo.controllers.python:HereKind",
+        INSTALLED: "merge_sumo.controllers.python:InstalledKind",
+        BUILT_IN: "merge_sumo.controllers.built_in:BuiltInKind",
+    },
+    accepts=lambda item: isinstance(item, type) and issubclass(item, ControllerKind),
+    contract="a subclass of merge_sumo.controllers.spec.ControllerKind",
+)
+
+
+def parse(text: str) -> ControllerSpec:
+    """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`; an unknown name is of `installed`.
+
+    Raises `UserError` for what is no parameter, and for one that is given twice.
+    """
+    kind, _, argument = text.partition(":")
+    if kind not in KINDS or kind in WITHOUT_PREFIX:
+        kind, argument = "", text
+    elif not KINDS[kind].has_parameters:
+        return ControllerSpec(kind, argument)
+    argument, _, options = argument.partition("?")
+    parameters: dict[str, str] = {}
+    for part in filter(None, options.split("&")):
+        name, _, value = part.partition("=")
+        if not (name and value):
+            raise UserError(f"{text}: {part!r} is not an option: write NAME=VALUE")
+        if name in parameters:
+            raise UserError(f"{text}: the option {name} is there twice")
+        parameters[name] = value
+    if not kind:
+        named = PYTHON if ":" in argument else INSTALLED
+        kind = BUILT_IN if argument in BUILT_IN_VUTS else named
+    return ControllerSpec(kind, argument, tuple(parameters.items()))
+
+
+def load(text: str, options: ControllerOptions | None = None) -> ControllerKind:
+    """Load the controller that a text names, in a process of its own where its kind is hosted.
+
+    Args:
+        text: as after `--vut`.
+        options: how it is hosted.
+
+    Raises:
+        UserError: for a text that names no controller, or one that cannot be loaded.
+    """
+    spec, options = parse(text), options or ControllerOptions()
+    if spec.kind == INSTALLED and spec.argument not in installed_vuts():
+        raise UserError(_why_unknown(spec.argument))
+    kind = KINDS[spec.kind]
+    is_hosted = kind.hosted and SUPPORTED and not options.in_process
+    controller = HostedKind(spec, options, kind) if is_hosted else kind(spec, options)
+    controller.files  # noqa: B018 (hashed before it drives)
+    return controller
+
+
+def _why_unknown(name: str) -> str:
+    if name.endswith(".py"):
+        return f"{name} is a file: name a class or a function of it, {name}:NAME"
+    names = [*BUILT_IN_VUTS, *installed_vuts()]
+    choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
+    if not name:
+        return f"name the vehicle under test, as in `vut` design2: {choice}"
+    kinds = [kind for kind, brings in KINDS.items() if brings.form]
+    return f"there is no VUT {name!r}: {meant(name, (*names, *kinds))}choose one of {choice}"
+
+
+def is_built_in(text: str) -> bool:
+    """Return whether a spec names a VUT that the package brings, with parameters or without."""
+    return parse(text).kind == BUILT_IN
+
+
+def waits_for_client(text: str) -> bool:
+    """Return whether a user starts the VUT's program, which then cannot be started again."""
+    spec = parse(text)
+    return KINDS[spec.kind].waits(spec.argument)
+
+
+def runs_code(text: str) -> bool:
+    """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
+    return KINDS[parse(text).kind].own_code and not waits_for_client(text)
