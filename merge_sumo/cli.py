@@ -26,7 +26,7 @@ from merge_sumo.console import (
     stoppable,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import dated
+from merge_sumo.files import dated
 from merge_sumo.interrupt import Stopped, stopping_in_order
 from merge_sumo.limits import check_limits, exhausted
 from merge_sumo.printable import quoted

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any, Final, TextIO
 from merge_sumo import config
 from merge_sumo.errors import Notice, UserError, WorkersLostError
 from merge_sumo.interrupt import Interrupt, Stopped
-from merge_sumo.printable import printable
+from merge_sumo.printable import either, printable
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.suggestions import either
 
 if TYPE_CHECKING:
     from merge_sumo.result import Result

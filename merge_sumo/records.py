@@ -8,9 +8,11 @@ file may be another person's.
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import tomllib
+import zipfile
 from collections.abc import Container, Sequence
 from dataclasses import is_dataclass
 from enum import Enum
@@ -34,10 +36,11 @@ from typing import (
 import msgspec
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.folders import read_limited, regular
-from merge_sumo.suggestions import meant
+from merge_sumo.files import read_limited, regular
+from merge_sumo.printable import meant
 
 T = TypeVar("T")
 
@@ -304,3 +307,20 @@ def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
         shown = "something endless"
     finite = "out of range" in message
     return f"{name} is {shown}: it must be {'finite' if finite else in_words(hint)}"
+
+
+def read_arrays(file: Path | io.BytesIO, *names: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an .npz file of ours, or those that are named.
+
+    Ours are not compressed, so that no file is more than it looks.
+
+    Raises:
+        RecordError: there is none, or what is there is something else.
+    """
+    try:
+        with np.load(regular(file) if isinstance(file, Path) else file, allow_pickle=False) as data:
+            if any(member.compress_type != zipfile.ZIP_STORED for member in data.zip.infolist()):
+                raise ValueError("it is compressed")
+            return {name: data[name] for name in names or data.files}
+    except Exception as error:  # numpy and the zip library raise whatever comes up
+        raise RecordError(str(error)) from error

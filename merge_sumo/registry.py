@@ -17,7 +17,7 @@ from typing import Final, Generic, TypeVar
 from warnings import warn
 
 from merge_sumo.errors import Notice, UserError
-from merge_sumo.suggestions import meant
+from merge_sumo.printable import meant
 
 T = TypeVar("T")
 

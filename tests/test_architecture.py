@@ -169,7 +169,7 @@ def unsafe_calls(source: str) -> list[str]:
 
 
 REMOVERS = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
-MAY_REMOVE = {"merge_sumo.folders", "merge_sumo.scratch"}
+MAY_REMOVE = {"merge_sumo.files", "merge_sumo.scratch"}
 """The first asks what is ours; the second removes temporary folders of ours that no process locks;
 the third removes what was unpacked for it."""
 

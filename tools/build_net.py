@@ -14,7 +14,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from merge_sumo.folders import check_new_file, replace_own
+from merge_sumo.files import check_new, replace_own
 from merge_sumo.sumo.binding import sumo_program
 
 SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
@@ -23,7 +23,7 @@ SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
 def build(configuration: Path, output: Path) -> bytes:
     """Build the net of a configuration into `output`, ours or a new file; return its bytes."""
     if output.parent != SOURCES:
-        check_new_file(output)
+        check_new(output)
     with tempfile.TemporaryDirectory() as folder:
         for source in SOURCES.glob(f"{configuration.stem}.*"):
             shutil.copy(source, folder)

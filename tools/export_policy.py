@@ -20,7 +20,7 @@ from merge_sumo.controllers.onnx import PERIOD, STATE
 from merge_sumo.drivers.levelk import DECISION_STEPS, actions_mps2, features
 from merge_sumo.drivers.policies import NETWORKS, load_network, read_manifest, scenario_of
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new_file, write_new
+from merge_sumo.files import check_new, write_new
 from merge_sumo.scenario.scenario import DT_S, Scenario
 
 OPSET: Final = 17
@@ -59,7 +59,7 @@ def export_onnx(
         raise UserError("an export needs onnx: run `pip install 'merge-sumo[onnx]'`") from error
     if name not in NETWORKS:
         raise UserError(f"there is no policy {name!r}: choose one of {', '.join(NETWORKS)}")
-    check_new_file(path)
+    check_new(path)
     network = load_network(name, folder)
     if network.a_min_mps2 is not None:
         raise UserError(

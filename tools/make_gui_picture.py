@@ -16,7 +16,7 @@ from pathlib import Path
 
 from lxml import etree
 
-from merge_sumo.folders import check_new_file
+from merge_sumo.files import check_new
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.replay_folder import CONFIG, VIEW
 
@@ -50,7 +50,7 @@ def main() -> None:
     parser.add_argument("time_s", type=float)
     parser.add_argument("picture", type=Path)
     arguments = parser.parse_args()
-    check_new_file(arguments.picture, "PICTURE")
+    check_new(arguments.picture, "PICTURE")
     take(arguments.folder, arguments.time_s, arguments.picture)
     print(arguments.picture)
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from playwright.sync_api import sync_playwright
 
 from merge_sumo.campaigns.run import Run
-from merge_sumo.folders import check_new_file
+from merge_sumo.files import check_new
 from merge_sumo.reports.report import write_report
 
 WIDTH_PX, HEIGHT_PX = 1280, 1880
@@ -44,7 +44,7 @@ def main() -> None:
     parser.add_argument("run", type=Path)
     parser.add_argument("picture", type=Path, nargs="?", default=Path("scenarios/report.png"))
     arguments = parser.parse_args()
-    check_new_file(arguments.picture, "PICTURE")
+    check_new(arguments.picture, "PICTURE")
     take(write_report(Run(arguments.run)), arguments.picture)
     print(arguments.picture)
 

@@ -29,7 +29,7 @@ from merge_sumo.campaigns.again import command
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError
-from merge_sumo.folders import free
+from merge_sumo.files import free
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import fmc, radius_for, regions
 from merge_sumo.metrics.merge import Severity

@@ -36,6 +36,7 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.metrics.score import Outcome
+from merge_sumo.printable import either
 from merge_sumo.records import Record
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray, MergeCase
@@ -46,7 +47,6 @@ from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.simulation.simulator import povs_for
-from merge_sumo.suggestions import either
 from merge_sumo.sumo.world import World
 from merge_sumo.workers import Workers, workers_or_here
 

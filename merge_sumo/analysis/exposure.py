@@ -24,10 +24,10 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.records import Record, convert, decode, read_toml, record_type, to_plain
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import Dimension, Scenario, as_merge
-from merge_sumo.suggestions import meant
 
 Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[

@@ -15,7 +15,7 @@ from merge_sumo.campaigns.scenario_suggestion import (
     suggested_lane_m,
     unseen,
 )
-from merge_sumo.folders import check_ending, check_new_file, write_new
+from merge_sumo.files import check_new, write_new
 from merge_sumo.printable import quoted
 from merge_sumo.result import Shown
 from merge_sumo.road.drawing import road_svg
@@ -43,10 +43,9 @@ def write_scenario(asked: config.NewScenario) -> Shown:
     Raises `UserError` for a net without such a merge, and where something is there.
     """
     file, net = Path(asked.file), Path(asked.net)
-    check_ending(file, (SUFFIX,), "FILE")
+    check_new(file, "FILE", (SUFFIX,))
     picture = file.with_suffix(".svg")
-    for path in (file, picture):
-        check_new_file(path, "FILE")
+    check_new(picture, "FILE")
     edges = tuple(asked.mainline.split()), tuple(asked.ramp.split())
     road = road_of(net, *edges)
     if not asked.point:

@@ -38,7 +38,7 @@ from merge_sumo.analysis.exposure import Distribution, Traffic, named_traffic, r
 from merge_sumo.analysis.run_study import RunStudy, StudyFile, check_least
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new_file, write_new
+from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record, to_json
@@ -194,7 +194,7 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
         raise UserError(f"`confidence` is {asked.confidence}: choose 0.5 or more, and below 1")
     if asked.distribution is not None and asked.traffic is not None:
         raise UserError("choose a distribution or a traffic: a traffic states its own")
-    check_new_file(out, endings=(".json",))
+    check_new(out, endings=(".json",))
     study.check_same_system()
     traffic = None if asked.traffic is None else named_traffic(str(asked.traffic))
     if traffic is None:

@@ -25,7 +25,7 @@ from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepe
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import waits_for_client
 from merge_sumo.errors import UserError
-from merge_sumo.folders import free
+from merge_sumo.files import free
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import counted

@@ -10,8 +10,7 @@ from typing import Any, Generic, TypeVar
 from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.errors import UserError, notice
-from merge_sumo.folders import check_ours, replace_own
-from merge_sumo.hashing import files_now
+from merge_sumo.files import check_ours, files_now, replace_own
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.printable import printable
 from merge_sumo.records import Record, read_record, to_json
@@ -36,9 +35,14 @@ class StudyFile(Generic[R]):
     name: str
     kind: type[R]
 
+    @property
+    def _mark(self) -> bytes:
+        """The name of the first field, which every file of the kind has in it."""
+        return f'"{self.kind.__struct_fields__[0]}"'.encode()
+
     def check(self, folder: Path) -> None:
         """Raise `UserError` where a file of this name is not ours to replace."""
-        check_ours(folder / self.name, self.kind.__struct_fields__)
+        check_ours(folder / self.name, self._mark)
 
     def read(self, folder: Path) -> R | None:
         """Read the record; None without the file, `UserError` where it is not as it was written."""
@@ -46,7 +50,7 @@ class StudyFile(Generic[R]):
 
     def write(self, folder: Path, record: R) -> None:
         """Write the record, in the place of an older one."""
-        replace_own(folder / self.name, to_json(record, indent=1))
+        replace_own(folder / self.name, to_json(record, indent=1), self._mark)
 
     def read_lines(self, run: Run) -> dict[int, R]:
         """Read the lines by index; `UserError` for one that is not of a failure of the campaign."""
@@ -55,7 +59,7 @@ class StudyFile(Generic[R]):
 
     def write_lines(self, folder: Path, lines: Iterable[R]) -> None:
         """Write lines, in the place of older ones."""
-        replace_own(folder / self.name, b"".join(map(to_json, lines)))
+        replace_own(folder / self.name, b"".join(map(to_json, lines)), self._mark)
 
 
 T = TypeVar("T")

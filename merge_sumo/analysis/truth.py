@@ -14,21 +14,27 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_own, check_place, make_place, regular, replace_own
-from merge_sumo.hashing import Files, changed
+from merge_sumo.files import (
+    CACHE,
+    Files,
+    cache_folder,
+    check_own,
+    check_private,
+    make_folder,
+    regular,
+    replace_own,
+    sha256_of,
+)
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import fmc, growth_bound, has_neighbour, regions
-from merge_sumo.records import decode
-from merge_sumo.resources import cache_folder
+from merge_sumo.records import decode, read_arrays
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.scenario import OWN, Scenario, level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
-from merge_sumo.trust import CACHE, check_private
 from merge_sumo.workers import Workers
 
 TRUTH_CASES: Final = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
@@ -165,7 +171,9 @@ def ground_truth(
     if known is not None:
         return known[0]
     path = kept.path(cache)
-    check_place(path.parent, CACHE)
+    if not path.parent.is_dir():
+        make_folder(path.parent, CACHE)
+        path.parent.chmod(stat.S_IRWXU)
     check_own(path)
     check_private(path.parent)
     points = np.random.default_rng([seed, level]).random(
@@ -174,9 +182,6 @@ def ground_truth(
     truth, files = _run(plan.at_level(level), level, points, workers, on_cases)
     arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
     np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
-    if not path.parent.is_dir():
-        make_place(path.parent, CACHE)
-        path.parent.chmod(stat.S_IRWXU)
     replace_own(path, arrays.getvalue())
     return truth
 
@@ -259,12 +264,13 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
         check_private(path.parent)
         if regular(path).stat().st_size > numbers_bytes + MOST_FILES_BYTES:
             return None
-        data = read_arrays(path)
+        data = read_arrays(path, *COLUMNS, "files", "of")
         points, margin, in_sumo = (data[name] for name in COLUMNS)
         files = decode(str(data["files"]), dict[str, str | None])
-        if str(data["of"]) != path.stem or changed(files):
+        unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
+        if str(data["of"]) != path.stem or not unchanged:
             return None
-    except (*UNREADABLE_NPZ, UserError):
+    except (OSError, UserError):
         return None
     shapes = points.shape, margin.shape, in_sumo.shape
     types = points.dtype.kind, margin.dtype.kind, in_sumo.dtype.kind

@@ -66,9 +66,8 @@ from merge_sumo.controllers.parameters import Range
 from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
 from merge_sumo.errors import UserError, notice
-from merge_sumo.folders import (
+from merge_sumo.files import (
     check_new,
-    check_new_file,
     check_own,
     dated,
     make_folder,
@@ -190,9 +189,9 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
     """
     out, junit = path_of(config.out), path_of(config.junit)
     if out is not None:
-        check_new_file(out, endings=(ending,))
+        check_new(out, endings=(ending,))
     if junit is not None:
-        check_new_file(junit, "`junit`", JUNIT)
+        check_new(junit, "`junit`", JUNIT)
     return out, junit
 
 

@@ -18,7 +18,7 @@ from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import WorkersLostError, notice
-from merge_sumo.folders import check_new, link_latest
+from merge_sumo.files import check_new, link_latest
 from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import parse_gates

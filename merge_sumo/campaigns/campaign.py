@@ -16,8 +16,7 @@ from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failur
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.folders import TakenError, check_new, check_own
-from merge_sumo.hashing import files_now
+from merge_sumo.files import TakenError, check_new, check_own, files_now
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.road.centre_lines import centre_lines

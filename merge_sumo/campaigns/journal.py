@@ -29,7 +29,7 @@ from merge_sumo.campaigns.run import (
     batch_file,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_own, make_place, replace_own, sync_folder, write_folder
+from merge_sumo.files import check_own, make_folder, replace_own, sync_folder, write_folder
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import to_json
@@ -62,7 +62,7 @@ class Journal:
         self._outcomes = outcomes
         self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
-        make_place(folder / TRAJECTORIES)
+        make_folder(folder / TRAJECTORIES, exist_ok=True)
 
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:

@@ -24,7 +24,7 @@ import numpy as np
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
-from merge_sumo.folders import replace_own
+from merge_sumo.files import replace_own
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import Record, replaced, to_json
@@ -95,7 +95,7 @@ def repeat(
         }
         found = [one if one.same else replaced(one, drawn=drawn[one.index]) for one in found]
     found.sort(key=lambda one: one.index)
-    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)))
+    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
     return found
 
 

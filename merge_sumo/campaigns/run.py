@@ -21,18 +21,17 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from merge_sumo.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search
 from merge_sumo.errors import UserError
-from merge_sumo.folders import regular
+from merge_sumo.files import regular
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import regions
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import counted, printable
-from merge_sumo.records import Record, convert, decode, read_indexed
+from merge_sumo.records import Record, RecordError, convert, decode, read_arrays, read_indexed
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
@@ -184,7 +183,7 @@ class Run:
         """Simulated time of all cases with the follow-up; up to M where the motion is lost."""
         steps = {one.index: round(one.measures.t_end_s / DT_S) for one in self.outcomes}
         for batch in {one.batch for one in self.outcomes}:
-            with suppress(*UNREADABLE_NPZ):
+            with suppress(RecordError):
                 read = read_arrays(batch_file(self.folder, batch), "index", "rows")
                 ran = np.maximum(read["rows"], 1) - 1
                 whole = dict(zip(read["index"].tolist(), ran.tolist(), strict=True))
@@ -309,7 +308,7 @@ class Run:
             path = batch_file(self.folder, batch)
             try:
                 arrays = read_arrays(path)
-            except UNREADABLE_NPZ as error:
+            except RecordError as error:
                 raise LostError(f"cannot read the trajectories in {path}: {error}") from error
             try:
                 arrays.pop("lines_sha256", None)

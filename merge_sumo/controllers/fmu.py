@@ -11,9 +11,9 @@ from typing import Any, Final
 from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError
+from merge_sumo.files import check_code
+from merge_sumo.printable import either
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.suggestions import either
-from merge_sumo.trust import check_code
 
 INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT: Final = "acceleration_mps2"

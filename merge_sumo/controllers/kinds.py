@@ -18,8 +18,8 @@ from merge_sumo.controllers.spec import (
     ControllerSpec,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.registry import Registry
-from merge_sumo.suggestions import meant
 
 KINDS: Final[Registry[type[ControllerKind]]] = Registry(
     "merge_sumo.vut_kinds",

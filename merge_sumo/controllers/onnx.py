@@ -15,8 +15,8 @@ from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
+from merge_sumo.files import check_code
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.trust import check_code
 
 PERIOD: Final = "decision_period_s"
 """Metadata of a network, or option: it decides this often and holds its decision."""

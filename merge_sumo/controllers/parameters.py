@@ -9,8 +9,7 @@ from typing import Final
 
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
-from merge_sumo.printable import quoted
-from merge_sumo.suggestions import meant
+from merge_sumo.printable import meant, quoted
 
 DIGITS: Final = 3
 """A value is rounded to so many digits of its range: 0.5..3 to thousandths."""

@@ -41,12 +41,12 @@ from merge_sumo.controllers.signatures import (
 from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.files import check_code
 from merge_sumo.registry import entries_of
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.scenario.signals import Left, as_signals
 from merge_sumo.source_files import module_of_file
-from merge_sumo.trust import check_code
 
 objects: Final[dict[str, Any]] = {}
 """The objects of this process that are controllers, by the arguments of their specs."""

@@ -20,7 +20,7 @@ import msgspec
 from merge_sumo.controllers.controller import Controller, ControllerArray
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import Files, hashed
+from merge_sumo.files import Files, hashed
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
 from merge_sumo.workers import workers_or_cores

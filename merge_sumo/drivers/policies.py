@@ -12,10 +12,9 @@ import numpy as np
 from merge_sumo.drivers.base import BuiltInVut
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDriver, QNetwork
 from merge_sumo.errors import UserError
-from merge_sumo.folders import read_limited
+from merge_sumo.files import read_limited, resource
 from merge_sumo.printable import quoted
 from merge_sumo.records import Record, convert, decode
-from merge_sumo.resources import resource
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import US23, Scenario
 

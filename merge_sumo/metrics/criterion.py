@@ -29,10 +29,9 @@ from merge_sumo.metrics.score import (
     merge_score,
 )
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
-from merge_sumo.printable import printable
+from merge_sumo.printable import nearest, printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.suggestions import nearest
 
 PAPER: Final = "paper"
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
-from merge_sumo.hashing import Files
+from merge_sumo.files import Files
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.pickling import quickly_pickled
 from merge_sumo.scenario.trajectory import Trajectory
 
 
-@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Episode:
     """A case that was run: its outcome, what happened, and how it came to that.

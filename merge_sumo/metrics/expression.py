@@ -18,8 +18,7 @@ from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any, Final, NamedTuple
 
 from merge_sumo.errors import UserError
-from merge_sumo.printable import printable
-from merge_sumo.suggestions import either, meant, nearest
+from merge_sumo.printable import either, meant, nearest, printable
 
 Value = float | str
 """A number, which may be infinite, or a text."""

@@ -39,7 +39,6 @@ from merge_sumo.metrics.merge import (
     severity_of,
 )
 from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.pickling import quickly_pickled
 from merge_sumo.records import convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import (
@@ -73,7 +72,6 @@ MEASURED: Final = frozenset(measure.name for measure in OURS if measure.of is No
 """Measures that are fields of `Measures`."""
 
 
-@quickly_pickled
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measures:
     """Named measures of one episode, with the verdict first.

@@ -18,11 +18,10 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
-from merge_sumo.printable import printable
+from merge_sumo.printable import meant, printable
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.suggestions import meant
 
 SIGNALS: Final = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),

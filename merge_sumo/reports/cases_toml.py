@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
 from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
 from merge_sumo.campaigns.run import Run, spread_failures
-from merge_sumo.folders import check_ending, make_place, write_new
+from merge_sumo.files import check_new, make_folder, write_new
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import condition_of
 from merge_sumo.metrics.fmc import radius_for
@@ -89,14 +89,15 @@ def watching(run: Run) -> list[Outcome]:
 
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
     """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
-    if target.suffix and not target.is_dir():
-        check_ending(target, (SUFFIX,))
+    is_file = target.suffix == SUFFIX or (target.suffix and not target.is_dir())
+    path = target if is_file else target / f"cases{SUFFIX}"
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
-    path = target if target.suffix == SUFFIX else target / f"cases{SUFFIX}"
+    if is_file:
+        check_new(path, endings=(SUFFIX,))
+    else:
+        make_folder(target, exist_ok=True)
     content = cases_toml(run, outcomes, path, run.settings.vut).encode()
     check_toml_size(content, path)
-    if path != target:
-        make_place(target)
     write_new(path, content)
     return path
 

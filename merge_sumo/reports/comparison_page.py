@@ -11,7 +11,7 @@ import numpy as np
 
 from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against, cut
 from merge_sumo.campaigns.run import AGAINST, Run
-from merge_sumo.folders import replace_own
+from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.summary import judge
 from merge_sumo.reports.pages import X_AXIS, page
@@ -43,7 +43,8 @@ def write_against(run: Run) -> None:
     compared = compare_against(run)
     if compared is not None:
         html = comparison_page(compared)
-        replace_own(run.folder / AGAINST_PAGE, html.encode(errors="backslashreplace"))
+        content = html.encode(errors="backslashreplace")
+        replace_own(run.folder / AGAINST_PAGE, content, GENERATOR)
 
 
 def comparison_page(compared: Comparison) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new, check_place, make_place, new_file, write_folder
+from merge_sumo.files import check_new, make_folder, new_file, write_folder
 from merge_sumo.metrics.bodies import WIDTH_M
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.reports.cases_toml import write_cases
@@ -60,9 +60,9 @@ def write_folders(
 
     Raises `UserError` before it writes anything where there is no such case or no such place.
     """
-    check_place(target)
     for index in indices:
         run.outcome(index)
+    make_folder(target, exist_ok=True)
     for index in indices:
         yield write(run, index, target / case_name(index), road)
 
@@ -72,12 +72,11 @@ def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
 
     Raises `UserError` when the file exists, or a case has no trajectory.
     """
-    check_place(folder)
     path = folder / f"{TABLE}.csv"
     check_new(path)
     rows = [row for index in indices or range(len(run.outcomes)) for row in _rows(run, index)]
     signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
-    make_place(folder)
+    make_folder(folder, exist_ok=True)
     with new_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         writer = csv.DictWriter(text, (*columns_of(run.scenario), *signals))

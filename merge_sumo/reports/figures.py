@@ -18,7 +18,7 @@ import numpy as np
 from merge_sumo.analysis.reproduction import LevelBatches, Panel, PredictedMargins
 from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_new_file, write_new
+from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import FloatArray
@@ -53,7 +53,7 @@ STYLE: Final[Any] = {
 
 def check_figure(path: Path) -> None:
     """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
-    check_new_file(path, "`figure`", KINDS)
+    check_new(path, "`figure`", KINDS)
     require_matplotlib()
 
 

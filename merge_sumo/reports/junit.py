@@ -20,7 +20,7 @@ from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, Step, 
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_ending, check_new, check_new_file, write_new
+from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
@@ -41,13 +41,9 @@ REGRESSION: Final = "regression"
 
 def check_junit(path: Path, folder: Path) -> None:
     """Raise `UserError` where a campaign in `folder` cannot write this JUnit file later."""
-    check_ending(path, JUNIT, "`junit`")
     if path.absolute() == folder.absolute():
         raise UserError(f"`junit` is {path}, the folder of the campaign: choose a file")
-    if path.parent.absolute() == folder.absolute():
-        check_new(path, "`junit`")
-    else:
-        check_new_file(path, "`junit`")
+    check_new(path, "`junit`", JUNIT)
 
 
 def write_junit(

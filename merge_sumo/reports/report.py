@@ -21,7 +21,7 @@ from markupsafe import Markup
 
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_ours, replace_own
+from merge_sumo.files import GENERATOR, check_ours, replace_own
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import Summary
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
@@ -56,7 +56,7 @@ def write_report(
 
 
 def _replace(run: Run, html: str) -> None:
-    replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"))
+    replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"), GENERATOR)
 
 
 class RunningReport:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from merge_sumo.analysis.reproduction import Reproduction
-from merge_sumo.folders import write_new
+from merge_sumo.files import write_new
 from merge_sumo.records import to_json
 from merge_sumo.reports import figures
 from merge_sumo.reports.pages import page

@@ -34,12 +34,11 @@ from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.plausibility import behind
 from merge_sumo.metrics.summary import judge
-from merge_sumo.printable import counted
+from merge_sumo.printable import counted, either
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.coordinates import coordinates, described
 from merge_sumo.scenario.scenario import level_name
-from merge_sumo.suggestions import either
 
 FRAGILE: Final = 10
 """Failures that are not robust that a sentence names."""

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from merge_sumo.resources import resource
+from merge_sumo.files import resource
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile

@@ -15,8 +15,8 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.road.xml_input import NET_TAGS, parse_xml, read_xml
-from merge_sumo.suggestions import meant
 
 VEHICLE_CLASS: Final = "passenger"
 ALIKE_EDGES: Final = 0.5

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.files import resource
+from merge_sumo.printable import meant
 from merge_sumo.records import read_toml, toml_value
-from merge_sumo.resources import resource
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.suggestions import meant
 
 SUFFIX: Final = ".toml"
 

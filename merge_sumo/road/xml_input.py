@@ -17,7 +17,7 @@ from typing import Final
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.folders import read_limited
+from merge_sumo.files import read_limited
 
 MAX_BYTES: Final = 2**28
 """Of a file, unpacked: the net of a city has 50 MB."""

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.pickling import quickly_pickled
 from merge_sumo.scenario.imperfection import (
     ACT,
     PERFECT_ACTUATION,
@@ -53,7 +52,6 @@ MOST_DRAWS: Final = 2**32
 """Draws of a case: their numbers have 4 bytes."""
 
 
-@quickly_pickled
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
     """One test case, a point of a scenario; a kind of scenario has a subclass with its coordinates.
@@ -168,7 +166,6 @@ class Case:
             _ = self.sensing, self.actuation
 
 
-@quickly_pickled
 @dataclass(frozen=True, kw_only=True, slots=True)
 class MergeCase(Case):
     """A case of a merge: start and speed of the POV and, in traffic, headways to its neighbours."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, Final, Self, TypeVar
 
 from merge_sumo.errors import UserError
-from merge_sumo.suggestions import either, meant
+from merge_sumo.printable import either, meant
 
 Bounds = tuple[float, float]
 Amount = float | Bounds

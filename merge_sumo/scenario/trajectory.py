@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.pickling import quickly_pickled
 from merge_sumo.printable import printable
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VUT
@@ -50,7 +49,6 @@ def as_reason(text: str) -> str:
     return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
 
 
-@quickly_pickled
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """Positions, speeds and accelerations of all vehicles in one episode.

@@ -15,7 +15,7 @@ from typing import Any, TypeVar, overload
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import hashed
+from merge_sumo.files import hashed
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome, measure_all
 from merge_sumo.road.centre_lines import centre_lines

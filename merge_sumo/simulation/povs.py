@@ -21,7 +21,8 @@ from merge_sumo.drivers.policies import (
     policies_sha256,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import Files
+from merge_sumo.files import Files
+from merge_sumo.printable import either
 from merge_sumo.scenario.case import Case, FloatArray, ToldCase
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
@@ -33,7 +34,6 @@ from merge_sumo.scenario.scenario import (
     level_name,
     names_of_levels,
 )
-from merge_sumo.suggestions import either
 from merge_sumo.sumo.world import World
 
 POLICIES: Final = {1: "pov1", 2: "pov2"}

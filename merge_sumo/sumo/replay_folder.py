@@ -18,7 +18,7 @@ from typing import Final
 
 from lxml import etree
 
-from merge_sumo.folders import write_folder
+from merge_sumo.files import write_folder
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.score import Outcome

@@ -11,8 +11,6 @@ A contract needs no pytest to be imported, and no SUMO unless it says so.
 
 from __future__ import annotations
 
-from contextlib import closing
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -22,29 +20,18 @@ import numpy as np
 from merge_sumo import api
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import load
-from merge_sumo.controllers.spec import ControllerKind
-from merge_sumo.drivers.base import Scene
-from merge_sumo.drivers.policies import policies_of
-from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measure
-from merge_sumo.road.merge import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
-from merge_sumo.scenario.case import Case, FloatArray, MergeCase, Pool, ToldCase
-from merge_sumo.scenario.imperfection import Sensing
+from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.scratch import ScratchFolder
-from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import Povs
-from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.sumo.world import World
 
 __all__ = [
     "MeasureContract",
     "SamplerContract",
     "VutContract",
-    "assert_sees_late",
     "episode",
     "play",
     "play_case",
@@ -114,50 +101,6 @@ def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
     return api.campaign(vut, out=folder, scenario=scenario, progress=False, **keywords).run
 
 
-LATE_STEPS: Final = 2
-"""By so many steps the sensors are late."""
-
-
-def assert_sees_late(factory: ControllerKind) -> None:
-    """Assert that a VUT with late sensors answers to the log of its episode, shifted.
-
-    It drives once with such sensors; then it is asked again, without any, about the positions and
-    speeds of the POV that many steps before, and those of the VUT at the time.
-    """
-    late = replace(US23, sense=Sensing(delay_s=LATE_STEPS * DT_S))
-    case = MergeCase(level=1, x_pov0_m=-260.0, v_pov0_mps=29.0, scenario=late)
-    road, povs = road_of(), Povs(policies=policies_of(US23))
-    plan = SimulationPlan(
-        scenario=late, road=road, vut=factory, povs=povs, criterion=Criterion(), corridors=1
-    )
-    with Simulator(plan) as simulator:
-        (ran,) = simulator.run([case])
-    assert ran.error is None
-    seen = shifted(ran.motion, LATE_STEPS)
-    told = tuple(map(tuple, seen[0, :, :2].tolist()))
-    with World(1, road, scenario=US23) as world, closing(factory.open(1, world)) as driver:
-        driver.begin(0, ToldCase(level=1, scenario=US23, told=told))
-        answers = []
-        for step, state in enumerate(seen[:-1]):
-            x_m, v_mps = state[:, 0, None], state[:, 1, None]
-            scene = Scene(np.array([True]), np.array([step]), x_m, v_mps)
-            answers.append(float(driver.act(scene)[0]))
-    obeyed = np.clip(answers, US23.a_min_mps2, US23.a_max_mps2)
-    assert np.array_equal(obeyed, ran.a_vut_mps2[:-1]), "it answers to something else"
-
-
-def shifted(motion: FloatArray, steps: int) -> FloatArray:
-    """Return a motion, (T + 1, A, 3), with the other cars where they were some steps before.
-
-    Before the start they drove as they start.
-    """
-    before = np.repeat(motion[:1], steps, axis=0)
-    before[:, :, 0] += before[:, :, 1] * (np.arange(-steps, 0) * DT_S)[:, None]
-    late = np.concatenate((before, motion))[: len(motion)]
-    late[:, VUT] = motion[:, VUT]
-    return late
-
-
 class VutContract:
     """What a campaign relies on in a VUT, at a point and on an acceleration lane.
 
@@ -184,12 +127,6 @@ class VutContract:
             for index in (0, 7):
                 alone = api.run(self.vut, recorded=(run.folder, index))
                 assert alone.measures == run.outcome(index).measures
-
-    def test_sees_with_late_sensors_what_was_before(self) -> None:
-        """SUMO's own drivers see in SUMO, and have no sensors."""
-        factory = load(self.vut)
-        if factory.vut_type is None:
-            assert_sees_late(factory)
 
     def test_is_found_again_by_its_name(self) -> None:
         """A worker is told the name and makes it anew."""

@@ -33,10 +33,10 @@ from merge_sumo.drivers.policies import (
     scenario_record,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.folders import (
+from merge_sumo.files import (
     cannot_write,
     check_own,
-    make_place,
+    make_folder,
     replace_own,
     write_new,
 )
@@ -164,7 +164,7 @@ def _take(folder: Path) -> None:
 
     Raises `UserError` for a folder that has other contents and no manifest.
     """
-    make_place(folder)
+    make_folder(folder, exist_ok=True)
     manifest = folder / MANIFEST
     files = [folder / f"{name}{end}" for name in NETWORKS for end in (LOG, WEIGHTS)]
     check_own(manifest, *files)

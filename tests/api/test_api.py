@@ -12,7 +12,7 @@ from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
-from merge_sumo.folders import DATED, dated
+from merge_sumo.files import DATED, dated
 from merge_sumo.metrics.summary import summarise
 
 

@@ -31,8 +31,8 @@ from merge_sumo.campaigns.run import (
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
+from merge_sumo.files import resource
 from merge_sumo.reports.report import write_report
-from merge_sumo.resources import resource
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import replay

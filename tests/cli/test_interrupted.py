@@ -18,7 +18,7 @@ import pytest
 from support.attacks import SIGNALS, World, stop
 from support.processes import wait_for
 
-from merge_sumo.folders import TEMPORARY
+from merge_sumo.files import TEMPORARY
 
 CONTROLLER = "def old(seen):\n    return 0.4\n\n\ndef new(seen):\n    return 0.6\n"
 

@@ -20,7 +20,7 @@ from entrants import LIMIT_S, check_spec
 from problems import named_problems
 
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_ours, replace_own
+from merge_sumo.files import GENERATOR, check_ours, replace_own
 from merge_sumo.reports.progress import Bars
 from merge_sumo.workers import LocalProcesses, Workers, workers_or_cores
 
@@ -54,7 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result = contest.benchmark(given.samplers, settings, folder, workers, on_step=bars.counted)
     record = json.dumps(result.to_record(), indent=1, allow_nan=False)
     replace_own(folder / contest.RECORD, f"{record}\n".encode())
-    replace_own(folder / contest.PAGE, contest_page(result).encode(errors="backslashreplace"))
+    page = contest_page(result).encode(errors="backslashreplace")
+    replace_own(folder / contest.PAGE, page, GENERATOR)
     print(result)
 
 

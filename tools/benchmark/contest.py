@@ -39,7 +39,7 @@ from problems import (
 
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.errors import UserError
-from merge_sumo.folders import check_own, make_place, regular, replace_own
+from merge_sumo.files import check_own, make_folder, regular, replace_own
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import counted
@@ -592,7 +592,7 @@ def benchmark(
     tasks = _tasks(entered, settings)
     place = folder / SEARCHES
     check_own(folder, place)
-    make_place(place)
+    make_folder(place, exist_ok=True)
     found = {task: known for task in tasks if (known := read_found(place, task)) is not None}
     missing = [task for task in tasks if task not in found]
     title = "searches" + (f" ({len(found)} there already)" if found else "")

@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 from merge_sumo.analysis.sampler_study import COMPARED_BATCH
 from merge_sumo.controllers.deadline import Deadline, DeadlineExceeded, text_of
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import sha256_of
+from merge_sumo.files import sha256_of
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler

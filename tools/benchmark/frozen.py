@@ -16,9 +16,9 @@ from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.suggestions import meant
 
 CRUISE_MPS: Final = 28.0
 

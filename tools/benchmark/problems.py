@@ -23,20 +23,19 @@ from oracle import oracle
 from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.truth import Truth, ground_truth
-from merge_sumo.arrays import UNREADABLE_NPZ, read_arrays
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.hashing import sha256_of
+from merge_sumo.files import sha256_of
 from merge_sumo.metrics.fmc import fmc, growth_bound, radius_for
-from merge_sumo.records import Record, read_record
+from merge_sumo.printable import meant
+from merge_sumo.records import Record, RecordError, read_arrays, read_record
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.kinematic_simulator import CHUNK
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.suggestions import meant
 
 TRUTHS: Final = Path(__file__).parent / "truths"
 """The folder of the truths."""
@@ -293,7 +292,7 @@ def shipped_truth(problem: Problem, folder: Path = TRUTHS) -> ProblemTruth:
         )
     try:
         arrays = read_arrays(io.BytesIO(path.read_bytes()))
-    except UNREADABLE_NPZ as error:
+    except RecordError as error:
         raise UserError(f"{path} cannot be read: {error}") from error
     levels = problem.levels
     return ProblemTruth(

@@ -39,11 +39,11 @@ from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
+from merge_sumo.files import check_code
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.sumo.world import World
-from merge_sumo.trust import check_code
 
 DEFAULT_PORT: Final = 8813
 """Port of TraCI clients that are given no other."""

@@ -8,7 +8,7 @@ Files of merge-sumo in a run folder may be written again, but not through links.
 from __future__ import annotations
 
 import errno
-import json
+import hashlib
 import os
 import re
 import secrets
@@ -19,11 +19,13 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.printable import printable, quoted
 
 TEMPORARY: Final = ".merge-sumo-"
 """Begin of the names under which files are written."""
@@ -33,8 +35,9 @@ GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
 DEFAULT: Final = Path("runs")
 """Folder of runs without a name."""
 LATEST: Final = "latest"
-DATED: Final = re.compile(r"[\w.-]*-([0-9]{8}-[0-9]{6})")
-"""The names that `dated` gives, with the time."""
+CACHE: Final = "MERGE_SUMO_CACHE"
+DATED: Final = re.compile(r"[\w.-]*-[0-9]{8}-[0-9]{6}(-[0-9]+)?")
+"""The names that `dated` gives."""
 
 
 class TakenError(UserError):
@@ -57,11 +60,16 @@ def read_limited(path: Path, most_bytes: int) -> bytes:
     return content
 
 
-def check_new(path: Path, option: str = "`out`") -> None:
-    """Raise `UserError` where no new folder or file can be made at `path`.
+def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) -> None:
+    """Raise `UserError` where no new file or folder can be made at a path.
 
-    Missing folders above it can be made; `option` names it in the message.
+    Args:
+        path: the file or folder; missing folders above it can be made.
+        option: what names it in the message.
+        endings: those that a file may have, by which other programs know what it is.
     """
+    if endings and path.suffix not in endings:
+        raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
     if path.name in ("", ".."):
         raise UserError(f"{option} is {str(path)!r} or empty: write the name of what is to be made")
     if os.path.lexists(path):
@@ -76,54 +84,11 @@ def check_new(path: Path, option: str = "`out`") -> None:
     parent = next((p for p in path.parents if os.path.lexists(p)), path.parent)
     if not parent.is_dir():
         raise UserError(f"cannot write {path}: {parent} is not a folder")
-    _check_writable(parent, path)
-
-
-def _check_writable(folder: Path, path: Path) -> None:
     try:
         # On Linux the file never has a name: nothing changes in the folder.
-        tempfile.TemporaryFile(dir=folder).close()
+        tempfile.TemporaryFile(dir=parent).close()
     except OSError as error:
         raise cannot_write(path, error) from error
-
-
-def check_ending(path: Path, endings: Sequence[str], option: str = "`out`") -> None:
-    """Raise `UserError` where a name does not say to other programs what the file is.
-
-    Args:
-        path: the file.
-        endings: those that its name may have.
-        option: what names it in the message.
-    """
-    if path.suffix not in endings:
-        raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
-
-
-def check_new_file(path: Path, option: str = "`out`", endings: Sequence[str] = ()) -> None:
-    """Raise `UserError` where no new file can be written at `path`, in an existing folder.
-
-    Args:
-        path: the file.
-        option: what names it in the message.
-        endings: those that its name may have; by default any.
-    """
-    if endings:
-        check_ending(path, endings, option)
-    check_new(path, option)
-    if not path.parent.is_dir():
-        raise UserError(f"{option} is {str(path)!r}: there is no folder {path.parent}")
-
-
-def check_place(folder: Path, option: str = "`out`") -> None:
-    """Raise `UserError` where `folder` is neither a folder to add to nor one that can be made."""
-    try:
-        is_there = folder.is_dir() and folder.name not in ("", "..")
-    except (OSError, ValueError):
-        is_there = False
-    if is_there:
-        _check_writable(folder, folder)
-    else:
-        check_new(folder, option)
 
 
 def check_own(*paths: Path) -> None:
@@ -144,56 +109,44 @@ def check_own(*paths: Path) -> None:
             raise UserError(f"cannot write {path}: it is {what}; remove it")
 
 
-def check_ours(path: Path, keys: Iterable[str] = ()) -> None:
-    """Raise `UserError` where there is a page or a record that merge-sumo did not write.
+def check_ours(path: Path, mark: bytes = GENERATOR) -> None:
+    """Raise `UserError` where there is a file that merge-sumo did not write.
 
-    A page of merge-sumo names its generator; a record has more of the `keys` than others, which may
-    be of another version.
+    Args:
+        path: the file, which may not exist.
+        mark: what a file of merge-sumo of that name has in it unless it is empty; by default the
+            generator of a page.
     """
     check_own(path)
     try:
-        if path.suffix == ".html":
-            ours = GENERATOR in path.read_bytes()
-        elif path.suffix in (".json", ".jsonl"):
-            found, expected = _keys(path.read_bytes(), path.suffix), set(keys)
-            ours = len(found & expected) > len(found ^ expected)
-        else:
-            return
+        content = path.read_bytes()
     except FileNotFoundError:
         return
     except OSError as error:
         raise cannot_write(path, error) from error
-    if not ours:
+    if content and mark not in content:
         raise UserError(f"{path} was not created by merge-sumo and is not overwritten: move it")
 
 
-def _keys(content: bytes, suffix: str) -> set[str]:
-    """Return the keys of a record, or of the first of many."""
-    try:
-        record = json.loads(content.partition(b"\n")[0] if suffix == ".jsonl" else content)
-    except (ValueError, RecursionError):
-        return set()
-    return set(record) if isinstance(record, dict) else set()
+def make_folder(path: Path, option: str = "`out`", *, exist_ok: bool = False) -> None:
+    """Make a folder.
 
+    Args:
+        path: the folder.
+        option: what names it in the message.
+        exist_ok: whether it may exist.
 
-def make_folder(path: Path, option: str = "`out`") -> None:
-    """Make an empty folder; `UserError` where it exists or cannot be made."""
-    check_new(path, option)
+    Raises:
+        UserError: it exists or cannot be made.
+    """
     try:
-        path.mkdir(parents=True)
+        if not (exist_ok and path.name not in ("", "..") and path.is_dir()):
+            check_new(path, option)
+            path.mkdir(parents=True)
     except FileExistsError as error:
         raise _exists(path, option) from error
     except OSError as error:
         raise cannot_write(path, error) from error
-
-
-def make_place(folder: Path, option: str = "`out`") -> None:
-    """Make a folder unless it is there; `UserError` where it cannot be made."""
-    check_place(folder, option)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise cannot_write(folder, error) from error
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -229,11 +182,11 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
 
 def _holds(path: Path, files: Mapping[str, bytes]) -> bool:
     """Return whether a path is a folder of just these files."""
+    if path.is_symlink() or not path.is_dir():
+        return False
     try:
-        if path.is_symlink() or {entry.name for entry in path.iterdir()} != files.keys():
-            return False
-        return all(regular(path / name).read_bytes() == files[name] for name in files)
-    except (OSError, ValueError):
+        return {file.name: regular(file).read_bytes() for file in path.iterdir()} == files
+    except OSError:
         return False
 
 
@@ -246,6 +199,7 @@ def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
     try:
         if os.path.lexists(path):
             raise FileExistsError
+        path.parent.mkdir(parents=True, exist_ok=True)
         with _temporary(path) as (new, file):
             yield file
             file.flush()
@@ -276,12 +230,18 @@ def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
         file.write(content)
 
 
-def replace_own(path: Path, content: bytes) -> None:
+def replace_own(path: Path, content: bytes, mark: bytes = b"") -> None:
     """Write a file of merge-sumo in the place of an older one, whole or not at all; sync it.
 
-    Raises `UserError` where something else is there (`check_ours`) or it cannot be written.
+    Args:
+        path: the file.
+        content: its bytes.
+        mark: what the older one has in it (`check_ours`).
+
+    Raises:
+        UserError: something else is there, or it cannot be written.
     """
-    check_ours(path, _keys(content, path.suffix))
+    check_ours(path, mark)
     try:
         with _temporary(path) as (new, file):
             _sync(file, content)
@@ -334,27 +294,20 @@ def free(path: Path) -> Path:
 def dated(what: str) -> Path:
     """Return a free dated name below `runs/`, of which `what` becomes a part."""
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
-    now = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-    candidate, number = DEFAULT / f"{name}-{now}", count(2)
-    while os.path.lexists(candidate):
-        candidate = DEFAULT / f"{name}-{next(number)}-{now}"
-    return candidate
+    return free(DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}")
 
 
 def link_latest(folder: Path) -> None:
-    """Let `runs/latest` lead to a folder that has its name from `dated`, unless one is newer.
+    """Let `runs/latest` lead to a folder that has its name from `dated`.
 
     Only a link to such a folder is replaced; where links cannot be made nothing happens.
     """
-    named = DATED.fullmatch(folder.name)
-    if folder.parent != DEFAULT or named is None or not folder.is_dir():
+    if folder.parent != DEFAULT or not DATED.fullmatch(folder.name) or not folder.is_dir():
         return
     link = DEFAULT / LATEST
     with suppress(OSError):
-        if os.path.lexists(link):
-            before = DATED.fullmatch(str(link.readlink()))  # raises where it is not a link
-            if before is None or before[1] > named[1]:
-                return
+        if os.path.lexists(link) and not DATED.fullmatch(str(link.readlink())):
+            return
         new = _temporary_name(link)
         new.symlink_to(folder.name, target_is_directory=True)
         new.replace(link)
@@ -365,5 +318,104 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
-def _exists(path: Path, option: str = "`out`") -> TakenError:
+def _exists(path: Path, option: str) -> TakenError:
     return TakenError(f"{path} exists: choose another name with {option}, or remove it first")
+
+
+Files = dict[str, str | None]
+"""SHA-256 by path, relative to the working folder where it lies below; None of a lost file."""
+
+
+def hashed(paths: Iterable[Path]) -> Files:
+    """Return files with their hashes."""
+    folder = Path.cwd().resolve()
+    files: Files = {}
+    for path in sorted({path.resolve() for path in paths}):
+        name = path.relative_to(folder) if path.is_relative_to(folder) else path
+        files[name.as_posix()] = sha256_of(path)
+    return files
+
+
+def files_now(recorded: Files, loaded: Files) -> Files:
+    """Return recorded files with the hashes that they have now, then what is `loaded` besides.
+
+    Args:
+        recorded: files by names that are relative to where a record was written.
+        loaded: files that are loaded now. A recorded file that is not at its place is looked for
+            next to them.
+    """
+    now, others = {}, dict(loaded)
+    for name in recorded:
+        now[name] = sha256_of(Path(name))
+        for other in loaded:
+            path = Path(other).with_name(Path(name).name)
+            if now[name] is None and (found := sha256_of(path)) is not None:
+                now[name] = found
+                others.pop(str(path), None)
+    return now | others
+
+
+def sha256_of(path: Path) -> str | None:
+    """Return the SHA-256 of a regular file; None where there is none that can be read."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            return None
+        return _sha256(path.resolve(), found.st_ino, found.st_ctime_ns, found.st_size)
+    except (OSError, ValueError):
+        return None
+
+
+# By the time of the last change of the inode: unlike that of the content, it cannot be set.
+@lru_cache(maxsize=4096)
+def _sha256(path: Path, _inode: int, _changed_ns: int, _size: int) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def check_code(path: Path) -> None:
+    """Raise `UserError` where users other than this one and root may write a file of code."""
+    if why := _written_by_others(path, 0):
+        raise UserError(
+            f"{printable(str(path))} is not run: {why}; make it yours alone (`chmod go-w "
+            f"{quoted(path)}`), or copy it"
+        )
+
+
+def check_private(folder: Path) -> None:
+    """Raise `UserError` where a cache folder is not this user's, or others can write it."""
+    if why := _written_by_others(folder):
+        raise UserError(
+            f"the cache folder {folder} is not used: {why}, and could forge what it holds; run "
+            f"`chmod go-w {quoted(folder)}`, or name another one with {CACHE}"
+        )
+
+
+def _written_by_others(path: Path, *trusted: int) -> str | None:
+    """Return a clause on others who may write a file or a folder; None where there are none."""
+    if sys.platform == "win32":  # the folders of a profile are the user's there
+        return None
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    if found.st_uid not in (os.geteuid(), *trusted):
+        return f"it belongs to the user {found.st_uid}"
+    return "others can write it" if found.st_mode & stat.S_IWOTH else None
+
+
+def resource(name: str) -> Path:
+    """Return the shipped folder `name` ("sumo_net" or "policies").
+
+    A wheel carries the folders inside the package; a source tree has them next to it.
+    """
+    package = Path(__file__).resolve().parent
+    shipped = package / "shipped" / name
+    return shipped if shipped.is_dir() else package.parent / name
+
+
+def cache_folder() -> Path:
+    """Return the folder of the cache: MERGE_SUMO_CACHE, or the user's cache folder."""
+    if named := os.environ.get(CACHE):
+        return Path(named)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "merge-sumo"
