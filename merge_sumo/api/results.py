@@ -32,8 +32,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of, headline
-from merge_sumo.reports.motion import lines_of
-from merge_sumo.reports.text import comparison_headline, transitions
+from merge_sumo.reports.text import comparison_headline, episode_lines, transitions
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.coordinates import coordinates
@@ -297,7 +296,7 @@ class CaseRun(Result):
     def lines(self) -> list[str]:
         """Return verdict, measures and motion, as `merge-sumo run` prints them."""
         notes = [f"note: {note}" for note in in_vain(dict.fromkeys(self.trajectory.in_vain, 1))]
-        return [*lines_of(self.outcome, self.trajectory, self._from_s), *notes]
+        return [*episode_lines(self.outcome, self.trajectory, self._from_s), *notes]
 
 
 def campaign_of(run: AnyRun) -> CampaignRun:

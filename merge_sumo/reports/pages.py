@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -38,11 +37,6 @@ def page(
     return environment().get_template(template).render({**own, **words})
 
 
-def fragment(source: str, words: Mapping[str, Any]) -> Markup:
-    """Return a part of a page, by the source of its template."""
-    return Markup(_compiled(source).render(words))  # noqa: S704 (the template escapes values)
-
-
 def source_of(name: str) -> str:
     """Return a file of the templates' folder."""
     return (TEMPLATES / name).read_text(encoding="utf-8")
@@ -60,8 +54,3 @@ def environment() -> Environment:
     made.globals |= {"described": described, "x_axis": X_AXIS}
     made.filters["shown"] = lambda value: printable(str(value)[:ERROR_CHARACTERS])
     return made
-
-
-@cache
-def _compiled(source: str) -> Any:
-    return environment().from_string(source)

@@ -20,35 +20,49 @@ import msgspec
 from markupsafe import Markup
 
 from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.files import GENERATOR, check_ours, replace_own
+from merge_sumo.metrics.cause import BRAKED_MPS
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import Summary
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
+from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
 from merge_sumo.reports.pages import page
-from merge_sumo.reports.report_data import page_data
+from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import OnPart, ReportModel
-from merge_sumo.reports.report_sections import sections_of, shared
+from merge_sumo.reports.text import comparison_headline, robustness
+from merge_sumo.scenario.scenario import MergeScenario, lane_of
 
 REPORT: Final = "report.html"
 """By this a report is known as ours, and may be replaced by a newer one."""
 FIRST_S: Final = 2.0
 """Seconds after which the report of a running campaign first appears."""
 EVERY_S: Final = 5
-"""Seconds between two reports of a running campaign, at least."""
+"""Minimum time between two reports of a running campaign, in s."""
 MOST_SHARE: Final = 0.1
-"""Of the time of a campaign that its report may take while it runs."""
+"""Maximum share of the time of a campaign that its report takes while it runs."""
 
 
 def write_report(
-    run: Run,
-    summary: Summary | None = None,
-    on_part: OnPart = lambda _done, _total: None,
+    run: Run, summary: Summary | None = None, on_part: OnPart = lambda _done, _total: None
 ) -> Path:
-    """Write `report.html` into the folder of a run, in place of an older one; return its path.
+    """Write `report.html` into the folder of a campaign, in place of an older one.
 
-    A campaign against an earlier version of the VUT has a page of what broke beside it. Raises
-    `UserError` when it cannot be written, or what is there is no report of ours.
+    A campaign against an earlier version of the VUT also gets a page of what broke.
+
+    Args:
+        run: the campaign.
+        summary: its summary, where that is known.
+        on_part: called with the number of levels whose surrogate is learned, and of all levels.
+
+    Returns:
+        The path of the report.
+
+    Raises:
+        UserError: if it cannot be written, or the file that is there is not a report of ours.
     """
     _replace(run, report_page(run, summary, on_part))
     write_against(run)
@@ -62,8 +76,8 @@ def _replace(run: Run, html: str) -> None:
 class RunningReport:
     """The report of a campaign that runs, rewritten every few seconds: a callback of the campaign.
 
-    It has no surrogates, which take seconds to learn. It never stops a campaign: where it cannot be
-    written, or `report.html` is somebody else's, that is said when the last one is written.
+    It has no surrogates, which take seconds to learn. It never stops a campaign: if it cannot be
+    written, or `report.html` is not ours, the last report raises the error.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -98,7 +112,7 @@ class RunningReport:
 
 
 def check_report(folder: Path) -> None:
-    """Raise `UserError` where `report.html` in a folder is something else than our report."""
+    """Raise `UserError` where `report.html` in a folder is not a report of ours."""
     check_ours(folder / REPORT)
     check_ours(folder / AGAINST_PAGE)
 
@@ -111,20 +125,40 @@ def report_page(
     learns: bool = True,
     running: bool = False,
 ) -> str:
-    """Return the report of a run as HTML; of one that is `running`, it is loaded again and again.
+    """Return the report of a campaign as HTML.
 
-    See `ReportModel` for the other arguments.
+    Args:
+        run: the campaign.
+        summary: its summary, where that is known.
+        on_part: called with the number of levels whose surrogate is learned, and of all levels.
+        learns: whether the page has surrogates.
+        running: whether the campaign runs: a browser then loads the page again and again.
     """
-    model = ReportModel(run, summary, on_part, learns=learns)
+    model, scenario = ReportModel(run, summary, on_part, learns=learns), run.scenario
     # No "<" in the JSON: nothing in it can end its element.
     data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
     return page(
         "report.html.jinja",
         styles=("report.css",),
         scripts=("player.js", "report.js"),
-        sections=sections_of(model),
         every_s=EVERY_S if running else 0,
         now=f"{datetime.now().astimezone():%H:%M:%S}",
         data=Markup(data),  # noqa: S704 (JSON without "<")
-        **shared(model),
+        model=model,
+        run=run,
+        vut=run.vut,
+        scenario=scenario,
+        is_merge=isinstance(scenario, MergeScenario),
+        lane_m=lane_of(scenario),
+        traffic=scenario.vehicles > 2,
+        meanings=meanings,
+        by_level=by_level,
+        headline=headline(run, model.facts),
+        comparison_headline=comparison_headline,
+        robustness=robustness,
+        starts_that_fail=STARTS_THAT_FAIL,
+        pairs_of=pairs_of,
+        radius_for=radius_for,
+        references=list(REFERENCES),
+        braked_mps=BRAKED_MPS,
     )

@@ -1,9 +1,12 @@
-"""The content of a report: cases, their motion, verdicts, and what is known beside them."""
+"""The content of a report, read from the folder of a campaign.
+
+It has the cases, their motion, the verdicts, and the results of studies that the folder holds.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
 from merge_sumo.analysis.comparison import compare_against
@@ -16,14 +19,14 @@ from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
 from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import Summary, Trouble, by_case, judge, summarise, undecided
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
-from merge_sumo.scenario.coordinates import Coordinate, coordinates
+from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import LEVELS
 
 LISTED: Final = 10
@@ -32,14 +35,14 @@ SHOWN: Final = 2000
 """Cases that the page holds one by one, with their motion; more are shown as counts."""
 
 OnPart = Callable[[int, int], None]
-"""Told of how many levels the surrogates are learned, and how many levels there are."""
+"""Called with the number of levels whose surrogate is learned, and the number of levels."""
 
 
 class ReportModel:
-    """Everything that the page shows of a run; each template has it as `model`.
+    """Everything that the page shows of a campaign; each template has it as `model`.
 
     Attributes:
-        run: the run.
+        run: the campaign.
         road: its road, to be drawn.
         cases: the run that stands for each case.
         repeated: by its index, all runs of a case that ran more than once.
@@ -48,11 +51,21 @@ class ReportModel:
         facts: the facts of the campaign.
         levels: POV levels.
         surfaces: surrogate of each level; None where there is none.
+        axes: coordinates of each level, in the pool's order.
         worst: failures, the worst first; `spread` the first of them, of as many regions as may be.
         near: cases that do not fail, those nearest to a failure first.
+        troubles: messages of errors and timeouts, with the cases that are listed for each.
         shown: cases that the page holds one by one, in their order.
         motion: trajectory of each case that is shown, by its index, where it is not lost.
+        kinds: kind of each failure that has one, by its index.
+        kind_counts: number of failures of each kind, the most frequent first.
         boxes: regions of failures in words.
+        notes: doubts about the outcomes, in sentences.
+        mostly_clipped: a sentence on a VUT that drove at its limits in most steps, else None.
+        unrepeatable: a sentence on the cases that did not repeat; None where each did.
+        go_on: the command that goes on with the campaign.
+        explain: the commands that explain a case and write the report, before and after its index.
+        printed: the end of what the controller printed; empty where it printed nothing.
     """
 
     def __init__(
@@ -65,7 +78,11 @@ class ReportModel:
     ) -> None:
         """Read what the page shows.
 
-        `summary` is that of the run, where it is known. Without `learns` there are no surrogates.
+        Args:
+            run: the campaign.
+            summary: its summary, where that is known.
+            on_part: called after each surrogate.
+            learns: whether there are surrogates.
         """
         self.run, self.learns = run, learns
         self.road = _road_of(run)
@@ -83,113 +100,69 @@ class ReportModel:
             self.surfaces[level] = learn_surface(run.outcomes, level, run.tolerated)
             on_part(done, len(self.levels))
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
+        self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
         self.stress = STRESS.read(run.folder)
         self.avoidance = AVOIDANCE.read_lines(run)
         self.explanations = EXPLANATIONS.read_lines(run)
         self.against = compare_against(run)
         self._choose_cases()
         self.motion = run.trajectories(outcome.index for outcome in self.shown)
-        self.diagnoses: dict[int, Diagnosis] = {
-            o.index: diagnose(self.motion[o.index], o.measures)
-            for o in self.shown
-            if o.index in self.motion
-        }
-        self.kinds: dict[int, Kind] = {
-            o.index: found.kind
-            for o in self.worst
-            if (found := self.diagnoses.get(o.index)) is not None and found.kind is not None
-        }
-        self.boxes = [
-            box for level in self.levels for box in failure_boxes(self.worst + self.near, level)
-        ]
+        self.diagnoses: dict[int, Diagnosis] = {}
+        for outcome in self.shown:
+            if motion := self.motion.get(outcome.index):
+                self.diagnoses[outcome.index] = diagnose(motion, outcome.measures)
+        self.kinds: dict[int, Kind] = {}
+        for outcome in self.worst:
+            diagnosis = self.diagnoses.get(outcome.index)
+            if diagnosis is not None and diagnosis.kind is not None:
+                self.kinds[outcome.index] = diagnosis.kind
+        self.kind_counts = Counter(self.kinds.values()).most_common()
+        self.boxes = list[FailureBox]()
+        for level in self.levels:
+            self.boxes += failure_boxes(self.worst + self.near, level)
+        self.notes = doubts(self.cases, run.criterion, run.settings.in_vain)
+        self.mostly_clipped = mostly_clipped(self.cases)
+        self.unrepeatable = unrepeatable(read_repeats(run))
+        self.go_on = again("resume", run.folder, run.record)
+        self.explain = _explain(run)
+        self.printed = end_of(run.folder / LOG)
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""
-        told: list[Outcome] = []
+        judged: list[Outcome] = []
         untested: list[Outcome] = []
         for outcome in self.cases:
-            is_told = outcome.is_tested and outcome.margin is not None
-            (told if is_told else untested).append(outcome)
+            is_judged = outcome.is_tested and outcome.margin is not None
+            (judged if is_judged else untested).append(outcome)
         self.worst = failures(self.cases)
         self.regions = regions_of(self.worst)
         robust = set() if self.stress is None else set(self.stress.robust)
         # The sort is stable: without a stress test the order is that of the regions.
         spread = sorted(spread_failures(self.worst), key=lambda o: o.index not in robust)
         self.spread = spread[:LISTED]
-        self.near = sorted((o for o in told if not o.failed), key=lambda o: (o.margin, o.index))
-        self.troubles = self.verdict.troubles[:LISTED]
-        examples = [o for trouble in self.troubles for o in self.examples_of(trouble)]
-        first = (*examples, *self.spread, *self.near[:LISTED], *self.worst, *untested, *self.near)
+        self.near = sorted((o for o in judged if not o.failed), key=lambda o: (o.margin, o.index))
+        self.troubles: list[tuple[Trouble, list[Outcome]]] = []
+        first: list[Outcome] = []
+        for trouble in self.verdict.troubles[:LISTED]:
+            examples = [self.run.outcome(index) for index in trouble.cases[:LISTED]]
+            self.troubles.append((trouble, examples))
+            first += examples
+        first += self.spread + self.near[:LISTED] + self.worst + untested + self.near
         shown = list({o.index: o for o in first}.values())[:SHOWN]
         self.shown = sorted(shown, key=lambda outcome: outcome.index)
 
-    def coordinates_of(self, level: int) -> tuple[Coordinate, ...]:
-        """Return the coordinates of a level, in the pool's order."""
-        return coordinates(self.run.scenario, (level,))
-
-    @property
-    def dimensions(self) -> list[int]:
-        """The numbers of coordinates that levels have, ascending."""
-        return sorted({len(self.coordinates_of(level)) for level in self.levels})
-
-    def examples_of(self, trouble: Trouble) -> list[Outcome]:
-        """Return the cases that are listed for a message."""
-        return [self.run.outcome(index) for index in trouble.cases[:LISTED]]
-
-    @property
-    def kind_counts(self) -> list[tuple[Kind, int]]:
-        """Number of failures of each kind that occurs, the most frequent first."""
-        return Counter(self.kinds.values()).most_common()
-
-    @property
-    def notes(self) -> list[str]:
-        """Doubts about the outcomes, in sentences."""
-        return doubts(self.cases, self.run.criterion, self.run.settings.in_vain)
-
-    @property
-    def mostly_clipped(self) -> str | None:
-        """A sentence on a VUT that drove at its limits in most steps; None for others."""
-        return mostly_clipped(self.cases)
-
-    @property
-    def unrepeatable(self) -> str | None:
-        """A sentence on the cases that did not repeat; None where each did."""
-        return unrepeatable(read_repeats(self.run))
-
-    @property
-    def lost(self) -> list[int]:
-        """The cases that are shown and have no motion any more."""
-        return [o.index for o in self.shown if o.index not in self.motion]
-
-    @property
-    def go_on(self) -> str:
-        """The command that goes on with the campaign."""
-        return again("resume", self.run.folder, self.run.record)
-
-    @property
-    def explain(self) -> tuple[str, str]:
-        """The commands that explain a case and write the report, before and after its index."""
-        folder, record = self.run.folder, self.run.record
-        explained = again("explain", folder, record, _Index())
-        first, _, rest = explained.partition(str(_Index()))
-        if explained.startswith("ms."):
-            return first, f"{rest}; {call('report', [folder])}"
-        return first, f"{rest} && {command('report', folder)}"
-
-    @property
-    def printed(self) -> str:
-        """The end of what the controller printed; empty where it printed nothing."""
-        return end_of(self.run.folder / LOG)
-
-    def settings(self) -> Iterator[tuple[str, Any]]:
-        """Yield name and value of each setting, nested ones with their path."""
-        rest = list(self.run.record.items())
+    def settings(self) -> list[tuple[str, Any]]:
+        """Return name and value of each setting, nested ones with their path."""
+        rows, rest = [], list(self.run.record.items())
         while rest:
             name, value = rest.pop(0)
             if isinstance(value, dict):
                 rest[:0] = [(f"{name} {inner}", one) for inner, one in value.items()]
-            else:
-                yield name, ", ".join(map(str, value)) if isinstance(value, list) else value
+                continue
+            if isinstance(value, list):
+                value = ", ".join(map(str, value))
+            rows.append((name, value))
+        return rows
 
 
 class _Index(int):
@@ -197,6 +170,14 @@ class _Index(int):
 
     def __str__(self) -> str:
         return "\0"
+
+
+def _explain(run: Run) -> tuple[str, str]:
+    explain = again("explain", run.folder, run.record, _Index())
+    first, _, rest = explain.partition(str(_Index()))
+    if explain.startswith("ms."):
+        return first, f"{rest}; {call('report', [run.folder])}"
+    return first, f"{rest} && {command('report', run.folder)}"
 
 
 def _road_of(run: Run) -> Corridor:

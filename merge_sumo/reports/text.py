@@ -1,4 +1,7 @@
-"""What a terminal shows of the results of studies: `lines_of` has a function for each of them."""
+"""What a terminal shows of an episode, and of the results of studies.
+
+`lines_of` has a function for each kind of result.
+"""
 
 from __future__ import annotations
 
@@ -30,16 +33,22 @@ from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.again import again, command
+from merge_sumo.metrics.cause import cause, met
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.plausibility import behind
+from merge_sumo.metrics.score import Outcome, measures_in
 from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.coordinates import coordinates, described
-from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
+from merge_sumo.scenario.trajectory import Trajectory
 
+LABEL: Final = 31
+"""Minimum width of the column of measures, in characters."""
 FRAGILE: Final = 10
 """Failures that are not robust that a sentence names."""
 
@@ -419,3 +428,65 @@ def vut_check(found: VutCheck) -> list[str]:
     cost = f"{found.us_per_step_median:.0f} us (median), {found.us_per_step_worst:.0f} us at worst"
     notes = [f"note: {sentence}" for sentence in found.notes]
     return [*problems, *notes, f"a step costs {cost}"]
+
+
+# Of one case
+
+
+def episode_lines(
+    outcome: Outcome, trajectory: Trajectory, from_s: float | None = None
+) -> list[str]:
+    """Return the case, its cause, its measures, and its motion as a table.
+
+    Args:
+        outcome: the outcome of the case.
+        trajectory: its motion.
+        from_s: begin the table so long before the first conflict, as in -3.
+    """
+    first, begins = Conflict.of(trajectory).begin(from_s)
+    case = outcome.case
+    lines = [
+        f"case: level {level_name(case.level)}, {described(case)}",
+        cause(outcome, trajectory),
+    ]
+    if outcome.margin is not None:
+        verb = "fails" if outcome.failed else "does not fail"
+        lines.append(f"{verb}: margin {outcome.margin:.3g}")
+    return [*lines, "", *_measures(outcome), "", *begins, *_motion_lines(trajectory, first)]
+
+
+def _measures(outcome: Outcome) -> Iterator[str]:
+    found, scenario, other = outcome.measures, outcome.case.scenario, met(outcome.measures)
+    if other != "POV":
+        yield f"  of the {other}, which is nearest to the VUT at the end:"
+    listed = [
+        (text, value, measure.unit)
+        for measure in measures_in(scenario)
+        if (value := found.value(measure.name)) is not None
+        and (text := measure.label_in(scenario).replace("POV", other))
+    ]
+    width = max([LABEL, *(len(text) for text, _, _ in listed)])
+    for text, value, unit in listed:
+        yield f"  {text:<{width}} {value:10.2f} {unit}".rstrip()
+    if found.clipped_steps:
+        yield f"  {'steps beyond its limits':<{width}} {found.clipped_steps:10d}"
+    if outcome.is_tested and found.error is not None:
+        yield f"  {'error behind M':<{width}} {found.error}"
+
+
+def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:
+    """Return the motion from a row on: a row for each second, for the merge, and for the end.
+
+    Of every vehicle x in m, v in m/s and a in m/s2; then the signals that the VUT has left.
+    """
+    motion, until = trajectory.whole, len(trajectory.motion) - 1
+    cars = VEHICLES[: motion.shape[1]]
+    lines = ["  t s" + "".join(f"  {f'x {who.upper()}':>8}   m/s  m/s2" for who in cars)]
+    seconds = range(first, len(motion), round(1.0 / DT_S))
+    for row in sorted({*seconds, max(until, first), len(motion) - 1}):
+        values = "".join(f"  {x:8.1f} {v:5.1f} {a:5.1f}" for x, v, a in motion[row].tolist())
+        signals = {name: of[row] for name, of in (trajectory.signals or {}).items()}
+        left = "".join(f"  {name} {value}" for name, value in signals.items() if value is not None)
+        place = f"  {trajectory.case.scenario.place}" if row == until < len(motion) - 1 else ""
+        lines.append(f"{row * DT_S:5.1f}{values}{place}{left}")
+    return lines

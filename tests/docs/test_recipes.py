@@ -101,7 +101,11 @@ RECIPES = {
             '<h2 id="thanks">Thanks</h2><p>{{ vut }} drove {{ run.outcomes | length }} cases.</p>'
             "</section>\n"
         },
-        more={"reports/report_sections.py": {'    "about",\n': '    "thanks",\n'}},
+        more={
+            "reports/templates/report.html.jinja": {
+                "<noscript>": '{% include "sections/thanks.html.jinja" %}\n'
+            }
+        },
     ),
     "an option of `campaign` that reaches the engine": Recipe(
         more={

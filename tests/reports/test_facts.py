@@ -17,7 +17,8 @@ from support.handmade import write_run
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
-from merge_sumo.reports.facts import Fact, headline
+from merge_sumo.reports import report_model
+from merge_sumo.reports.facts import TOUCH, Fact, headline
 from merge_sumo.reports.report import report_page
 
 
@@ -139,3 +140,12 @@ def test_of_the_headline_begin_terminal_and_report(made):
     page: Any = html.fromstring(report_page(made))
     (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
     assert card.text == "\n".join(lines).replace("`", "")
+
+
+def test_of_the_headline_name_the_option_of_another_rule_in_the_report(made, monkeypatch):
+    facts = [*CampaignRun(made).facts, Fact(TOUCH, 2, "", "outcomes.jsonl", "severity")]
+    monkeypatch.setattr(report_model, "facts_of", lambda *_: facts)
+    page: Any = html.fromstring(report_page(made))
+    (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
+    said = "2 more cases touch after M, which this rule does not count: --fail-when unsafe"
+    assert said in card.text
