@@ -161,7 +161,7 @@ def run(config: c.RunCase) -> CaseRun:
         if config.on_end is not None:
             config.on_end(result)
         if folder is not None and config.gui:
-            replayer.open_gui(folder, config.from_s)
+            replayer.open_gui(folder, config.from_s, silent=True)
     return result
 
 

@@ -8,11 +8,12 @@ numbers, and on nothing else.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, NamedTuple
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -24,10 +25,11 @@ from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import Record, convert, read_record, to_json
 from merge_sumo.result import Result
-from merge_sumo.road.corridor import LanePath
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import FARTHEST_M
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import (
     DT_S,
@@ -57,12 +59,8 @@ from merge_sumo.sumo.replay_folder import (
 )
 
 REPLAYED: Final = "replayed.fcd.xml"
-COMPARED: Final = ("x", "y", "pos", "speed")
 TOLERANCE: Final = 1e-6
 """Metres and m/s; the record is written with nine digits."""
-LANE_END_M: Final = 2e-3
-"""Nearer than this to where a lane begins, a vehicle may be on the lane before or behind."""
-MIN_TIMESTEPS: Final = 1 + HOLD_STEPS
 MAX_TIMESTEPS: Final = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
 
 
@@ -97,15 +95,16 @@ class Replay(Result):
     def lines(self) -> list[str]:
         """Return the case and its cause, and whether the replay is identical."""
         if self.diverged_at_s is None:
-            return [*self.words, f"identical: {self.rows} rows of x, y, position and speed"]
+            return [*self.words, f"identical: {self.rows} rows of x, y and speed"]
         return [*self.words, f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
 
 
 def replay(folder: Path, from_s: float | None = None) -> Replay:
     """Replay a folder in headless SUMO and compare every row of all vehicles with the record.
 
-    Positions (x, y, along the lane) and speeds must agree within 1e-6, and the record must be an
-    episode: all vehicles on their lanes, moved by eq. (4) and held at its end.
+    Positions and speeds must agree within 1e-6, and the record must be an episode: all vehicles on
+    their lanes, moved by eq. (4) and held at its end. SUMO plays the positions on the lanes of the
+    record, so these must agree with its x and y, too.
 
     Args:
         folder: the replay folder, which may be of another person.
@@ -124,8 +123,8 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
         if ended.code != 0:
             raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
         replayed = _record(stage / REPLAYED, f"SUMO's replay of {folder}")
-    recorded = {at: row for at, row in episode.rows.items() if at.step >= first}
-    fault = _difference(recorded, replayed) or _broken_motion(episode)
+    recorded = {at: row for at, row in episode.rows.items() if at[0] >= first}
+    fault = _difference(recorded, replayed) or _broken_motion(episode.trajectory)
     diverged_at_s, detail = fault or (None, "")
     outcome = episode.outcome
     words = case_line(outcome.case, outcome.index), cause(outcome, episode.trajectory), *begins
@@ -140,10 +139,13 @@ def check_display() -> None:
         )
 
 
-def open_gui(folder: Path, from_s: float | None = None) -> int:
+def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False) -> int:
     """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code.
 
-    The arguments are those of `replay`; a notice says when it begins.
+    Args:
+        folder: the replay folder, which may be of another person.
+        from_s: as in `replay`.
+        silent: whether no notice says when it begins.
 
     Raises:
         UserError: there is no display, or the folder is not a replay folder.
@@ -151,13 +153,19 @@ def open_gui(folder: Path, from_s: float | None = None) -> int:
     check_display()
     episode = _read(folder)
     first, begins = Conflict.of(episode.trajectory).begin(from_s)
-    for sentence in begins:
+    for sentence in [] if silent else begins:
         notice(sentence)
     with stopping_in_order(), _staged(episode, first) as (stage, arguments):
         return run_program("sumo-gui", arguments, stage, limit_s=None).code
 
 
 Place = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
+
+
+class RecordedTime(Record, frozen=True, forbid_unknown_fields=False):
+    """A step of a record."""
+
+    time: Annotated[float, Meta(ge=0.0, le=MAX_TIMESTEPS * DT_S)]
 
 
 class RecordedMotion(Record, frozen=True, forbid_unknown_fields=False):
@@ -171,27 +179,8 @@ class RecordedMotion(Record, frozen=True, forbid_unknown_fields=False):
     lane: str
 
 
-class At(NamedTuple):
-    """A step, and a vehicle."""
-
-    step: int
-    who: str
-
-
-class _Position(NamedTuple):
-    path: LanePath
-    x_m: float
-    """Lane coordinate on it."""
-
-    @property
-    def has_position(self) -> bool:
-        """Whether a replay tells the position on the lane; elsewhere x and y tell.
-
-        SUMO keeps a vehicle a millimetre before the end of a lane, and where lanes overlap inside
-        of a junction it may take the one before.
-        """
-        at_an_end = any(abs(self.x_m - start_m) <= LANE_END_M for start_m in self.path.starts_m)
-        return not (at_an_end or self.path.piece(self.x_m).is_internal)
+Rows = dict[tuple[int, str], RecordedMotion]
+"""The motion of each vehicle at each step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,29 +190,24 @@ class _Episode:
     road: Road
     outcome: Outcome
     trajectory: Trajectory
-    rows: Mapping[At, tuple[RecordedMotion, _Position]]
+    rows: Rows
 
 
 def _read(folder: Path) -> _Episode:
     """Read case, record and net of a folder that may be of another person."""
+    if not folder.is_dir():
+        raise UserError(f"{folder} is not a replay folder: there is no such folder")
     net = HOSTED_NET if (folder / HOSTED_NET).exists() else NET
     for name in (net, CASE, RECORD):
         if not (folder / name).exists():
             raise UserError(f"{folder} is not a replay folder: it has no {name}")
     outcome = _outcome(folder / CASE)
     road = _road(folder / net, outcome)
-    rows = _placed(folder / RECORD, road, outcome)
-    steps = max(at.step for at in rows) + 1 - HOLD_STEPS
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
-    motion = np.zeros((steps, len(cars), 3))
-    for step in range(steps):
-        for car, who in enumerate(cars):
-            row, place = rows[At(step, who)]
-            motion[step, car, :2] = place.x_m, row.speed
-    motion[:-1, :, 2] = np.diff(motion[:, :, 1], axis=0) / DT_S
+    rows = _record(folder / RECORD, f"the record {folder / RECORD}")
+    motion = _motion(rows, road.corridor, outcome, f"the record {folder / RECORD}")
     measures = outcome.measures
     end = round(measures.t_end_s / DT_S)
-    if not 0 <= end < steps:
+    if not 0 <= end < len(motion):
         raise UserError(f"{folder} ends at {measures.t_end_s:g} s, and its record does not")
     until_merge, after = cut_at(motion, end)
     trajectory = Trajectory(
@@ -253,55 +237,49 @@ def _road(path: Path, outcome: Outcome) -> Road:
     return Road(hosted_net(corridor, 1, lane_goes_on=True), corridor, HOSTED_NET)
 
 
-def _placed(path: Path, road: Road, outcome: Outcome) -> dict[At, tuple[RecordedMotion, _Position]]:
-    """Return the rows of a record with their places on the paths.
+def _motion(rows: Rows, road: Corridor, outcome: Outcome, name: str) -> FloatArray:
+    """Return the motion of a record without the rows that hold its end, (steps, vehicles, 3).
 
     The VUT has the lanes of the ramp, and that of the mainline next to an acceleration lane.
     """
-    name = f"the record {path}"
-    rows = _record(path, name)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
-    steps = max(len(rows) // len(cars), MIN_TIMESTEPS)
-    if rows.keys() != {At(step, who) for step in range(steps) for who in cars}:
+    steps = len(rows) // len(cars) - HOLD_STEPS
+    if steps < 1 or rows.keys() != {*product(range(steps + HOLD_STEPS), cars)}:
         raise UserError(
-            f"{name} must have {', '.join(cars)} every {DT_S:g} s, in {MIN_TIMESTEPS} or more rows"
+            f"{name} must have {', '.join(cars)} every {DT_S:g} s, in {1 + HOLD_STEPS} or more rows"
         )
-    main, ramp = (
-        {piece.lane: (path, piece.start_m) for piece in path.pieces}
-        for path in (road.corridor.mainline, road.corridor.ramp)
-    )
-    placed = {}
-    for at, row in rows.items():
-        lanes = main | ramp if at.who == VEHICLES[VUT] else main
+    main = {piece.lane: piece.start_m for piece in road.mainline.pieces}
+    ramp = {piece.lane: piece.start_m for piece in road.ramp.pieces}
+    motion = np.zeros((steps, len(cars), 3))
+    for (step, who), row in rows.items():
+        lanes = main | ramp if who == VEHICLES[VUT] else main
         if row.lane not in lanes:
-            raise UserError(f"{name} has {at.who} on lane {row.lane:.40}, which is not on its path")
-        of, start_m = lanes[row.lane]
-        placed[at] = row, _Position(of, start_m + row.pos)
-    return placed
+            raise UserError(f"{name} has {who} on lane {row.lane:.40}, which is not on its path")
+        if step < steps:
+            motion[step, cars.index(who), :2] = lanes[row.lane] + row.pos, row.speed
+    motion[:-1, :, 2] = np.diff(motion[:, :, 1], axis=0) / DT_S
+    return motion
 
 
-def _record(path: Path, name: str) -> dict[At, RecordedMotion]:
+def _record(path: Path, name: str) -> Rows:
     """Return the rows of floating car data; `UserError` where one has a wrong value."""
     root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
-    if not len(root) <= MAX_TIMESTEPS:
+    if len(root) > MAX_TIMESTEPS:
         raise UserError(f"{name} has {len(root)} timesteps, and at most {MAX_TIMESTEPS} are read")
-    rows: dict[At, RecordedMotion] = {}
+    rows: Rows = {}
     for timestep in root:
         try:
-            time_s = float(timestep.get("time", ""))
-            step = round(time_s / DT_S)
-        except (ValueError, OverflowError) as error:
-            raise UserError(f"{name} has a timestep without a time") from error
-        if abs(time_s - step * DT_S) > TOLERANCE:
-            raise UserError(f"{name} has a timestep at {time_s:g} s: there is one every {DT_S:g} s")
-        for vehicle in timestep:
-            try:
-                row = convert(dict(vehicle.items()), RecordedMotion, strict=False)
-            except UserError as error:
-                raise UserError(f"{name}, at {step * DT_S:.1f} s: {error}") from error
-            if At(step, row.id) in rows:
-                raise UserError(f"{name} has two rows of {row.id} at {step * DT_S:g} s")
-            rows[At(step, row.id)] = row
+            time = convert(dict(timestep.items()), RecordedTime, strict=False).time
+            moved = [convert(dict(car.items()), RecordedMotion, strict=False) for car in timestep]
+        except UserError as error:
+            raise UserError(f"{name}: {error}") from error
+        step = round(time / DT_S)
+        if abs(time - step * DT_S) > TOLERANCE:
+            raise UserError(f"{name} has a timestep at {time:g} s: there is one every {DT_S:g} s")
+        for row in moved:
+            if (step, row.id) in rows:
+                raise UserError(f"{name} has two rows of {row.id} at {time:g} s")
+            rows[step, row.id] = row
     return rows
 
 
@@ -327,29 +305,24 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
         yield stage, ["-c", CONFIG, "--begin", f"{row * DT_S:.1f}"]
 
 
-def _difference(
-    recorded: Mapping[At, tuple[RecordedMotion, _Position]], replayed: Mapping[At, RecordedMotion]
-) -> tuple[float, str] | None:
+def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:
     """Return when and in what a replay first differs from the record, or None."""
-    for at, (row, place) in recorded.items():
-        time_s, shown = at.step * DT_S, replayed.get(at)
+    for (step, who), row in recorded.items():
+        shown = replayed.get((step, who))
         if shown is None:
-            return time_s, f"{at.who} is not there"
-        for name in COMPARED:
+            return step * DT_S, f"{who} is not there"
+        for name in ("x", "y", "speed"):
             was, now = getattr(row, name), getattr(shown, name)
-            if not (abs(now - was) <= TOLERANCE or (name == "pos" and not place.has_position)):
-                return time_s, f"{name} of {at.who} is {now}, recorded {was}"
-    for at in replayed.keys() - recorded.keys():
-        return at.step * DT_S, f"{at.who} is not in the record"
+            if abs(now - was) > TOLERANCE:
+                return step * DT_S, f"{name} of {who} is {now}, recorded {was}"
     return None
 
 
-def _broken_motion(episode: _Episode) -> tuple[float, str] | None:
+def _broken_motion(trajectory: Trajectory) -> tuple[float, str] | None:
     """Return when a vehicle of the record does not move by eq. (4), or None."""
-    whole = episode.trajectory.whole
-    moved_m = whole[1:, :, 0] - whole[:-1, :, 0]
-    away_m = np.abs(moved_m - whole[:-1, :, 1] * DT_S)
+    x_m, v_mps = trajectory.whole[:, :, 0], trajectory.whole[:, :, 1]
+    away_m = np.abs(np.diff(x_m, axis=0) - v_mps[:-1] * DT_S)
     for step, car in np.argwhere(away_m > TOLERANCE).tolist():
-        speed = whole[step, car, 1]
+        speed = v_mps[step, car]
         return step * DT_S, f"{VEHICLES[car]} is recorded as not moving at its speed of {speed}"
     return None

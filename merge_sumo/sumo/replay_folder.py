@@ -30,6 +30,7 @@ from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.colours import rgb
+from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
@@ -48,60 +49,32 @@ VIEW: Final = "view.settings.xml"
 CASE: Final = "case.json"
 SCENARIO: Final = "scenario"
 """Key of the scenario in that file, next to those of the outcome."""
-SPEED_LIMIT_MPS: Final = 200.0
-"""Above every speed: SUMO lets a vehicle enter a replay no faster than its lane allows."""
-
-WINDOW: Final = (1280, 800)
 SHAPE: Final = 614.0 / 1270.0
-"""Height of the picture in that window, as a share of its width."""
-SEEN: Final = 1.3
-"""Width of the picture, as a multiple of where the VUT drove."""
-SMALLEST_M: Final = 100.0
-"""Of where it drove."""
-BELOW_LABELS: Final = 0.8
-"""Share of the height of the picture in which no label stands."""
-LETTERS: Final = "60"
-"""Size of the labels."""
+"""Height of the picture in the window of sumo-gui, as a share of its width."""
 REAL_TIME_MS: Final = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
-PALE: Final = "0.93,0.93,0.90"
 HOLD_STEPS: Final = 10
 """Steps for which the last picture stays, so that one sees how it ended."""
-
 NAMES: Final = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
 TEXT: Final = "text"
 """Parameter of a point of interest that is shown."""
+PALE: Final = "0.93,0.93,0.90"
 INK: Final = "0.1,0.1,0.1"
-LINES: Final = (0.465, 0.43, 0.395, 0.36)
-"""Heights of the lines above the middle of the picture, as shares of its height."""
-LEGEND: Final = 0.325
-"""Height of the dots."""
-RAISED: Final = 0.022
-"""Height at which a text is drawn above its place, as a share of the picture's height."""
-LETTER: Final = 0.0065
-"""Width of a letter, as a share of the picture's width."""
-DOT: Final = 0.012
-"""Diameter of the dots of the legend, as a share of the picture's width."""
-APART: Final = 0.13
-"""Of two dots, as a share of the picture's width."""
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The picture of sumo-gui: its zoom, its middle, and its size on the road."""
+    """The picture of sumo-gui: its zoom, its middle, and its size on the road.
+
+    With `borders` there are lines between lanes.
+    """
 
     zoom: str
     x_m: float
     y_m: float
     width_m: float
     height_m: float
-    borders: bool = False
-    """True for lines between lanes."""
-
-    @property
-    def viewport(self) -> tuple[str, str, str]:
-        """Zoom, x and y."""
-        return self.zoom, f"{self.x_m:g}", f"{self.y_m:g}"
+    borders: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +119,11 @@ def _road(road: Corridor, folder: Path) -> Road:
 
 
 def _fast(path: LanePath) -> LanePath:
-    return LanePath(tuple(replace(p, speed_limit_mps=SPEED_LIMIT_MPS) for p in path.pieces))
+    """Return a path with a limit above every speed.
+
+    SUMO lets a vehicle enter a replay no faster than its lane allows.
+    """
+    return LanePath(tuple(replace(piece, speed_limit_mps=200.0) for piece in path.pieces))
 
 
 def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Corridor:
@@ -195,7 +172,7 @@ def files_of(
         TYPES: _types(trajectory),
         LABELS: _labels(outcome, trajectory, picture),
         RECORD: record,
-        VIEW: view_settings(picture.viewport, borders=picture.borders),
+        VIEW: view_settings(picture),
         CONFIG: _config(road, len(record)),
     }
     files = {road.file: road.net}
@@ -253,29 +230,26 @@ def motion_record(road: Corridor, trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def view_settings(
-    viewport: tuple[str, str, str],
-    *,
-    borders: bool = False,
-) -> etree._Element:
-    """Return the settings of a view.
-
-    `viewport` is zoom, x and y. `borders` draws lines between lanes.
-    """
+def view_settings(picture: Picture) -> etree._Element:
+    """Return the settings of a view."""
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    vehicles = {"vehicleQuality": "3", "vehicle_exaggeration": "1"}
-    if borders:
+    if picture.borders:
         etree.SubElement(scheme, "edges", laneShowBorders="1")
-    etree.SubElement(scheme, "vehicles", vehicles)
+    etree.SubElement(scheme, "vehicles", vehicleQuality="3", vehicle_exaggeration="1")
     etree.SubElement(
         scheme,
         "pois",
-        {"poiTextParam": TEXT, **_text("poiText", LETTERS, INK), "poiText_bgColor": PALE},
+        poiTextParam=TEXT,
+        poiText_show="1",
+        poiText_size="60",
+        poiText_color=INK,
+        poiText_constantSize="1",
+        poiText_bgColor=PALE,
     )
     etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
-    zoom, x, y = viewport
-    etree.SubElement(root, "viewport", zoom=zoom, x=x, y=y)
+    x, y = f"{picture.x_m:g}", f"{picture.y_m:g}"
+    etree.SubElement(root, "viewport", zoom=picture.zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
 
@@ -285,40 +259,28 @@ def _colour(vehicle: str) -> str:
     return ",".join(f"{part / 255.0:.2f}" for part in rgb(vehicle))
 
 
-def _text(of: str, size: str, colour: str) -> dict[str, str]:
-    """Return how a text is shown; its size is that on the screen."""
-    return {
-        f"{of}_show": "1",
-        f"{of}_size": size,
-        f"{of}_color": colour,
-        f"{of}_constantSize": "1",
-    }
-
-
 def _picture(shown: Road, record: etree._Element) -> Picture:
     """Return a picture of the way of the VUT; at a zoom of 100 it has the whole net."""
     road = shown.corridor
     net: list[tuple[float, ...]] = []
-    for path in (road.mainline, road.ramp):
-        for piece in path.pieces:
-            net += [point[:2] for point in piece.shape]
-    driven = [
-        (float(car.get("x", "0")), float(car.get("y", "0")))
-        for car in record.iter("vehicle")
-        if car.get("id") == VEHICLES[VUT]
-    ]
+    for piece in (*road.mainline.pieces, *road.ramp.pieces):
+        net += [point[:2] for point in piece.shape]
+    driven: list[tuple[float, ...]] = []
+    for car in record.iter("vehicle"):
+        if car.get("id") == VEHICLES[VUT]:
+            driven.append((float(car.get("x", "0")), float(car.get("y", "0"))))
     whole_m, _, _ = _box(net)
-    driven_m, x_m, y_m = _box(driven or net)
-    width_m = SEEN * max(driven_m, SMALLEST_M)
+    driven_m, x_m, y_m = _box(driven)
+    width_m = 1.3 * max(driven_m, 100.0)
     zoom = f"{100.0 * whole_m / width_m:.0f}"
-    borders = road.lane_m is not None
-    return Picture(zoom, round(x_m), round(y_m), width_m, width_m * SHAPE, borders=borders)
+    is_lane = road.lane_m is not None
+    return Picture(zoom, round(x_m), round(y_m), width_m, width_m * SHAPE, is_lane)
 
 
 def _box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
-    """Return the width of a picture of points, and its centre."""
+    """Return the width of a picture of points below the labels, and its centre."""
     xs, ys = zip(*points, strict=True)
-    width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) / (SHAPE * BELOW_LABELS))
+    width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) / (0.8 * SHAPE))
     return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
 
 
@@ -341,7 +303,7 @@ def _config(road: Road, timesteps: int) -> etree._Element:
             "delay": REAL_TIME_MS,
             # It halts there, with no dialog over the last picture as where it ends.
             "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
-            "window-size": ",".join(map(str, WINDOW)),
+            "window-size": "1280,800",
         },
     }
     root = etree.Element("configuration")
@@ -358,32 +320,22 @@ def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree
     if outcome.measures.end.is_error:
         words = words.partition(":")[0]  # a message may hold anything
     lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
     root = etree.Element("additional")
-    for number, (line, height) in enumerate(zip(lines, LINES, strict=False)):
-        at = picture.x_m, picture.y_m + height * picture.height_m
-        _label(root, f"line{number}", at, line)
-    dot_m, apart_m = DOT * picture.width_m, APART * picture.width_m
-    y = picture.y_m + LEGEND * picture.height_m
-    for row, name in enumerate(cars):
-        x = picture.x_m + (row - (len(cars) - 0.5) / 2.0) * apart_m
-        _label(root, name, (x, y), "", _colour(name), dot_m)
-        middle = x + (DOT + 0.5 * LETTER * len(NAMES[name])) * picture.width_m
-        _label(root, f"{name}-name", (middle, y - RAISED * picture.height_m), NAMES[name])
+    for number, line in enumerate(lines[:4]):
+        y_m = picture.y_m + (0.465 - 0.035 * number) * picture.height_m
+        _label(root, f"line{number}", (picture.x_m, y_m), line)
+    cars = VEHICLES[: outcome.case.scenario.vehicles]
+    for number, name in enumerate(cars):
+        x_m = picture.x_m + 0.13 * (number - 0.5 * (len(cars) - 1)) * picture.width_m
+        at = x_m, picture.y_m + 0.315 * picture.height_m
+        _label(root, name, at, NAMES[name], _colour(name), 0.012 * picture.width_m)
     return root
 
 
-def case_line(case: Case, index: int | None = None) -> str:
+def case_line(case: Case, index: int | None) -> str:
     """Return which case it is, with its index where it has one."""
-    notation = case.scenario.notation.items()
-    values = ((getattr(case, field), written) for field, written in notation)
-    parts = [
-        f"{written.name} {value:.{written.digits}f} {written.unit}"
-        for value, written in values
-        if value is not None
-    ]
     named = "" if index is None else f"case {index}, "
-    return f"{named}POV level {level_name(case.level)}: {', '.join(parts)}"
+    return f"{named}POV level {level_name(case.level)}: {described(case)}"
 
 
 def _label(
@@ -394,6 +346,7 @@ def _label(
     colour: str = INK,
     size_m: float = 0.1,
 ) -> None:
+    """Add a dot with a text, which is drawn above it."""
     poi = etree.SubElement(
         root,
         "poi",
@@ -405,5 +358,4 @@ def _label(
         width=f"{size_m:.2f}",
         height=f"{size_m:.2f}",
     )
-    if text:
-        etree.SubElement(poi, "param", key=TEXT, value=text)
+    etree.SubElement(poi, "param", key=TEXT, value=text)

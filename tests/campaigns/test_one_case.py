@@ -30,7 +30,7 @@ class TestTheCommand:
         _, cause, replayed = out.splitlines()
         assert (code, cause) == (0, ran.splitlines()[1])
         rows = _rows(tmp_path / "kept")
-        assert replayed == f"identical: {rows} rows of x, y, position and speed"
+        assert replayed == f"identical: {rows} rows of x, y and speed"
 
     def test_begins_its_table_before_the_conflict(self, command_line):
         _, whole, _ = command_line("run", "--vut", "design2", *STALEMATE, "--json")

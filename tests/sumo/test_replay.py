@@ -282,13 +282,13 @@ CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
     (many(HOLD_STEPS), "in 11 or more rows"),
     (many(MAX_TIMESTEPS + 1), "has 1512 timesteps, and at most 1511 are read"),
     (lambda record: record[ROW].set("time", "4.05"), "at 4.05 s: there is one every 0.1 s"),
-    (lambda record: record[ROW].attrib.pop("time"), "without a time"),
+    (lambda record: record[ROW].attrib.pop("time"), "it has no time"),
     (lambda record: record[ROW].append(copy.deepcopy(record[ROW][1])), "two rows of vut at 4 s"),
     (without_vut, "must have pov, vut every 0.1 s"),
     *(
         (
             lambda record, number=number: record[ROW][0].set("pos", number),
-            "at 4.0 s: pos is ",
+            ": pos is ",
         )
         for number in ("nan", "1e8", "", "0x10", "\u0661")
     ),

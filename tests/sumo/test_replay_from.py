@@ -91,7 +91,7 @@ class TestTheCommand:
         _, _, begins, verdict = out.splitlines()
         assert (code, begins) == (0, "from 8.5 s, 3 s before the contact at 11.5 s")
         # 8.5 to 14.6 s, and the 10 rows that hold the end: 71 rows of two cars.
-        assert verdict == "identical: 142 rows of x, y, position and speed"
+        assert verdict == "identical: 142 rows of x, y and speed"
 
     def test_begins_at_the_start_where_that_is_later(self, command_line: Any) -> None:
         _, whole, _ = command_line("replay", STALEMATE)
