@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
-from merge_sumo.controllers.messages import HostReply, HostRequest, decode_answer, encode, packed
+from merge_sumo.controllers.host import HostReply, HostRequest, decode_answer, encode, packed
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene, VutLostError

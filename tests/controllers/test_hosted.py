@@ -19,8 +19,8 @@ from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
 
 from merge_sumo.controllers.controller import Start
+from merge_sumo.controllers.host import HostRequest, decode_request, encode, packed, unpacked
 from merge_sumo.controllers.kinds import load
-from merge_sumo.controllers.messages import HostRequest, decode_request, encode, packed, unpacked
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Scene, VutLostError

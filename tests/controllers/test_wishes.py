@@ -184,7 +184,7 @@ def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(spec):
 
 def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(spec):
     source = """
-from merge_sumo.controllers.messages import HostReply
+from merge_sumo.controllers.host import HostReply
 HostReply.of = lambda driver, scene: HostReply(
     accelerations_mps2=driver.act(scene).tobytes(), wishes=bytes([7, 7])
 )

@@ -43,6 +43,13 @@ class Command(NamedTuple):
     payload: bytes
 
 
+class Position(NamedTuple):
+    """A position: its type, and its coordinates, or road, position on it and number of lane."""
+
+    kind: int
+    place: list[Any]
+
+
 class Reader:
     """Reads values from bytes, one after the other; raises `ProtocolError`."""
 
@@ -67,10 +74,6 @@ class Reader:
         (value,) = struct.unpack(form, self.raw(struct.calcsize(form)))
         return value
 
-    def ubyte(self) -> int:
-        """Return the next unsigned byte."""
-        return self.raw(1)[0]
-
     def string(self) -> str:
         """Return the next string."""
         try:
@@ -80,33 +83,26 @@ class Reader:
 
     def count(self) -> int:
         """Return the number of values of a compound, whose type is next."""
-        if self.ubyte() != COMPOUND:
+        if self.number("B") != COMPOUND:
             raise ProtocolError("a compound was expected")
         return self._length()
 
-    def place(self) -> tuple[int, list[Any]]:
-        """Return the type and the coordinates of a position."""
-        kind = self.ubyte()
-        if kind == ROAD:
-            return kind, [self.string(), self.number("d"), self.ubyte()]
-        if kind >= len(PLACES):
-            raise ProtocolError(f"type 0x{kind:02x} is not a position")
-        dimensions = 2 if PLACES[kind].islower() else 3
-        return kind, [self.number("d") for _ in range(dimensions)]
-
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value, with a type before it; a compound is a list of its values."""
-        kind = self.ubyte()
+        kind = self.number("B")
         if kind in NUMBERS:
             return self.number(NUMBERS[kind])
         if kind == STRING:
             return self.string()
         if kind == COLOR:
             return tuple(self.raw(4))
-        if kind == STRING_LIST:
-            return tuple(self._items(self.string))
-        if kind == DOUBLE_LIST:
-            return tuple(self._items(partial(self.number, "d")))
+        if kind in (STRING_LIST, DOUBLE_LIST):
+            item = self.string if kind == STRING_LIST else partial(self.number, "d")
+            return tuple(self._items(item))
+        if kind <= ROAD:
+            form = "dd" if PLACES[kind].islower() else "ddd"
+            road, form = ([self.string()], "dB") if kind == ROAD else ([], form)
+            return Position(kind, [*road, *map(self.number, form)])
         if kind == COMPOUND and nesting < MAX_NESTING:
             return self._items(partial(self.typed, nesting + 1))
         raise ProtocolError(f"a value of type 0x{kind:02x} is not expected here")
@@ -135,6 +131,7 @@ class Reader:
 
 
 def _flat(value: Any) -> list[Any]:
+    """Return the values of a compound and of those in it."""
     if not isinstance(value, list):
         return [value]
     values = []
@@ -156,7 +153,7 @@ def commands_of(body: bytes) -> list[Command]:
     reader = Reader(body)
     commands: list[Command] = []
     while reader.left or not commands:
-        length, head = reader.ubyte(), 1
+        length, head = reader.number("B"), 1
         if length == 0:
             length, head = reader.number("i"), 5
         if length <= head:

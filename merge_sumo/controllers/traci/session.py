@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from functools import cache
@@ -248,7 +248,7 @@ class Session:
     def _answer(self, identifier: int, reader: Reader) -> bytes:
         """Return the answer without its status."""
         if identifier in QUESTIONS:
-            variable, name = reader.ubyte(), reader.string()
+            variable, name = reader.number("B"), reader.string()
             value = self._value(identifier, variable, name, reader)
             return command(bytes((identifier + RESPONSE, variable)) + string(name) + value)
         if identifier - SET in QUESTIONS:
@@ -257,7 +257,7 @@ class Session:
         if identifier - SUBSCRIBE in QUESTIONS:
             return self._subscribe(Subject(identifier - SUBSCRIBE, _subscribed(reader)), reader)
         if identifier - CONTEXT in QUESTIONS:
-            name, around = _subscribed(reader), (reader.ubyte(), reader.number("d"))
+            name, around = _subscribed(reader), (reader.number("B"), reader.number("d"))
             return self._subscribe(Subject(identifier - CONTEXT, name, around), reader)
         if identifier == VERSION:
             return version_answer()
@@ -273,9 +273,10 @@ class Session:
         if not is_answered(names):
             raise RefusedError(f"merge-sumo does not answer {name_of(getter, variable)}")
         function = SERVED_BY.get(names[0], names[0])
-        if function in OWN_ANSWERS and (getter != GET_VEHICLE or name in self.sumo.at_m):
-            return packed(function, OWN_ANSWERS[function](self, name))
         try:
+            own = self._own_answer(function, name)
+            if own is not None:
+                return packed(function, own)
             if function == "simulation.convert2D":
                 return self._conversion(reader)
             if function in DISTANCES:
@@ -284,19 +285,33 @@ class Session:
                 of_all = not name or function.endswith(("getIDList", "getIDCount"))
                 arguments = [*([] if of_all else [name]), *reader.arguments()]
             return packed(function, self.sumo.call(function, *arguments))
-        except ProtocolError as error:
+        except (ProtocolError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise RefusedError(f"merge-sumo does not answer {function}: {error}") from error
 
+    def _own_answer(self, function: str, name: str) -> Any:
+        """Return what SUMO cannot know here; None where it knows."""
+        if name in self.sumo.at_m:
+            # SUMO's own answers to these are those before the vehicle was put back.
+            if function == "vehicle.getPosition":
+                return self.position(name)
+            if function == "vehicle.getPosition3D":
+                return (*self.position(name), 0.0)
+            if function == "vehicle.getAngle":
+                return self.sumo.point(name).angle_deg
+        # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
+        if function == "simulation.getMinExpectedNumber":
+            return max(len(self.sumo.at_m), COMING * self.expected)
+        departed, arrived = tuple(self.sumo.departed), tuple(self.sumo.arrived)
+        for event, names in {"Loaded": departed, "Departed": departed, "Arrived": arrived}.items():
+            if function in (f"simulation.get{event}IDList", f"simulation.get{event}Number"):
+                return names if function.endswith("List") else len(names)
+        return None
+
     def _conversion(self, reader: Reader) -> bytes:
-        """Return a place in other coordinates."""
-        others = reader.count() - len(("place", "kind"))
-        kind, place = reader.place()
-        target = reader.typed()
-        if not (isinstance(target, int) and 0 <= target < len(PLACES)):
-            raise ProtocolError(f"there are no coordinates {target!r}")
+        """Return a position in other coordinates."""
+        (kind, place), target, *v_class = reader.typed()
         letter = PLACES[target]
         if target == ROAD:
-            v_class = [reader.typed() for _ in range(others)]
             function, arguments = "convertRoad", [*place[:2], kind == LON_LAT, *v_class]
         elif kind == ROAD:
             function = "convert2D" if letter.islower() else "convert3D"
@@ -308,27 +323,20 @@ class Session:
         return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
 
     def _distance(self, function: str, name: str, reader: Reader) -> tuple[str, list[Any]]:
-        """Return what measures from a vehicle to a place, or from one place to another."""
-        vehicle = [name] if name else []
-        kinds, ends = [], []
-        for _ in range(reader.count() - 1):
-            kind, place = reader.place()
-            kinds.append(kind)
-            ends.append(place)
-        driving = bool(reader.ubyte())
-        points = []
-        for place in ends:
-            points += place[:2]
-        if all(kind == ROAD for kind in kinds):
-            if not vehicle:
+        """Return what measures from a vehicle to a position, or from one position to another."""
+        ends = [reader.typed() for _ in range(reader.count() - 1)]
+        driving = bool(reader.number("B"))
+        points = [value for end in ends for value in end.place[:2]]
+        on_earth = any(end.kind == LON_LAT for end in ends)
+        if all(end.kind == ROAD for end in ends):
+            if not name:
                 return "simulation.getDistanceRoad", [*points, driving]
-            return function, [name, *points, *(place[2] for place in ends)]
-        on_earth = LON_LAT in kinds
-        if driving or vehicle:
-            for place in ends:  # where there is no road, SUMO would end
-                v_class = "passenger" if vehicle else "ignoring"
-                self.sumo.call("simulation.convertRoad", *place[:2], on_earth, v_class)
-        if vehicle:
+            return function, [name, *points, *(end.place[2] for end in ends)]
+        if driving or name:
+            for end in ends:  # where there is no road, SUMO would end
+                v_class = "passenger" if name else "ignoring"
+                self.sumo.call("simulation.convertRoad", *end.place[:2], on_earth, v_class)
+        if name:
             return f"{function}2D", [name, *points]
         return function, [*points, on_earth, driving]
 
@@ -347,9 +355,9 @@ class Session:
         """
         of = subject.around[0] if subject.around else subject.getter
         variables = dict(self.subscriptions.get(subject, {}))
-        count = reader.ubyte()
+        count = reader.number("B")
         for _ in range(count):
-            variable = reader.ubyte()
+            variable = reader.number("B")
             name = functions().get((of, variable), ("",))[-1].partition(".")[2]
             takes_parameter = subject.around is None and name in WITH_PARAMETER
             variables[variable] = reader.typed_bytes() if takes_parameter else b""
@@ -404,7 +412,7 @@ class Session:
 
     def _command(self, setter: int, reader: Reader) -> None:
         """Have a command carried out, or note that it changes nothing, or refuse it."""
-        variable, target = reader.ubyte(), reader.string()
+        variable, target = reader.number("B"), reader.string()
         names = functions().get((setter, variable), ())
         name, effect = name_of(setter, variable), effect_of(names)
         if effect is Effect.REFUSED:
@@ -502,22 +510,3 @@ def _subscribed(reader: Reader) -> str:
     """Return the id of the object of a subscription, which holds from now on until it is ended."""
     reader.raw(16)  # its begin and its end
     return reader.string()
-
-
-OWN_ANSWERS: Final[dict[str, Callable[[Session, str], Any]]] = {
-    # SUMO's own answers to these are those before the vehicle was put back.
-    "vehicle.getPosition": lambda session, name: session.position(name),
-    "vehicle.getPosition3D": lambda session, name: (*session.position(name), 0.0),
-    "vehicle.getAngle": lambda session, name: session.sumo.point(name).angle_deg,
-    # Several of SUMO's steps may pass in one of the client's, and an episode may end in it.
-    "simulation.getDepartedNumber": lambda session, _: len(session.sumo.departed),
-    "simulation.getDepartedIDList": lambda session, _: tuple(session.sumo.departed),
-    "simulation.getLoadedNumber": lambda session, _: len(session.sumo.departed),
-    "simulation.getLoadedIDList": lambda session, _: tuple(session.sumo.departed),
-    "simulation.getArrivedNumber": lambda session, _: len(session.sumo.arrived),
-    "simulation.getArrivedIDList": lambda session, _: tuple(session.sumo.arrived),
-    "simulation.getMinExpectedNumber": lambda session, _: max(
-        len(session.sumo.at_m), COMING * session.expected
-    ),
-}
-"""What SUMO cannot know here."""
