@@ -19,6 +19,7 @@ from merge_sumo.console import (
     flag_of,
     names_of_samplers,
     notices_printed,
+    prepare_streams,
     print_json,
     print_result,
     say,
@@ -30,7 +31,6 @@ from merge_sumo.files import dated
 from merge_sumo.interrupt import Stopped, stopping_in_order
 from merge_sumo.limits import check_limits, exhausted
 from merge_sumo.printable import quoted
-from merge_sumo.streams import prepare_streams
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection

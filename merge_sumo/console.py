@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import signal
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
+from io import TextIOWrapper
 from typing import TYPE_CHECKING, Any, Final, TextIO
 
 from merge_sumo import config
@@ -45,14 +49,42 @@ def flag_of(name: str) -> str:
     return FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
+def prepare_streams() -> None:
+    """Open closed standard streams to nothing, and write letters that a terminal lacks as escapes.
+
+    A file would get the number of a closed stream, and what is printed.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = open(os.devnull, mode)  # noqa: PTH123, SIM115 (it stays open)
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
+    for output in (sys.stdout, sys.stderr):
+        if isinstance(output, TextIOWrapper):
+            output.reconfigure(errors="backslashreplace")
+
+
 def show(line: object) -> None:
-    """Print a line of a result on standard output."""
-    print(printable(str(line)), flush=True)
+    """Print a line of a result on standard output.
+
+    Raises:
+        UserError: it cannot be written, and the result is lost.
+        Stopped: the reader has gone: the command ends as other programs do.
+    """
+    try:
+        print(printable(str(line)), flush=True)
+    except OSError as error:
+        # What is left in the buffer goes nowhere, also when the interpreter ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if error.errno == errno.EPIPE:
+            raise Stopped(signal.SIGPIPE) from None
+        raise UserError(f"cannot write the result to standard output: {error.strerror}") from error
 
 
 def say(line: str) -> None:
-    """Print a line for the user on standard error."""
-    print(printable(_with_flags(line)), file=sys.stderr, flush=True)
+    """Print a line for the user on standard error; one that cannot be written is lost alone."""
+    with suppress(OSError):
+        print(printable(_with_flags(line)), file=sys.stderr, flush=True)
 
 
 @cache

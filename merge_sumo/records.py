@@ -267,37 +267,25 @@ def _unknown(name: object, kind: Any) -> str:
 
 def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
     """Return a sentence on a record: the field, its value, and what it must be."""
-    message = str(error)
-    place = re.search(r" - at `\$([^`]*)`$", message)
-    names = re.findall(r"\.(\w+)", place[1]) if place else []
-    for name in names:
-        table = record if isinstance(record, dict) else {}
-        # The type of a field, or the tags that tell records of a union apart.
-        tags = tuple(_tag(known) for known in get_args(kind) if _is_record(known))
-        kind = _hints(_class_of(table, kind)).get(name, Literal[tags])
-        record = table.get(name)
-    name = names[-1] if names else "it"
+    message, _, place = str(error).partition(" - at `$")
+    name = "it"
+    for name in re.findall(r"\.(\w+)", place):
+        kind = _hints(_class_of(kind)).get(name)
+        record = record.get(name) if isinstance(record, dict) else None
     wrong = _NAMED.match(message)
     if wrong and wrong[1] == "missing required":
         return f"{name} has no {wrong[2]}"
     if wrong:
-        return _unknown(wrong[2], _class_of(record, kind))
+        return _unknown(wrong[2], _class_of(kind))
     return _not_a_value(name, record, kind, message)
 
 
-def _class_of(table: dict[str, Any], hint: Any) -> Any:
-    """Return the class that a type means; of a union, the record of the kind that a table names."""
-    classes = [part for part in get_args(hint) if _is_record(part) or is_dataclass(part)] or [hint]
-    named = (known for known in classes if _is_record(known) and _tag(known) == table.get("kind"))
-    return next(named, classes[0])
-
-
-def _is_record(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Record)
-
-
-def _tag(kind: Any) -> Any:
-    return kind.__struct_config__.tag
+def _class_of(hint: Any) -> Any:
+    """Return the record or dataclass that a type means, the first of a union."""
+    for part in (hint, *get_args(hint)):
+        if is_dataclass(part) or (isinstance(part, type) and issubclass(part, Record)):
+            return part
+    return Record
 
 
 def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
@@ -305,6 +293,8 @@ def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
         shown = f"{value!r:.60}"
     except (ValueError, RecursionError):  # thousands of digits, or of brackets
         shown = "something endless"
+    if hint is None:  # a field of another record of a union
+        return f"{name} is {shown}: {message}"
     finite = "out of range" in message
     return f"{name} is {shown}: it must be {'finite' if finite else in_words(hint)}"
 

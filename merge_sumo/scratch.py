@@ -6,22 +6,22 @@ removes those whose lock is free. Where the system has no such locks, it removes
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import platform
-import re
 import shutil
 import tempfile
+import time
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 _HERE: Final = hashlib.sha256(platform.node().encode(errors="replace")).hexdigest()[:8]
 """This machine: a lock in a folder that several machines share may mean nothing to the others."""
 PREFIX: Final = f"merge-sumo-{_HERE}-"
-_OURS: Final = re.compile(re.escape(PREFIX) + r"[a-z0-9_]{8}")
+YOUNG_S: Final = 60.0
+"""Age, in s, from which on a folder without a lock is one of a process that is gone."""
 
 
 class ScratchFolder(tempfile.TemporaryDirectory[str]):
@@ -30,14 +30,8 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
     def __init__(self) -> None:
         """Make the folder; OSError where that cannot be."""
         _remove_remains(tempfile.gettempdir())
-        self._lock: int | None = None
-        while True:
-            super().__init__(prefix=PREFIX, ignore_cleanup_errors=True)
-            try:
-                self._lock = _locked(Path(self.name))
-                return
-            except (BlockingIOError, FileNotFoundError):
-                self.cleanup()  # another process took it for remains before it had its lock
+        super().__init__(prefix=PREFIX, ignore_cleanup_errors=True)
+        self._lock = _locked(Path(self.name))
 
     def cleanup(self) -> None:
         """Remove the folder."""
@@ -48,46 +42,34 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
 
 
 def _locked(folder: Path) -> int | None:
-    """Return the descriptor that holds the lock of a folder; None where there are no locks.
+    """Return the descriptor that holds the lock of a folder.
 
-    Raises BlockingIOError where another has the lock, and OSError where this is not a folder.
+    None where another process has it, this is not a folder, or the system has no such locks.
     """
     try:
         import fcntl
     except ImportError:  # Windows
         return None
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    descriptor = None
     try:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.path.samestat(os.fstat(descriptor), folder.lstat()):
-            return descriptor
-        raise FileNotFoundError(errno.ENOENT, "replaced", str(folder))
-    except (BlockingIOError, FileNotFoundError):
-        os.close(descriptor)
-        raise
-    except OSError:  # the file system has no locks
-        os.close(descriptor)
+    except OSError:
+        if descriptor is not None:
+            os.close(descriptor)
         return None
+    return descriptor
 
 
 @cache
 def _remove_remains(above: str) -> None:
     """Remove the folders of ours whose process is gone, once in a process."""
     with suppress(OSError):
-        for folder in Path(above).iterdir():
-            if _OURS.fullmatch(folder.name):
-                with suppress(OSError):
-                    _remove_if_left(folder)
-
-
-def _remove_if_left(folder: Path) -> None:
-    """Remove a folder of this user that no process holds; OSError where it is none."""
-    geteuid: Any = getattr(os, "geteuid", None)
-    if geteuid is None or folder.lstat().st_uid != geteuid():
-        return
-    lock = _locked(folder)
-    if lock is not None:
-        try:
-            shutil.rmtree(folder, ignore_errors=True)
-        finally:
-            os.close(lock)
+        for folder in Path(above).glob(f"{PREFIX}????????"):
+            # A young one may not have its lock yet.
+            if time.time() - folder.lstat().st_mtime < YOUNG_S:
+                continue
+            lock = _locked(folder)
+            if lock is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(lock)

@@ -28,6 +28,7 @@ BESIDE = (
 def temporary(tmp_path, monkeypatch):
     """Give an own folder for temporary files, in which this process has made nothing yet."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(scratch, "YOUNG_S", 0.0)
     scratch._remove_remains.cache_clear()
     return tmp_path
 
@@ -73,27 +74,3 @@ def test_nothing_else_is_removed(temporary, tmp_path_factory):
         pass
     assert sorted(temporary.iterdir()) == before
     assert (elsewhere / "kept").is_file()
-
-
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="there are no users")
-def test_another_users_is_not_removed(temporary, monkeypatch):
-    (temporary / f"{PREFIX}abcd1234").mkdir()
-    monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
-    with ScratchFolder():
-        pass
-    assert [folder.name for folder in temporary.iterdir()] == [f"{PREFIX}abcd1234"]
-
-
-def test_one_that_was_taken_for_remains_is_made_again(temporary, monkeypatch):
-    locked, tried = scratch._locked, []
-
-    def taken_first(folder):
-        tried.append(folder)
-        if len(tried) == 1:
-            folder.rmdir()
-        return locked(folder)
-
-    monkeypatch.setattr(scratch, "_locked", taken_first)
-    with ScratchFolder() as name:
-        assert tried[0] != Path(name)
-        assert list(temporary.iterdir()) == [Path(name)]
