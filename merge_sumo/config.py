@@ -390,7 +390,7 @@ class Export:
     """sumo: folders that sumo-gui replays. openscenario: folders with OpenSCENARIO and OpenDRIVE.
     csv: one table of motion. cases: one small TOML file to commit, for rerun."""
     out: AnyPath | None = None
-    """Folder to write into, of cases also FILE.toml; by default RUN/scenarios for sumo, else
+    """Folder, or FILE.csv or FILE.toml for one file; by default RUN/scenarios for sumo, else
     RUN/exports."""
 
 

@@ -104,7 +104,7 @@ def formats_table() -> str:
     """Return the registered formats of export as a table."""
     from merge_sumo.reports.exports import FORMATS
 
-    rows = [f"| `{name}` | {one.about} |" for name, one in FORMATS.items()]
+    rows = [f"| `{name}` | {about} |" for name, about in FORMATS.items()]
     return "\n".join(("| `--format` | written |", "|---|---|", *rows))
 
 

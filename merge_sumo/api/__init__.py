@@ -68,7 +68,6 @@ from merge_sumo.drivers.policies import policies_in
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import (
     check_new,
-    check_own,
     dated,
     make_folder,
     write_new,
@@ -76,14 +75,14 @@ from merge_sumo.files import (
 from merge_sumo.metrics.merge import check_from
 from merge_sumo.printable import printable, quoted
 from merge_sumo.records import check_toml_size, to_plain
-from merge_sumo.reports import exports, figures
+from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
+from merge_sumo.reports.exports import export_cases
 from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.result import Shown
-from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.coordinates import outside_of_the_pool
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -212,22 +211,10 @@ def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comp
 @verb(c.Export)
 def export(config: c.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
-    if config.file_format not in exports.FORMATS:
-        known = ", ".join(exports.FORMATS)
-        raise UserError(f"there is no format {config.file_format!r}: choose one of {known}")
-    loaded, export_format = campaign_of(config.run).run, exports.FORMATS[config.file_format]
     indices = config.indices
     wanted = [indices] if isinstance(indices, int) else list(indices or ())
-    if config.out is None:
-        below = dict.fromkeys((SCENARIOS, exports.EXPORTS, export_format.below))
-        check_own(*(loaded.folder / name for name in below))
-    target = loaded.folder / export_format.below if config.out is None else Path(config.out)
-    if export_format.write_table is not None:
-        return [export_format.write_table(loaded, wanted, target)]
-    if not wanted or export_format.write_case is None:
-        raise UserError(f"`file_format` {config.file_format} needs the indices of cases")
-    road = road_for(loaded.scenario)
-    return list(exports.write_folders(loaded, wanted, target, export_format.write_case, road))
+    loaded = campaign_of(config.run).run
+    return export_cases(loaded, wanted, config.file_format, path_of(config.out))
 
 
 def report(run: c.AnyRun) -> Shown:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
 from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
 from merge_sumo.campaigns.run import Run, spread_failures
+from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import condition_of
@@ -87,18 +88,43 @@ def watching(run: Run) -> list[Outcome]:
     return [*chosen, *failing[MOST // 4 :]][:MOST]
 
 
+def new_file_in(target: Path, name: str) -> Path:
+    """Return the path of a new file: `target` if it has an ending, else `name` in that folder.
+
+    Raises `UserError` where no such file can be made, or the ending is not that of `name`.
+    """
+    ending = Path(name).suffix
+    if target.suffix == ending or (target.suffix and not target.is_dir()):
+        check_new(target, endings=(ending,))
+        return target
+    make_folder(target, exist_ok=True)
+    return target / name
+
+
 def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
-    """Write cases, or those that watch, as a new file at a path or in a folder; return its path."""
-    is_file = target.suffix == SUFFIX or (target.suffix and not target.is_dir())
-    path = target if is_file else target / f"cases{SUFFIX}"
+    """Write a cases file.
+
+    Args:
+        run: the campaign.
+        indices: the cases; without any, at most 40 that watch a controller.
+        target: the new file, or a folder for it.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        UserError: if there is no such case, or the file cannot be written.
+    """
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
-    if is_file:
-        check_new(path, endings=(SUFFIX,))
-    else:
-        make_folder(target, exist_ok=True)
+    path = new_file_in(target, f"cases{SUFFIX}")
     content = cases_toml(run, outcomes, path, run.settings.vut).encode()
     check_toml_size(content, path)
     write_new(path, content)
+    if not indices and len(outcomes) < len(run.outcomes):
+        notice(
+            f"note: the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to "
+            "watch a controller; name others by their index"
+        )
     return path
 
 

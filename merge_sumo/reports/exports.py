@@ -9,8 +9,7 @@ import csv
 import importlib
 import io
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, Final
@@ -20,18 +19,19 @@ import numpy as np
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
-from merge_sumo.files import check_new, make_folder, new_file, write_folder
+from merge_sumo.files import check_own, make_folder, new_file, write_folder
 from merge_sumo.metrics.bodies import WIDTH_M
 from merge_sumo.metrics.merge import merged_rows
-from merge_sumo.reports.cases_toml import write_cases
+from merge_sumo.reports.cases_toml import new_file_in, write_cases
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.coordinates import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 
 EXPORTS: Final = "exports"
-TABLE: Final = "trajectories"
+TABLE: Final = "trajectories.csv"
 SEVERITY: Final = "severity"
 """Column with one of our words."""
 SIGNAL: Final = "signal_"
@@ -49,34 +49,70 @@ CONTROLLER: Final = "EgoController"
 HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 
-WriteCase = Callable[[Run, int, Path, Corridor], Path]
-"""Writes a case of a run into a new folder; returns the path of the file to open."""
+FORMATS: Final = {
+    "sumo": "folders that sumo-gui replays",
+    "openscenario": "folders with OpenSCENARIO and OpenDRIVE",
+    "csv": "one table of motion",
+    "cases": "one file to commit: at most 40 cases, or those named",
+}
+"""What is written, by the name that follows `--format`."""
 
 
-def write_folders(
-    run: Run, indices: Sequence[int], target: Path, write: WriteCase, road: Corridor
-) -> Iterator[Path]:
-    """Write cases as folders below `target`, and yield the file to open of each.
+def export_cases(
+    run: Run, indices: Sequence[int], file_format: str, target: Path | None = None
+) -> list[Path]:
+    """Write cases of a campaign in a format of `FORMATS`.
 
-    Raises `UserError` before it writes anything where there is no such case or no such place.
+    Args:
+        run: the campaign.
+        indices: the cases; of tables none are all, of cases files those that watch a controller.
+        file_format: the format.
+        target: where they go; by default a folder in that of the campaign.
+
+    Returns:
+        The files to open.
+
+    Raises:
+        UserError: before anything is written, if there is no such format, case or place.
     """
+    if file_format not in FORMATS:
+        raise UserError(f"there is no format {file_format!r}: choose one of {', '.join(FORMATS)}")
+    if target is None:
+        check_own(run.folder / SCENARIOS, run.folder / EXPORTS)
+        target = run.folder / (SCENARIOS if file_format == "sumo" else EXPORTS)
+    if file_format == "cases":
+        return [write_cases(run, indices, target)]
+    if file_format == "csv":
+        return [write_table(run, indices, target)]
+    if not indices:
+        raise UserError(f"`file_format` {file_format} needs the indices of cases")
     for index in indices:
         run.outcome(index)
     make_folder(target, exist_ok=True)
-    for index in indices:
-        yield write(run, index, target / case_name(index), road)
+    road = road_for(run.scenario)
+    write = export_case if file_format == "sumo" else write_openscenario
+    return [write(run, index, target / case_name(index), road) for index in indices]
 
 
-def write_table(run: Run, indices: Sequence[int], folder: Path) -> Path:
-    """Write the motion of cases, or of all, as one table, one row a step; return its path.
+def write_table(run: Run, indices: Sequence[int], target: Path) -> Path:
+    """Write the motion of cases, or of all, as one table with a row for each step.
 
-    Raises `UserError` when the file exists, or a case has no trajectory.
+    Args:
+        run: the campaign.
+        indices: the cases; none are all.
+        target: the new file, or a folder for it.
+
+    Returns:
+        The path of the file.
+
+    Raises:
+        UserError: if the file exists, or a case has no trajectory.
     """
-    path = folder / f"{TABLE}.csv"
-    check_new(path)
-    rows = [row for index in indices or range(len(run.outcomes)) for row in _rows(run, index)]
+    rows: list[dict[str, Any]] = []
+    for index in indices or range(len(run.outcomes)):
+        rows += _rows(run, index)
+    path = new_file_in(target, TABLE)
     signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
-    make_folder(folder, exist_ok=True)
     with new_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         writer = csv.DictWriter(text, (*columns_of(run.scenario), *signals))
@@ -257,35 +293,3 @@ def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
     front = xosc.Axle(0.5, WHEEL_M, width - 0.2, -0.2 * length, WHEEL_M / 2.0)
     rear = xosc.Axle(0.0, WHEEL_M, width - 0.2, -0.8 * length, WHEEL_M / 2.0)
     return xosc.Vehicle(who, xosc.VehicleCategory.car, box, front, rear, 70.0, *limits)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ExportFormat:
-    """A format of cases; one of the two functions writes it.
-
-    Attributes:
-        about: what is written, in a sentence without its full stop.
-        write_case: writes the case of an index into a new folder, and returns the file to open.
-        write_table: writes cases into a new file of a folder, and returns its path.
-        below: folder in that of the campaign, where no other is named.
-    """
-
-    about: str
-    write_case: WriteCase | None = None
-    write_table: Callable[[Run, Sequence[int], Path], Path] | None = None
-    below: str = EXPORTS
-
-
-FORMATS: Final = {
-    "sumo": ExportFormat(
-        about="folders that sumo-gui replays", write_case=export_case, below=SCENARIOS
-    ),
-    "openscenario": ExportFormat(
-        about="folders with OpenSCENARIO and OpenDRIVE", write_case=write_openscenario
-    ),
-    "csv": ExportFormat(about="one table of motion", write_table=write_table),
-    "cases": ExportFormat(
-        about="one file to commit: at most 40 cases, or those named", write_table=write_cases
-    ),
-}
-"""Formats by the name that follows `--format`."""

@@ -19,9 +19,10 @@ from scenariogeneration import xosc
 from support.calling import invoke
 from support.handmade import write_run
 
+import merge_sumo as ms
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
@@ -116,7 +117,8 @@ class TestAMergeFromALane:
         assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s)
 
     def test_is_a_column_of_a_table(self, made, tmp_path):
-        path = write_table(made, [0, 1], tmp_path / "table")
+        path = write_table(made, [0, 1], tmp_path / "merges.csv")
+        assert path == tmp_path / "merges.csv"
         frame = polars.read_csv(path)
         assert frame.columns == list(columns_of(made.scenario))
         first, second = (frame.filter(case=case)["merged"].to_list() for case in (0, 1))
@@ -147,6 +149,13 @@ class TestATable:
 
 
 class TestTheCommand:
+    def test_says_how_many_cases_of_more_a_file_has(self, tmp_path):
+        run = write_run(tmp_path / "run", per_level=15)
+        with pytest.warns(Notice, match="the file has 40 of 45 cases"):
+            ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
+        with pytest.raises(UserError, match=r"end it in \.csv"):
+            ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
+
     def test_says_what_to_install(self, made, tmp_path, monkeypatch):
         load = importlib.import_module
 
