@@ -7,16 +7,14 @@ Only installed packages, which the user chose, are searched; the working folder 
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
 from functools import lru_cache
-from importlib.metadata import EntryPoint, distributions
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Final, Generic, TypeVar
-from warnings import warn
 
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
 
 T = TypeVar("T")
@@ -125,33 +123,21 @@ def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
 
     Nothing is imported, and nothing in the working folder, where lies what somebody sent, is found.
     """
-    with suppress(OSError):  # the working folder may be gone
-        return _installed(group, tuple(sys.path), os.getcwd())  # noqa: PTH109
-    return {}
+    try:
+        return _installed(group, tuple(sys.path), Path.cwd().resolve())
+    except OSError:  # the working folder is gone
+        return {}
 
 
 @lru_cache(maxsize=64)
 def _installed(
-    group: str, folders: tuple[str, ...], working_folder: str
+    group: str, _folders: tuple[str, ...], working_folder: Path
 ) -> dict[str, dict[str, EntryPoint]]:
-    here = os.path.realpath(working_folder)
-    searched = [folder for folder in folders if folder and os.path.realpath(folder) != here]
     entries: dict[str, dict[str, EntryPoint]] = {}
-    packages: set[str] = set()
-    for package in distributions(path=searched):
-        try:
-            selected = package.entry_points.select(group=group)
-            name = str(package.metadata["Name"]) if selected else ""
-        except ValueError as error:  # not UTF-8, or no entry points
-            where = package.locate_file("")
-            warn(f"left out the entry points of a package in {where}: {error}", Notice, 2)
-            continue
-        # The name takes most of the time; the first package of a name shadows others.
-        if not selected or name in packages:
-            continue
-        packages.add(name)
-        for entry in selected:
+    for entry in entry_points(group=group):
+        package = entry.dist
+        if package is not None and Path(str(package.locate_file(""))).resolve() != working_folder:
             # Where the backport of importlib.metadata is imported, as by Dask, entries are its own.
             plain = EntryPoint(entry.name, entry.value, group)
-            entries.setdefault(entry.name, {})[name] = plain
+            entries.setdefault(entry.name, {})[package.name] = plain
     return entries

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -46,7 +46,6 @@ from merge_sumo.registry import entries_of
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.scenario.signals import Left, as_signals
-from merge_sumo.source_files import module_of_file
 
 objects: Final[dict[str, Any]] = {}
 """The objects of this process that are controllers, by the arguments of their specs."""
@@ -473,3 +472,24 @@ def _module_of(source: str) -> ModuleType:
 
 def _cannot_load(what: str, error: BaseException) -> UserError:
     return UserError(f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}")
+
+
+def module_of_file(path: Path) -> ModuleType:
+    """Return the module that a file holds; it is executed once, and again when it has changed.
+
+    Modules beside it are found. Raises OSError where it cannot be read, and what its code raises.
+    """
+    return _executed(path.resolve(), path.stat().st_mtime_ns)
+
+
+@cache
+def _executed(path: Path, _changed_ns: int) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"merge_sumo_file_{path.stem}", path)
+    if spec is None or spec.loader is None:
+        raise ImportError("it is no Python file")
+    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))  # for the modules beside it
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -65,7 +65,7 @@ def test_the_last_step_opens_it_in_sumo_gui(campaign, command_line, monkeypatch)
     folder, worst = campaign
     monkeypatch.chdir(folder)
     monkeypatch.setenv("DISPLAY", ":99")
-    monkeypatch.setattr("merge_sumo.sumo.replay.open_gui", lambda folder, from_s: 0)
+    monkeypatch.setattr("merge_sumo.sumo.replay.open_gui", lambda *_, **_options: 0)
     arguments = the_worst(WINDOW, worst)
     assert arguments == [*the_worst(RUN, worst), "--gui"]
     code, _, err = command_line(*arguments)

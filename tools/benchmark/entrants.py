@@ -19,6 +19,7 @@ from typing import Any, Final, TypeVar
 
 from merge_sumo.analysis.sampler_study import COMPARED_BATCH
 from merge_sumo.controllers.deadline import Deadline, DeadlineExceeded, text_of
+from merge_sumo.controllers.python import module_of_file
 from merge_sumo.errors import UserError
 from merge_sumo.files import sha256_of
 from merge_sumo.metrics.prediction import Prediction
@@ -27,7 +28,6 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.contract import SamplerContract
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import Case, FloatArray, Pool
-from merge_sumo.source_files import module_of_file
 
 T = TypeVar("T")
 
