@@ -183,7 +183,8 @@ def _check_text(name: str, text: str | None) -> None:
         (text or "").encode()
     except UnicodeEncodeError:
         raise UserError(
-            f"`{name}` is {text!r}, which campaign.json cannot record: it is not UTF-8; rename it"
+            f"`{name}` is {text!r}: it has bytes that are not UTF-8, which campaign.json cannot "
+            "record; use another name"
         ) from None
 
 

@@ -196,7 +196,9 @@ class _Episode:
 def _read(folder: Path) -> _Episode:
     """Read case, record and net of a folder that may be of another person."""
     if not folder.is_dir():
-        raise UserError(f"{folder} is not a replay folder: there is no such folder")
+        raise UserError(
+            f"there is no folder {folder}: name a replay folder, or a campaign and a case"
+        )
     net = HOSTED_NET if (folder / HOSTED_NET).exists() else NET
     for name in (net, CASE, RECORD):
         if not (folder / name).exists():

@@ -67,7 +67,7 @@ class TestAVutFile:
         assert_refused(
             call("campaign", "--vut", vut, "--cases", 2),
             "merge-sumo: --vut is ",
-            "it is not UTF-8",
+            "bytes that are not UTF-8",
         )
         assert [path.suffix for path in tmp_path.iterdir()] == [".py"]
 

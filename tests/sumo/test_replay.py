@@ -321,7 +321,7 @@ class TestAFolderThatCannotBeReplayed:
     def test_lacks_a_file_or_is_missing(self, folder, tmp_path):
         (folder / NET).unlink()
         assert NET in refusal(folder)
-        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
+        assert "there is no folder" in refusal(tmp_path / "nowhere")
 
 
 def test_a_folder_of_an_older_version_is_played_on_the_shipped_road(folder):
