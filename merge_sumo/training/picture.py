@@ -1,4 +1,4 @@
-"""A merging game from above, as the player of the report draws a case: with pygame, to scale."""
+"""A merging game from above, to scale, drawn by pygame."""
 
 from __future__ import annotations
 
@@ -18,22 +18,12 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.scenario.scenario import Scenario
 
-BACKGROUND: Final = "#ffffff"
 ROAD: Final = "#c9c7c1"
 INK: Final = "#1c2228"
 SIZE_PX: Final = (960, 240)
-FINER: Final = 2
-"""The picture is drawn so many times larger, and made smaller, so that edges are smooth."""
 LANE_M: Final = 3.05
 """A lane is 3.2 m wide: what is left free between two lanes is the line between them."""
 CAR_WIDTH_M: Final = 2.0
-LEAST_M: Final = 90.0
-"""The view follows both cars, and is never narrower."""
-MERGE_LINE_M: Final = (-2.4, 5.4)
-DASH_M: Final = 1.0
-LETTERS_PX: Final = 22
-UNSEEN: Final = ("dummy", "offscreen")
-"""Drivers of SDL that draw windows nowhere."""
 
 
 class GamePicture:
@@ -50,7 +40,7 @@ class GamePicture:
         self._paths = {"POV": np.array(data["main"]), "VUT": np.array(data["ramp"])}
         self._lengths_m = dict(zip(("POV", "VUT"), scenario.lengths_m, strict=True))
         self._pygame.font.init()
-        self._font = self._pygame.font.Font(None, FINER * LETTERS_PX)
+        self._font = self._pygame.font.Font(None, 22)
         self._window: Any = None
         self._clock = self._pygame.time.Clock()
 
@@ -61,26 +51,26 @@ class GamePicture:
 
     def show(self, state: FloatArray, fps: float) -> None:
         """Show the picture in a window, at most so often a second; `UserError` without a screen."""
-        pygame = self._pygame
         if self._window is None:
             self._window = self._opened()
         self._window.blit(self._drawn(state), (0, 0))
-        pygame.event.pump()
-        pygame.display.flip()
+        self._pygame.event.pump()
+        self._pygame.display.flip()
         self._clock.tick(fps)
 
     def _opened(self) -> Any:
         """Return a new window; `UserError` where it could not be seen."""
-        pygame = self._pygame
+        display = self._pygame.display
         try:
-            pygame.display.init()
-            # Without a screen SDL goes on in silence, unless it is told to.
-            if pygame.display.get_driver() in UNSEEN and "SDL_VIDEODRIVER" not in os.environ:
-                raise pygame.error("no display")
-            pygame.display.set_caption("merge-sumo")
-            return pygame.display.set_mode(SIZE_PX)
-        except pygame.error as error:
-            pygame.display.quit()
+            display.init()
+            # Without a screen SDL draws nowhere and says nothing, unless it is told to.
+            is_unseen = display.get_driver() in ("dummy", "offscreen")
+            if is_unseen and "SDL_VIDEODRIVER" not in os.environ:
+                raise self._pygame.error("no display")
+            display.set_caption("merge-sumo")
+            return display.set_mode(SIZE_PX)
+        except self._pygame.error as error:
+            display.quit()
             raise UserError(
                 f"there is no screen for a window ({error}): take render_mode='rgb_array'"
             ) from error
@@ -92,39 +82,34 @@ class GamePicture:
             self._window = None
 
     def _drawn(self, state: FloatArray) -> Any:
-        """Return the picture of a state as a surface."""
+        """Return the picture of a state as a surface, in which both cars are."""
         x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state.tolist()
-        moving = {"POV": (x_pov_m, v_pov_mps), "VUT": (x_vut_m, v_vut_mps)}
-        fronts = np.array([self._place(who, x_m) for who, (x_m, _) in moving.items()])
-        (left, bottom), (right, top) = fronts.min(axis=0), fronts.max(axis=0)
-        wide, high = (FINER * px for px in SIZE_PX)
-        width_m = max(right - left + 50.0, (1.7 * (top - bottom) + 22.0) * wide / high, LEAST_M)
-        px_per_m, centre = wide / width_m, np.array([left + right, bottom + top]) / 2.0
+        cars = (("POV", x_pov_m, v_pov_mps, -1), ("VUT", x_vut_m, v_vut_mps, 1))
+        fronts = np.array([self._place(who, x_m) for who, x_m, _, _ in cars])
+        low, high = fronts.min(axis=0), fronts.max(axis=0)
+        size = np.array(SIZE_PX)
+        across_m, up_m = high - low
+        width_m = max(across_m + 50.0, (1.7 * up_m + 22.0) * size[0] / size[1], 90.0)
+        px_per_m = size[0] / width_m
 
         def pixels(points: FloatArray) -> FloatArray:
-            middle = np.array([wide, high]) / 2.0
-            placed: FloatArray = middle + (points - centre) * [px_per_m, -px_per_m]
-            return placed
+            return np.asarray(size / 2.0 + (points - (low + high) / 2.0) * [px_per_m, -px_per_m])
 
-        canvas = self._pygame.Surface((wide, high))
-        canvas.fill(BACKGROUND)
+        canvas = self._pygame.Surface(SIZE_PX)
+        canvas.fill("#ffffff")
         for lane in self._lanes:
             self._line(canvas, ROAD, pixels(lane), LANE_M * px_per_m)
-        for y_m in np.arange(*MERGE_LINE_M, 2.0 * DASH_M):
-            dash = pixels(np.array([[0.0, y_m], [0.0, y_m + DASH_M]]))
-            self._line(canvas, INK, dash, 0.25 * px_per_m)
-        is_above = fronts[0, 1] > fronts[1, 1]
-        for (who, (x_m, v_mps)), front in zip(moving.items(), fronts, strict=True):
-            rear = self._place(who, x_m - self._lengths_m[who])
+        merge_line = np.array([[0.0, -2.4], [0.0, 5.4]])
+        self._line(canvas, INK, pixels(merge_line), 0.25 * px_per_m)
+        for who, x_m, v_mps, side in cars:
+            rear, front = self._place(who, x_m - self._lengths_m[who]), self._place(who, x_m)
             ends = pixels(np.array([rear, front]))
             self._line(canvas, COLOURS[who.lower()], ends, CAR_WIDTH_M * px_per_m)
             text = self._font.render(f"{who} {v_mps:.1f} m/s", True, INK)
-            x, y = pixels(np.array([(rear + front) / 2.0]))[0]
-            aside = 2.4 * px_per_m + text.get_height() / 2.0
-            above = is_above == (who == "POV")
-            place = text.get_rect(center=(x, y - aside if above else y + aside))
+            x, y = ends.mean(axis=0)
+            place = text.get_rect(center=(x, y + side * (2.4 * px_per_m + 11.0)))
             canvas.blit(text, place.clamp(canvas.get_rect()))
-        return self._pygame.transform.smoothscale(canvas, SIZE_PX)
+        return canvas
 
     def _line(self, canvas: Any, colour: str, points: FloatArray, width_px: float) -> None:
         """Draw a line of a width: rectangles for its pieces, and discs where they meet."""

@@ -16,6 +16,5 @@ ENV_ID: Final = "merge_sumo/Merge-v0"
 registration.register(
     ENV_ID,
     entry_point="merge_sumo.training.env:MergeEnv",
-    vector_entry_point="merge_sumo.training.env:MergeVectorEnv",
     max_episode_steps=round(MAX_EPISODE_S / DT_S) // DECISION_STEPS,
 )

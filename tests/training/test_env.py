@@ -15,7 +15,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import TEMPLATES
 from merge_sumo.scenario.colours import COLOURS
 from merge_sumo.training import picture
-from merge_sumo.training.env import MergeEnv, MergeVectorEnv
+from merge_sumo.training.env import MergeEnv
 from merge_sumo.training.registration import ENV_ID
 
 CSS = TEMPLATES / "report.css"
@@ -32,28 +32,28 @@ def no_screen(monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
 
 
-@pytest.mark.parametrize("action", [-1, 7, 2.0, 1.5, True, None, "3", [3]])
+@pytest.mark.parametrize("action", [-1, 7, 2.0, 1.5, None, "3", [3]])
 def test_what_is_no_action_is_refused_in_a_sentence(action):
-    game, games = MergeEnv("vut"), MergeVectorEnv(2, "vut")
+    game = MergeEnv("vut")
     game.reset(seed=1)
-    games.reset(seed=1)
     with pytest.raises(UserError, match="an action is a whole number from 0 to 6: not"):
         game.step(action)
-    sentence = "a whole number from 0 to 6 for each of 2 games: not"
-    with pytest.raises(UserError, match=sentence):
-        games.step([action, action])
-    with pytest.raises(UserError, match=sentence):
-        games.step([3])
 
 
-def test_what_makes_no_game_is_refused_in_a_sentence():
-    with pytest.raises(UserError, match="num_envs is 0"):
-        MergeVectorEnv(0)
-    for svo in ("selfish", 2.0, float("nan")):
-        with pytest.raises(UserError, match=r"svo is .*: choose 'random', or 0 up to"):
-            MergeEnv("pov", "vut1", svo)
-    with pytest.raises(UserError, match="no render_mode 'ansi': choose 'rgb_array' or 'human'"):
-        MergeEnv(render_mode="ansi")
+@pytest.mark.parametrize(
+    ("settings", "sentence"),
+    [
+        ({"role": "bus"}, "no role 'bus'"),
+        ({"role": "vut", "svo": 0.5}, "svo is the orientation of a POV"),
+        ({"opponent": "pov1"}, "cannot play against 'pov1'"),
+        ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or 0 up to"),
+        ({"opponent": "vut1", "svo": float("nan")}, "svo is .*: choose 'random', or 0 up to"),
+        ({"render_mode": "ansi"}, "no render_mode 'ansi': choose 'rgb_array' or 'human'"),
+    ],
+)
+def test_settings_that_make_no_game_are_refused_in_a_sentence(settings, sentence):
+    with pytest.raises(UserError, match=sentence):
+        MergeEnv(**settings)
 
 
 @pytest.mark.parametrize("role", ["pov", "vut"])

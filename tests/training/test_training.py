@@ -32,7 +32,6 @@ from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import play, returns_of
-from merge_sumo.training.env import MergeVectorEnv
 from merge_sumo.training.game import Game, greedy, pool_starts
 from merge_sumo.training.helix import train_library
 from merge_sumo.training.registration import ENV_ID
@@ -70,19 +69,6 @@ class TestEnvironments:
             assert (observation[terminated, 2] >= 0.0).all()
             ends, ended = ends + int(terminated.sum()), terminated
         assert ends >= 6
-
-    @pytest.mark.parametrize(
-        ("settings", "sentence"),
-        [
-            ({"role": "bus"}, "no role 'bus'"),
-            ({"role": "vut", "svo": 0.5}, "svo is the orientation of a POV"),
-            ({"role": "pov", "opponent": "pov1"}, "cannot play against 'pov1'"),
-            ({"max_episode_steps": 0}, "max_episode_steps is 0"),
-        ],
-    )
-    def test_settings_that_make_no_game_are_refused_in_a_sentence(self, settings, sentence):
-        with pytest.raises(UserError, match=sentence):
-            MergeVectorEnv(1, **settings)
 
 
 def test_the_tutorial_shows_the_code_that_its_commands_run():
