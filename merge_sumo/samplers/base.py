@@ -5,14 +5,13 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.metrics.summary import RunsOfCase, by_case
+from merge_sumo.metrics.summary import by_case
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
@@ -54,13 +53,6 @@ class Sampler(ABC):
         self.seed = seed
         self.predictor = predictor if self.uses_predictions else None
         self._outcomes: dict[int, Outcome] = {}
-        self._last_index = -1
-        self._observed: dict[int | None, list[Outcome]] | None = {None: []}
-        """Outcomes with a verdict by level, and all of them; None where they are to be sorted."""
-        self._histories: dict[int, LevelHistory] = {}
-        """Of the first outcomes of a level; later ones are added when it is asked for."""
-        self._repeated = False
-        """Whether a case ran with more than one draw."""
         self._proposed: Counter[int] = Counter()
         self._pending: list[Case] = []
 
@@ -85,13 +77,7 @@ class Sampler(ABC):
         """
         for outcome in outcomes:
             self._proposed[outcome.case.level] += outcome.index not in self._outcomes
-            if outcome.index <= self._last_index:
-                self._observed = None
-            self._last_index = max(outcome.index, self._last_index)
-            self._repeated |= outcome.case.draw > 0
             self._outcomes[outcome.index] = outcome
-            if self._observed is not None:
-                _observe(self._observed, outcome)
         if self.predictor is not None and motions is not None:
             self.predictor.tell(outcomes, motions)
 
@@ -109,11 +95,12 @@ class Sampler(ABC):
 
     def observed(self, level: int | None = None) -> list[Outcome]:
         """Return the outcomes with a verdict, of one level or of all, in order of their index."""
-        if self._observed is None:
-            self._observed, self._histories = {None: []}, {}
-            for _, outcome in sorted(self._outcomes.items()):
-                _observe(self._observed, outcome)
-        return list(self._observed.get(level, ()))
+        observed = []
+        for index in sorted(self._outcomes):
+            outcome = self._outcomes[index]
+            if outcome.margin is not None and level in (None, outcome.case.level):
+                observed.append(outcome)
+        return observed
 
     def proposed(self, level: int | None = None) -> int:
         """Return the number of cases told, with or without a verdict, or pending.
@@ -124,50 +111,29 @@ class Sampler(ABC):
         return pending + (self._proposed.total() if level is None else self._proposed[level])
 
     def history(self, level: int) -> LevelHistory:
-        """Return the outcomes with a verdict at one level as arrays, a row for each case."""
-        if self._repeated:
-            return self._repeated_history(level)
-        observed = self.observed(level)
-        before = self._histories.get(level)
-        outcomes = observed if before is None else observed[len(before.points) :]
-        history = self._rows_of(outcomes, level)
-        if before is not None:
-            history = before.then(history)
-        self._histories[level] = history
-        return history.take(np.arange(len(observed)))
+        """Return the outcomes with a verdict at one level as arrays, a row for each case.
 
-    def runs(self, level: int | None = None) -> list[RunsOfCase]:
-        """Return the cases with a verdict, of one level or of all, each with its runs.
-
-        Those of a level are the rows of its history.
+        The worst run of a case gives its margin and its gap.
         """
-        return by_case(self.observed(level))
-
-    def _repeated_history(self, level: int) -> LevelHistory:
-        """Return the history of a level where cases ran with more than one draw."""
-        cases = self.runs(level)
-        worst = [one.deciding() for one in cases]
-        margins = [bounded(np.array([r.margin for r in one.outcomes], float)) for one in cases]
-        return replace(
-            self._rows_of(worst, level),
-            failed=np.array([one.share > self.tolerated for one in cases], dtype=bool),
-            batch=np.array([one.outcomes[0].batch for one in cases], dtype=np.int64),
-            runs=np.array([one.runs for one in cases], dtype=np.int64),
-            failures=np.array([one.failures for one in cases], dtype=np.int64),
-            variance=np.array([np.var(of, ddof=1) if len(of) > 1 else np.nan for of in margins]),
-            varies=any(len({run.margin for run in one.outcomes}) > 1 for one in self.runs()),
-        )
-
-    def _rows_of(self, outcomes: Sequence[Outcome], level: int) -> LevelHistory:
-        """Return outcomes as rows, as if each were the only run of its case."""
+        every = by_case(self.observed())
+        cases = [case for case in every if case.case.level == level]
+        worst = [case.deciding() for case in cases]
+        variance = np.full(len(cases), np.nan)
+        for place, case in enumerate(cases):
+            if case.runs > 1:
+                margins = np.array([run.margin for run in case.outcomes], dtype=np.float64)
+                variance[place] = np.var(bounded(margins), ddof=1)
         return LevelHistory(
-            points=to_unit((o.case for o in outcomes), level, self.pool.scenario),
-            margin=bounded(np.array([o.margin for o in outcomes], dtype=np.float64)),
-            failed=np.array([o.failed for o in outcomes], dtype=bool),
+            points=to_unit((run.case for run in worst), level, self.pool.scenario),
+            margin=bounded(np.array([run.margin for run in worst], dtype=np.float64)),
+            failed=np.array([case.share > self.tolerated for case in cases], dtype=bool),
             # None becomes NaN.
-            gap=np.array([o.signed_gap for o in outcomes], dtype=np.float64),
-            batch=np.array([o.batch for o in outcomes], dtype=np.int64),
-            tolerated=self.tolerated,
+            gap=np.array([run.signed_gap for run in worst], dtype=np.float64),
+            batch=np.array([case.outcomes[0].batch for case in cases], dtype=np.int64),
+            runs=np.array([case.runs for case in cases], dtype=np.int64),
+            failures=np.array([case.failures for case in cases], dtype=np.int64),
+            variance=variance,
+            varies=any(case.varies for case in every),
         )
 
     def rng(self, *key: int) -> np.random.Generator:
@@ -199,13 +165,6 @@ class LevelwiseSampler(Sampler):
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
         """Return `n` points, (n, d), of the level's unit cube; the history's points have its d."""
-
-
-def _observe(observed: dict[int | None, list[Outcome]], outcome: Outcome) -> None:
-    """Add an outcome, if it has a verdict, to those of its level and to all."""
-    if outcome.margin is not None:
-        observed[None].append(outcome)
-        observed.setdefault(outcome.case.level, []).append(outcome)
 
 
 def reflect(points: FloatArray) -> FloatArray:

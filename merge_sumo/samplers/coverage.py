@@ -15,6 +15,7 @@ import numpy as np
 
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.summary import by_case
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.base_rate import BaseRate
@@ -119,7 +120,7 @@ class CoverageSampler(Sampler):
     ) -> BaseRate:
         """Return the base rate of a level, with the sequence of its first batch."""
         # A case is judged by what was predicted of its first run.
-        predictions = [case.outcomes[0].prediction for case in self.runs(level)]
+        predictions = [case.outcomes[0].prediction for case in by_case(self.observed(level))]
         errors = [
             outcome.case
             for outcome in self._outcomes.values()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -42,7 +42,6 @@ class LevelHistory:
         failures: number of those that failed, (N,).
         variance: variance of the margin over the runs of a case, (N,); NaN for a single run.
         varies: whether runs of a case have differed, at this level or another.
-        tolerated: share of the runs of a case that may fail.
     """
 
     points: FloatArray
@@ -50,22 +49,10 @@ class LevelHistory:
     failed: NDArray[np.bool_]
     gap: FloatArray
     batch: NDArray[np.int64]
-    runs: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    failures: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    variance: FloatArray = field(default_factory=lambda: np.empty(0, dtype=np.float64))
-    varies: bool = False
-    tolerated: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Give each case a single run where nothing else is said."""
-        single = {
-            "runs": np.ones(len(self.points), dtype=np.int64),
-            "failures": self.failed.astype(np.int64),
-            "variance": np.full(len(self.points), np.nan),
-        }
-        for name, values in single.items():
-            if len(getattr(self, name)) != len(self.points):
-                object.__setattr__(self, name, values)
+    runs: NDArray[np.int64]
+    failures: NDArray[np.int64]
+    variance: FloatArray
+    varies: bool
 
     @property
     def dims(self) -> int:
@@ -87,22 +74,11 @@ class LevelHistory:
         """Return whether any run of a case failed, (N,)."""
         return self.failures > 0
 
-    def then(self, later: LevelHistory) -> LevelHistory:
-        """Return the outcomes with later ones after them."""
-        if not len(later.points):
-            return self
-        rows: dict[str, Any] = {
-            name: np.concatenate([values, getattr(later, name)])
-            for name, values in self._rows().items()
-        }
-        rows["varies"] = self.varies or later.varies
-        return replace(self, **rows)
-
     def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
         """Return some of the outcomes."""
-        return replace(self, **{name: values[places] for name, values in self._rows().items()})
-
-    def _rows(self) -> dict[str, Any]:
-        """Return the fields with a row for each case, by name."""
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
-        return {name: rows for name, rows in values.items() if isinstance(rows, np.ndarray)}
+        chosen: dict[str, Any] = {}
+        for column in fields(self):
+            values = getattr(self, column.name)
+            if isinstance(values, np.ndarray):
+                chosen[column.name] = values[places]
+        return replace(self, **chosen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.histories import history_of
 
 from merge_sumo.samplers.annealing import CHAINS, AnnealingSampler
 from merge_sumo.samplers.base import reflect
@@ -21,18 +22,14 @@ def two_valleys(points: FloatArray) -> FloatArray:
     return 1.0 - 1.8 * np.exp(-np.minimum(left, right) / 0.05)
 
 
-def history_of(points: FloatArray, margin: FloatArray, batch: FloatArray) -> LevelHistory:
-    return LevelHistory(points, margin, margin < 0.0, np.full(len(margin), np.nan), batch)
-
-
 def anneal(seed: int, batches: int, n: int = 20) -> LevelHistory:
     sampler = AnnealingSampler(Pool(levels=(0,), scenario=US23), seed)
-    history = history_of(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+    history = history_of(np.empty((0, 2)), np.empty(0))
     for batch in range(batches):
         rng = np.random.default_rng([seed, batch])
         points = np.vstack([history.points, sampler.propose(history, n, rng, 0)])
         of_batch = np.append(history.batch, np.full(n, batch))
-        history = history_of(points, two_valleys(points), of_batch)
+        history = history_of(points, two_valleys(points), batch=of_batch)
     return history
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import some
+from support.histories import history_of
 
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.score import Measures, Outcome
@@ -22,7 +23,6 @@ from merge_sumo.samplers.belief import (
 from merge_sumo.samplers.coverage import NEAREST, PATIENCE, _LevelBatch, _limit
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
-from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.scenario.case import Case, Pool, to_unit
@@ -121,8 +121,7 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
     points = np.random.default_rng(0).random((30, 2))
     gap = 10.0 * (points[:, 0] - 0.5)
     missing = np.where(points[:, 0] > 0.9, np.nan, gap)
-    margin, batch = np.full(30, 0.99), np.zeros(30, dtype=np.int64)
-    history = LevelHistory(points, margin, np.abs(gap) < 1.0, missing, batch)
+    history = history_of(points, np.full(30, 0.99), failed=np.abs(gap) < 1.0, gap=missing)
     values, low, high = what_is_learned(history)
     assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(100.0 / 3.0) / np.arcsinh(1.0))
     sure = Margin(points, values, low, high, rough=False).at(np.array([[0.5, 0.5], [0.97, 0.5]]))
@@ -186,8 +185,7 @@ def test_looks_where_cases_come_near_but_counts_on_failures_alone(blind):
     points = rng.random((2 * PATIENCE, 2))
     gap = 1.3 + 10.0 * points[:, 0]
     margin = 1.0 - 0.9 * np.exp(0.4 * (1.0 - gap))
-    nothing, batch = np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=np.int64)
-    history = LevelHistory(points, margin, nothing, np.where(blind, np.nan, gap), batch)
+    history = history_of(points, margin, gap=np.where(blind, np.nan, gap))
     assert _limit(history) is not None
     enough = replace(history, failures=(np.arange(len(points)) < NEAREST).astype(np.int64))
     assert _limit(enough) is None

@@ -82,7 +82,7 @@ class TestTheBelief:
         runs = np.full(150, self.RUNS)
         variance = np.where((failures > 0) & (failures < self.RUNS), 0.4, 0.0)
         rows = points, margin, decides, gap, np.arange(150) // 10, runs, failures, variance
-        return LevelHistory(*rows, varies=True, tolerated=tolerated), inside
+        return LevelHistory(*rows, varies=True), inside
 
     def test_is_the_share_of_runs_that_fail(self):
         history, _ = self.history(0.1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from support.histories import history_of
 
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.subset import STAGE_SIZE, SubsetSampler, SubsetState, replay
@@ -17,25 +18,24 @@ def margin_at(points: FloatArray) -> FloatArray:
     return 0.8 * (points.sum(axis=1) - 0.1)
 
 
-def history_of(points: FloatArray, batch: FloatArray) -> LevelHistory:
-    margin = margin_at(points)
-    return LevelHistory(points, margin, margin < 0.0, np.full(len(margin), np.nan), batch)
+def in_batches(points: FloatArray, batch: FloatArray) -> LevelHistory:
+    return history_of(points, margin_at(points), batch=batch)
 
 
 def simulate(seed: int, batches: int, n: int = 20) -> LevelHistory:
     sampler = SubsetSampler(Pool(levels=(0,), scenario=US23), seed)
-    history = history_of(np.empty((0, 2)), np.empty(0, dtype=np.int64))
+    history = in_batches(np.empty((0, 2)), np.empty(0, dtype=np.int64))
     for batch in range(batches):
         rng = np.random.default_rng([seed, batch])
         points = np.vstack([history.points, sampler.propose(history, n, rng, 0)])
-        history = history_of(points, np.append(history.batch, np.full(n, batch)))
+        history = in_batches(points, np.append(history.batch, np.full(n, batch)))
     return history
 
 
 def stages() -> list[SubsetState]:
     history = simulate(3, batches=20)
     ends = range(20, len(history.points) + 1, 20)
-    return [replay(history_of(history.points[:end], history.batch[:end])) for end in ends]
+    return [replay(in_batches(history.points[:end], history.batch[:end])) for end in ends]
 
 
 def test_goes_through_ever_lower_and_rarer_regions_to_the_failures():
@@ -56,6 +56,6 @@ def test_a_rejected_move_leaves_its_chain_where_it_is():
     before = replay(history)
     far = np.full((3, 2), 0.99)
     points = np.vstack([history.points, far])
-    after = replay(history_of(points, np.append(history.batch, [5, 5, 5])))
+    after = replay(in_batches(points, np.append(history.batch, [5, 5, 5])))
     assert after.moved == 3
     np.testing.assert_array_equal(after.chains, before.chains)
