@@ -171,7 +171,7 @@ def notices_printed() -> Iterator[None]:
             line: str | None = None,
         ) -> None:
             if issubclass(category, Notice):
-                say(str(message))
+                say(f"note: {message}")
             else:
                 show_warning(message, category, filename, lineno, file, line)
 

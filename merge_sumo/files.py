@@ -292,9 +292,12 @@ def free(path: Path) -> Path:
 
 
 def dated(what: str) -> Path:
-    """Return a free dated name below `runs/`, of which `what` becomes a part."""
+    """Return a dated name below `runs/`, of which `what` becomes a part.
+
+    It has microseconds: several campaigns of a VUT may begin in the same second.
+    """
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
-    return free(DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}")
+    return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"
 
 
 def link_latest(folder: Path) -> None:

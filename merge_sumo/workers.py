@@ -15,7 +15,6 @@ import signal
 import sys
 import tempfile
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
@@ -32,15 +31,10 @@ from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 MAX_CHUNK: Final = 500
 """Items that a worker takes at a time; what bounds its memory."""
 DASK_TIMEOUT_S: Final = 30.0
-HERE_S: Final = 3.0
-"""Seconds of work in this process before worker processes are started by default. Starting them
-takes about as long on a busy machine, so that work takes at most twice the least time."""
-TRIED: Final = 8
-"""Items of the first chunk in this process, where it is not known how long they take."""
 CHUNKS_AHEAD: Final = 16
 """Chunks for each worker that `Workers.run` submits before it collects the first."""
-
-LOOK_S: Final = 5.0
+POLL_S: Final = 5.0
+"""Time between two looks at the connection while a result is waited for."""
 LOST: Final = "lost the connection to the Dask workers; check the cluster"
 
 T = TypeVar("T")
@@ -55,14 +49,14 @@ class Job(Generic[T, R]):
         function: gives a result for each item of a chunk.
         chunks: the chunks.
         lost: gives the result of an item that ended its worker each time.
-        futures: of the chunks, in their order; fewer where chunks wait for this process.
+        futures: of the chunks, in their order; none in this process.
         retried: places of items that ran again, because a worker had died.
     """
 
     function: Callable[[Sequence[T]], Sequence[R]]
     chunks: Sequence[Sequence[T]]
     lost: Callable[[T], R]
-    futures: list[Future[Sequence[R]]]
+    futures: list[Future[Sequence[R]]] = field(default_factory=list)
     retried: set[int] = field(default_factory=set)
 
 
@@ -80,13 +74,11 @@ class Workers(AbstractContextManager["Workers"]):
 
     def __init__(
         self,
-        open_executor: Callable[[int], Executor] | None,
-        count: int,
+        open_executor: Callable[[int], Executor] | None = None,
+        count: int = 1,
         *,
-        died: tuple[type[Exception], ...] = (BrokenExecutor,),
+        died: type[Exception] = BrokenExecutor,
         gone: tuple[type[Exception], ...] = (CancelledError,),
-        here_s: float = 0.0,
-        on_close: Callable[[], None] = lambda: None,
         is_lost: Callable[[], bool] = lambda: False,
     ) -> None:
         """Open an executor.
@@ -96,32 +88,16 @@ class Workers(AbstractContextManager["Workers"]):
             count: number of workers.
             died: what a future raises when its worker is dead.
             gone: what a future raises when no worker can be reached.
-            here_s: seconds of work in this process before the executor is opened.
-            on_close: called when the executor is closed.
             is_lost: returns whether the connection to all workers has ended.
         """
-        self._is_lost = is_lost
         self.count = count
-        self._open, self._on_close = open_executor, on_close
-        self._died, self._gone = died, gone
-        self._here_s, self._worked_s, self._worked = here_s, 0.0, 0
-        self._executor: Executor | None = None
-        self._go_on_in_workers()
-
-    @property
-    def here(self) -> bool:
-        """True as long as the work is done in this process."""
-        return self._executor is None
+        self._open, self._died, self._gone, self._is_lost = open_executor, died, gone, is_lost
+        self._executor = None if open_executor is None else open_executor(count)
+        self.on_close = ExitStack()
 
     def chunk_size(self, items: int) -> int:
         """Return the number of items that a worker takes at a time."""
-        share = math.ceil(items / self.count)
-        if self._open is not None and self._executor is None:
-            # The number for which there is time in this process.
-            left_s = self._here_s - self._worked_s
-            most = int(self._worked * left_s / self._worked_s) if self._worked_s else TRIED
-            share = min(items, max(most, TRIED))
-        return max(1, min(MAX_CHUNK, share))
+        return max(1, min(MAX_CHUNK, math.ceil(items / self.count)))
 
     def submit(
         self,
@@ -136,32 +112,43 @@ class Workers(AbstractContextManager["Workers"]):
                 processes, and may run twice.
             chunks: the chunks.
             lost: gives the result of an item that ends its worker whenever it runs.
+
+        Returns:
+            What `collect` takes.
+
+        Raises:
+            WorkersLostError: no worker can be reached.
         """
-        job = Job(function, list(chunks), lost, [])
-        self._start(job)
+        job = Job(function, list(chunks), lost)
+        if self._executor is None or self._open is None:
+            return job
+        for chunk in job.chunks:
+            try:
+                future = self._executor.submit(function, chunk)
+            except self._died:  # earlier
+                self._executor.shutdown()
+                self._executor = self._open(self.count)
+                future = self._executor.submit(function, chunk)
+            except self._gone as error:
+                raise WorkersLostError(LOST) from error
+            job.futures.append(future)
         return job
 
     def collect(self, job: Job[T, R]) -> list[R]:
         """Return the results of all items of a job, in their order.
 
         Raises:
-            WorkersLostError: if no worker can be reached.
+            WorkersLostError: no worker can be reached.
             Exception: what the function raises.
         """
         results: list[R] = []
         for number, chunk in enumerate(job.chunks):
             if self._executor is None:
-                start_s = time.perf_counter()
                 results += job.function(chunk)
-                self._worked_s += time.perf_counter() - start_s
-                self._worked += len(chunk)
-                job.futures.append(Future())
-                self._go_on_in_workers()
                 continue
-            self._start(job)
             try:
                 # A cluster that goes away just now may leave a future without an end.
-                while not wait([job.futures[number]], timeout=LOOK_S).done:
+                while not wait([job.futures[number]], timeout=POLL_S).done:
                     if self._is_lost():
                         raise WorkersLostError(LOST)
                 results += job.futures[number].result()
@@ -180,44 +167,28 @@ class Workers(AbstractContextManager["Workers"]):
         *,
         chunk: int | None = None,
     ) -> Generator[tuple[int, R], None, None]:
-        """Yield (place in `items`, result) in order.
+        """Run a function on items, some chunks ahead of the one whose results are read.
 
         Args:
             function: as of `submit`.
             items: the items.
             lost: as of `submit`.
             chunk: items that a worker takes at a time; by default `chunk_size`.
+
+        Yields:
+            Place in `items` and result, in order.
         """
-        jobs: deque[tuple[int, Job[T, R]]] = deque()
-        first = 0
-        while jobs or first < len(items):
-            ahead = 1 if self.here else CHUNKS_AHEAD * self.count
+        size = chunk or self.chunk_size(len(items))
+        ahead = 1 if self._executor is None else CHUNKS_AHEAD * self.count
+        jobs: deque[Job[T, R]] = deque()
+        place = first = 0
+        while place < len(items):
             while first < len(items) and len(jobs) < ahead:
-                end = first + (chunk or self.chunk_size(len(items) - first))
-                jobs.append((first, self.submit(function, [items[first:end]], lost)))
-                first = end
-            place, job = jobs.popleft()
-            yield from enumerate(self.collect(job), start=place)
-
-    def _go_on_in_workers(self) -> None:
-        """Open the executor when work in this process has taken its time."""
-        if self._open is not None and self._worked_s >= self._here_s:
-            self._executor = self._open(self.count)
-
-    def _start(self, job: Job[Any, Any]) -> None:
-        """Give the executor, if it is open, the chunks of a job that wait."""
-        if self._executor is None or self._open is None:
-            return
-        for chunk in job.chunks[len(job.futures) :]:
-            try:
-                future = self._executor.submit(job.function, chunk)
-            except self._died:  # earlier
-                self._executor.shutdown()
-                self._executor = self._open(self.count)
-                future = self._executor.submit(job.function, chunk)
-            except self._gone as error:
-                raise WorkersLostError(LOST) from error
-            job.futures.append(future)
+                jobs.append(self.submit(function, [items[first : first + size]], lost))
+                first += size
+            for result in self.collect(jobs.popleft()):
+                yield place, result
+                place += 1
 
     def _retry(self, job: Job[T, R], items: Sequence[T]) -> list[R]:
         """Run items with nothing else in their worker; halve them where it dies."""
@@ -235,15 +206,13 @@ class Workers(AbstractContextManager["Workers"]):
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the executor; where the program is to stop at once, end the workers."""
-        try:
+        with self.on_close:
             if isinstance(self._executor, LocalProcesses):
                 self._executor.end(at_once=kind is not None and not issubclass(kind, Exception))
             elif self._executor is not None:
                 self._executor.shutdown(wait=kind is None)
             else:
                 end_worker()
-        finally:
-            self._on_close()
 
 
 AnyWorkers = int | str | None
@@ -257,25 +226,21 @@ def workers_or_cores(workers: int | None) -> int:
     return workers or os.cpu_count() or 1
 
 
-def open_workers(workers: AnyWorkers = None, *, here_s: float = 0.0) -> Workers:
+def open_workers(workers: AnyWorkers = None) -> Workers:
     """Return the workers of the cluster at an address, or else local ones.
 
     One local worker is this process; more are processes of their own.
-
-    Args:
-        workers: a number, an address, or None for one a core.
-        here_s: seconds of work in this process before local processes are started.
     """
     if isinstance(workers, str):
         return dask_workers(workers)
     count = workers_or_cores(workers)
     if count > 1 and is_daemonic():
         notice(
-            "note: the cases run in this process, as a daemonic process, such as a worker of "
+            "the cases run in this process, as a daemonic process, such as a worker of "
             "multiprocessing.Pool, starts no others"
         )
         count = 1
-    return Workers(None if count == 1 else LocalProcesses, count, here_s=here_s)
+    return Workers(None if count == 1 else LocalProcesses, count)
 
 
 def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
@@ -286,24 +251,6 @@ def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
 def is_daemonic() -> bool:
     """Return whether `multiprocessing` lets this process start no others."""
     return multiprocessing.current_process().daemon
-
-
-DASK_LOGGERS: Final = ("distributed", "distributed.client", "tornado.application")
-"""As distributed's setting `logging` names them."""
-
-
-@contextmanager
-def _quiet(names: Sequence[str]) -> Iterator[None]:
-    """Log nothing: what matters to a user is a sentence of ours."""
-    loggers = list(map(logging.getLogger, names))
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
-    try:
-        yield
-    finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
 
 
 def dask_workers(address: str) -> Workers:
@@ -321,7 +268,11 @@ def dask_workers(address: str) -> Workers:
             f"workers at {address} need Dask: run `pip install merge-sumo[dask]`"
         ) from error
     with ExitStack() as opened:
-        opened.enter_context(_quiet(DASK_LOGGERS))
+        # What matters to a user is a sentence of ours.
+        for name in ("distributed", "distributed.client", "tornado.application"):
+            logger = logging.getLogger(name)
+            opened.callback(logger.setLevel, logger.level)
+            logger.setLevel(logging.CRITICAL + 1)
         try:
             client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
@@ -330,14 +281,15 @@ def dask_workers(address: str) -> Workers:
         count = len(client.scheduler_info(n_workers=-1)["workers"])
         if count == 0:
             raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
-        return Workers(
+        workers = Workers(
             lambda _: client.get_executor(pure=False),
             count,
-            died=(KilledWorker,),
+            died=KilledWorker,
             gone=(CancelledError, ClosedClientError),
             is_lost=lambda: client.status in ("closing", "closed"),
-            on_close=opened.pop_all().close,
         )
+        workers.on_close = opened.pop_all()
+        return workers
 
 
 class LocalProcesses(ProcessPoolExecutor):

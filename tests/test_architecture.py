@@ -29,7 +29,7 @@ HEAVY_MODULES = {"numpy", "scipy", "sklearn", "libsumo", "torch"}
 
 LAYERS = (
     *("scenario", "metrics", "road", "drivers", "sumo", "controllers", "simulation", "samplers"),
-    *("campaigns", "analysis", "training", "reports", "api", "testing"),
+    *("campaigns", "analysis", "training", "reports", "testing"),
 )
 """The rooms, from the ground up: each imports from itself and from those before it."""
 
@@ -297,7 +297,7 @@ class TestImports:
 
     def test_of_a_command_are_the_api_and_what_prints(self):
         rooms = {layer_of(name) for name in imports_of(PACKAGE / "cli.py")}
-        assert rooms == {"api", ""}
+        assert rooms == {""}
 
     def test_of_a_vut_are_of_sumo_in_its_own_models_and_its_traci_server_alone(self):
         of_sumo = ("merge_sumo.controllers.sumo_model", "merge_sumo.controllers.traci")

@@ -90,7 +90,7 @@ class CasesFile(Run):
         if outcome.index in self._by_index:
             raise UserError("its index is there twice")
         if sentences := outside_of_the_pool(outcome.case):
-            raise UserError(sentences[0].removeprefix("note: "))
+            raise UserError(sentences[0])
         self._by_index[outcome.index] = outcome
         self.accepted |= {outcome.index: accepted} if accepted else {}
 

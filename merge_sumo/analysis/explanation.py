@@ -197,10 +197,7 @@ def failure_of(run: Run, index: int | None) -> Outcome:
 
 
 def note_explanation(
-    run: Run,
-    plan: SimulationPlan,
-    workers: Workers,
-    check: Callable[[], None] = lambda: None,
+    run: Run, plan: SimulationPlan, check: Callable[[], None] = lambda: None
 ) -> None:
     """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
@@ -209,8 +206,9 @@ def note_explanation(
     """
     worst = failures(run.cases)[:1]
     if plan.needs_sumo is None and worst:
-        with suppress(UserError):
-            _explained(run, _Neighbours(plan.with_engine(None), worst[0], (), workers, check))
+        # Worker processes would take longer to start than these cases.
+        with suppress(UserError), workers_or_here(None) as here:
+            _explained(run, _Neighbours(plan.with_engine(None), worst[0], (), here, check))
 
 
 def explain(

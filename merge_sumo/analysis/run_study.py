@@ -150,6 +150,6 @@ def notice_changes(run: Run, plan: SimulationPlan) -> None:
         now = files_now(known, files)
         if differing := [file for file, sha256 in known.items() if now[file] != sha256]:
             notice(
-                f"note: {printable(differing[0])} is not as it was in {run.folder}: {spec} may "
+                f"{printable(differing[0])} is not as it was in {run.folder}: {spec} may "
                 "drive otherwise than it did there"
             )

@@ -168,7 +168,7 @@ class Study:
         by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
         if not self.plan.vut.files_are_known and not is_here(settings.vut):
             notice(
-                "note: nobody can tell what the program behind this VUT loads; this truth is kept "
+                "nobody can tell what the program behind this VUT loads; this truth is kept "
                 "for its command and the files that are named there"
             )
         return TruthResult(settings.vut, by_level, settings.criterion)

@@ -23,7 +23,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record
-from merge_sumo.scenario.case import Pool
+from merge_sumo.scenario.case import Case, Pool
+from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers, workers_or_here
@@ -119,7 +120,8 @@ def note_shares(
         return
     by_equations = plan.needs_sumo is None
     size, budget_s = (CASES, 0.0) if by_equations else (ROUND, PART * took_s)
-    plan = plan.with_log(run.folder.resolve() / LOG)
+    # By the equations of motion where the drivers allow it, else in SUMO.
+    plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     streams = {level: stream(run.settings.seed, level) for level in run.levels}
     shares = {level: LevelShare(level, 0, 0) for level in run.levels}
     done, begun_s = 0, perf_counter()
@@ -130,11 +132,15 @@ def note_shares(
             total = done + size * len(streams)
             for level, rng in streams.items():
                 on_part(done, total)
+                uniform = uniform_cases(plan.scenario, level, size, rng)
+                results: list[tuple[bool, bool]] = []
                 try:
-                    more = share_at(plan, level, size, rng, processes)
+                    for _, result in evaluate(plan, uniform, processes, end_of):
+                        results.append(result)
                 except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
                     return
-                shares[level] = shares[level].with_more(more)
+                failed, errors = np.sum(results, axis=0).tolist()
+                shares[level] = shares[level].with_more(LevelShare(level, size, failed, errors))
                 done += size
                 on_part(done, total)
                 check()
@@ -149,23 +155,12 @@ def stream(seed: int, level: int) -> np.random.Generator:
     return np.random.default_rng([seed, STREAM, level])
 
 
-def share_at(
-    plan: SimulationPlan,
-    level: int,
-    cases: int,
-    rng: np.random.Generator,
-    workers: Workers | None = None,
-) -> LevelShare:
-    """Return the share of uniform cases of a level that fail.
-
-    They run by the equations of motion where the drivers allow it, else in SUMO.
-    """
-    points = rng.random((cases, len(plan.scenario.dimensions(level))))
-    pool = Pool(levels=(level,), scenario=plan.scenario)
-    chosen = plan.for_verdicts().with_engine(None)
-    ran = dict(evaluate(chosen, pool.cases(points, level), workers, end_of)).values()
-    failures, errors = (sum(of) for of in zip(*ran, strict=True))
-    return LevelShare(level, cases, failures, errors)
+def uniform_cases(
+    scenario: Scenario, level: int, count: int, rng: np.random.Generator
+) -> list[Case]:
+    """Return uniform cases of a level."""
+    points = rng.random((count, len(scenario.dimensions(level))))
+    return Pool(levels=(level,), scenario=scenario).cases(points, level)
 
 
 def end_of(episode: Episode) -> tuple[bool, bool]:

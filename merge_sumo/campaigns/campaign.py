@@ -15,7 +15,7 @@ from merge_sumo.campaigns.repeats import repeat
 from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failures
 from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
 from merge_sumo.controllers.process import LOG
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
@@ -50,10 +50,8 @@ def run_campaign(
     callbacks: Sequence[Callback] = (),
     *,
     resumes: bool = False,
-    on_before: Callback = lambda _: None,
     workers: Workers | None = None,
-    begin: Callable[[], None] = lambda: None,
-    warn: Callable[[str], None] = lambda _: None,
+    begin: Callback = lambda _: None,
 ) -> Run:
     """Run a campaign into a new folder, or one that was stopped to its end; return it.
 
@@ -68,10 +66,9 @@ def run_campaign(
         folder: where to.
         callbacks: called in turn with the outcomes of one or more groups when they are stored.
         resumes: whether the folder has a campaign that was stopped, however it was.
-        on_before: called with the outcomes of the cases that ran before.
         workers: where cases run, by default in this process.
-        begin: called before the first case, when nothing is refused any more.
-        warn: called with a sentence on outcomes that were dropped.
+        begin: called before the first case, when nothing is refused any more, with the outcomes of
+            the cases that ran before.
 
     Raises:
         UserError: if the plan cannot be carried out; if the folder of a new campaign exists; if
@@ -87,13 +84,12 @@ def run_campaign(
     outcomes: list[Outcome] = []
     with workers_or_here(workers) as available, ExitStack() as opened:
         if resumes:
-            journal, history = _resumed(settings, plan, folder, opened, available, warn)
+            journal, history = _resumed(settings, plan, folder, opened, available)
             outcomes += [episode.outcome for episode in history]
-            on_before(outcomes)
         else:
             open_simulators(plan, available)
             journal, history = _created(settings, plan, folder, opened), []
-        begin()
+        begin(outcomes)
 
         def on_groups(groups: Groups) -> None:
             journal.append(*groups)
@@ -117,7 +113,12 @@ def run_campaign(
         )
         loop.run(on_groups)
         done = Run(folder, outcomes)
-        _finish(done, settings, plan, available)
+        if plan.earlier is not None:
+            repeat(Run(folder / AGAINST), settings.earlier, plan.earlier, available)
+        repeat(done, settings, replace(plan, against=None), available)
+    for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
+        with suppress(TakenError):  # whatever it is, the campaign has ended
+            export_case(done, outcome.index, folder / SCENARIOS / case_name(outcome.index))
     return done
 
 
@@ -138,10 +139,9 @@ def _resumed(
     folder: Path,
     opened: ExitStack,
     workers: Workers,
-    warn: Callable[[str], None],
 ) -> tuple[Journal, list[Episode]]:
     """Return the journal of a folder, which `opened` closes, and the episodes that it has."""
-    journal, before = _reopened(folder, opened, warn)
+    journal, before = _reopened(folder, opened)
     records = [(journal, _compared(settings, plan, before))]
     motion = SAMPLERS[settings.sampler].uses_predictions
     old: Run | None = None
@@ -151,7 +151,7 @@ def _resumed(
             record = record_of(settings.earlier, plan.earlier)
             with suppress(TakenError), Journal.create(place, record):
                 pass
-        journal.earlier, old = _reopened(place, opened, warn)
+        journal.earlier, old = _reopened(place, opened)
         records.append((journal.earlier, _compared(settings.earlier, plan.earlier, old)))
         before.earlier()  # raises where cases are missing; more of them run again
         journal.earlier.keep(old, len(before.outcomes))
@@ -176,12 +176,12 @@ def _sized(
     return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
 
 
-def _reopened(folder: Path, opened: ExitStack, warn: Callable[[str], None]) -> tuple[Journal, Run]:
+def _reopened(folder: Path, opened: ExitStack) -> tuple[Journal, Run]:
     """Return the journal of a folder, which `opened` closes, and what the folder holds."""
     journal, run, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
     if dropped:
-        warn(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
+        notice(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
     return journal, run
 
 
@@ -223,17 +223,6 @@ def _compared(
         )
     record |= {k: before.record[k] for k in TALLIES if k in before.record}
     return record if moved or grown else None
-
-
-def _finish(done: Run, settings: CampaignSettings, plan: SimulationPlan, workers: Workers) -> None:
-    """Run some cases of a campaign a second time; export the worst."""
-    if plan.earlier is not None:
-        repeat(Run(done.folder / AGAINST), settings.earlier, plan.earlier, workers)
-    repeat(done, settings, replace(plan, against=None), workers)
-    for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
-        folder = done.folder / SCENARIOS / case_name(outcome.index)
-        with suppress(TakenError):  # whatever it is, the campaign has ended
-            export_case(done, outcome.index, folder, plan.road)
 
 
 def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:

@@ -17,7 +17,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import groupby
 from typing import Final
 
@@ -28,7 +27,7 @@ from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.simulation.evaluate import lost, simulate
+from merge_sumo.simulation.evaluate import submit_cases
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import MAX_CHUNK, Job, Workers
 
@@ -95,7 +94,7 @@ class SearchLoop:
                 needs their motions.
         """
         self._sampler, self._plan, self._cases, self._stop = sampler, plan, cases, stop
-        self._workers = Workers(None, 1) if workers is None else workers
+        self._workers = Workers() if workers is None else workers
         self._batch, self._first, self._in_flight = batch, first, in_flight
         self._ahead = not sampler.learns and stop is None
         self._overlaps = in_flight is not None and sampler.overlaps
@@ -194,10 +193,7 @@ class SearchLoop:
         if groups[0].episodes:
             return None
         cases = [case for group in groups for case in group.cases]
-        size = self._workers.chunk_size(len(cases))
-        chunks = [cases[first : first + size] for first in range(0, len(cases), size)]
-        simulated = partial(simulate, self._plan)
-        return self._workers.submit(simulated, chunks, partial(lost, self._plan))
+        return submit_cases(self._plan, cases, self._workers)
 
     def _take(
         self, groups: Sequence[_Group], episodes: list[Episode], retried: Iterable[int]

@@ -1,27 +1,44 @@
-"""From settings to the plan of a simulation."""
+"""From the config of a verb to the settings of a campaign, and to the plan of its simulation.
+
+A single case, with the same drivers and verdict as in a campaign, is planned here as well.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-from merge_sumo.campaigns.settings import CampaignSettings
+from merge_sumo import config as c
+from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.controllers.in_memory import AnyVut, drivers_of
 from merge_sumo.controllers.kinds import load
+from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for
+from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.imperfection import Actuation, Sensing
+from merge_sumo.scenario.scenario import US23, Scenario, level_name
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import Povs, own_pov, policies_folder
+from merge_sumo.simulation.povs import Povs, one_level, own_pov, parse_levels, policies_folder
 
 DEBUG_DEADLINE_S: Final = 86_400.0
-"""A person at a breakpoint takes their time."""
+"""Deadline of a step while a user debugs."""
 
 
 def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPlan:
     """Return the plan of what settings name: road, drivers, criterion.
 
-    With `debug` a controller of the user's runs in this process, without a deadline.
+    A verb calls it once: it reads files, and loads a VUT of the user's to ask what it is.
 
-    A verb calls it once: it reads files, and loads a VUT of the user's to ask what it is. Raises
-    `UserError` for drivers, policies or a road that are missing or cannot be loaded.
+    Args:
+        settings: the settings.
+        debug: whether a controller of the user's runs in this process, without a deadline.
+
+    Raises:
+        UserError: drivers, policies or a road are missing or cannot be loaded.
     """
     policies = policies_folder(settings.policies, settings.scenario)
     options = settings.vut_options(policies)
@@ -32,14 +49,180 @@ def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPla
     povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
     for level in settings.levels:
         povs.check_level(level)
-    against = None
-    if settings.against is not None:
-        against = load(settings.against, settings.earlier.vut_options(policies))
     return SimulationPlan(
         scenario=settings.scenario,
         road=road_for(settings.scenario),
         vut=vut,
-        against=against,
+        against=None if settings.against is None else load(settings.against, options),
         povs=povs,
         criterion=settings.criterion,
     )
+
+
+def changed_scenario(
+    scenario: Scenario | Path | str, changes: Mapping[str, Any] | None = None
+) -> Scenario:
+    """Return the scenario of a config, with changes by the fields of `ScenarioChanges`."""
+    named = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
+    values = dict(changes or {})
+    for name, kind in (("sense", Sensing), ("act", Actuation)):
+        if isinstance(text := values.get(name), str):
+            values[name] = kind.parsed(text, f"`{name}`")
+    return replace(named, **values) if values else named
+
+
+def explicit(
+    config: c.Drivers,
+    vut: AnyVut = "",
+    pov: AnyVut | None = None,
+    scenario: Scenario | None = None,
+) -> tuple[dict[str, Any], c.Execution]:
+    """Return the settings that a config names, and where its cases run.
+
+    Args:
+        config: the config.
+        vut: the recorded VUT, where an object drives again.
+        pov: the recorded POV.
+        scenario: the scenario of a config that names none; None for that of the recorded campaign.
+
+    Raises:
+        UserError: for a change of a scenario that is not named.
+    """
+    named: AnyVut | None = getattr(config, "vut", None)
+    where = config if isinstance(config, c.Execution) else c.Execution()
+    spec, pov_spec, workers = drivers_of(named or vut, config.pov or pov, where.workers)
+    fields = c.changed(config, c.Limits)
+    if named is not None:
+        fields["vut"] = spec
+    if config.pov is not None:
+        fields["pov"] = pov_spec
+    if config.policies is not None:
+        fields["policies"] = str(config.policies)
+    if isinstance(config, c.Test):
+        fields |= c.changed(config, c.FailureRule)
+        changes = c.changed(config, c.ScenarioChanges)
+        if base := config.scenario or scenario:
+            fields["scenario"] = changed_scenario(base, changes)
+        elif changes:
+            raise UserError(
+                f"`{next(iter(changes))}` is of the scenario: name that, too, with `scenario`"
+            )
+    if isinstance(config, c.CampaignCalls):
+        fields |= c.changed(config, c.Search)
+        if config.against is not None:
+            fields["against"], _, workers = drivers_of(config.against, None, workers)
+        if config.cases is not None:
+            fields["stop_when_converged"] = config.stop_when_converged
+    return fields, c.Execution(workers=workers, progress=where.progress)
+
+
+def settings_for(
+    config: c.Campaign | c.GroundTruth | c.Benchmark, **search: Any
+) -> tuple[CampaignSettings, c.Execution]:
+    """Return the settings of a campaign, or of a study, and where it runs.
+
+    `search` has settings that the study chooses.
+    """
+    fields, where = explicit(config, scenario=US23)
+    if isinstance(config, c.Campaign) and config.cases is None:
+        fields["stop_when_converged"] = True
+    scenario, own = fields["scenario"], config.pov is not None
+    folder = policies_folder(config.policies, scenario)
+    fields["levels"] = parse_levels(config.level, folder, scenario.levels, own=own)
+    return _new_settings(fields | search), where
+
+
+def _new_settings(fields: dict[str, Any]) -> CampaignSettings:
+    """Return settings whose failures are those of the scenario, where nothing else is named."""
+    if "require" not in fields:
+        fields.setdefault("fail_when", fields["scenario"].criterion)
+    return CampaignSettings(**fields)
+
+
+ONE: Final[dict[str, Any]] = {
+    "cases": 1,
+    "batch": 1,
+    "in_flight": None,
+    "sampler": "uniform",
+    "stop_when_converged": False,
+    "repeat": 1,
+}
+"""Settings of a campaign that is one case."""
+
+
+def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, Case]:
+    """Return a case, and how it is run.
+
+    The coordinates of the config win over those of its row, or of the recorded case.
+
+    Args:
+        config: the config.
+        run: the campaign, or the cases file, of the recorded case.
+    """
+    if run is None and not config.vut:
+        raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
+    fields, _ = explicit(config, scenario=US23 if run is None else None)
+    if run is None or config.recorded is None:
+        scenario, row = fields["scenario"], config.case or {}
+    else:
+        scenario, row = run.scenario, run.outcome(config.recorded[1]).to_record()
+    level = int(row.get("level", 0))
+    if config.level is not None:
+        folder, own = policies_folder(config.policies, scenario), config.pov is not None
+        level = one_level(str(config.level), folder, scenario.levels, own=own)
+    fields |= {**ONE, "levels": (level,)}
+    recorded = None if run is None else settings_of(run.folder, run.record, fields)
+    settings = recorded or _new_settings(fields)
+    values = {}
+    for dimension in settings.scenario.dimensions(level):
+        values[dimension.field] = row.get(dimension.field)
+    for name in c.COORDINATES:
+        if getattr(config, name) is not None:
+            values[name] = getattr(config, name)
+    case = case_of(settings.scenario, level, {**values, **(config.at or {})})
+    draw = row.get("draw")
+    if draw is None or draw != draw:  # noqa: PLR0124 (NaN of a data frame: the first)
+        return settings, case
+    try:
+        return settings, replace(case, draw=int(draw))
+    except (TypeError, ValueError, OverflowError):
+        raise UserError(f"draw is {draw!r:.60}: it must be a whole number") from None
+
+
+def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
+    """Return the case of a scenario with values by the names of its fields.
+
+    Raises:
+        UserError: a coordinate is missing or unknown, or a value is out of range.
+    """
+    given: dict[str, float] = {}
+    for name, value in values.items():
+        if name not in scenario.notation and name != "v_vut0_mps":
+            raise UserError(f"a case has no {name}: it has {', '.join(scenario.notation)}")
+        try:
+            if value is not None:
+                given[name] = float(value)
+        except (TypeError, ValueError):
+            raise UserError(f"{name} is {value!r}: it must be a number") from None
+    if isinstance(scenario.v_vut0_mps, float):
+        given.setdefault("v_vut0_mps", scenario.v_vut0_mps)
+    unknown = given.keys() - {"v_vut0_mps"}
+    for dimension in scenario.dimensions(level):
+        if dimension.field not in given:
+            raise UserError(
+                f"{_option(dimension.field)} is missing: the pool has {dimension.low:g} to "
+                f"{dimension.high:g}"
+            )
+        unknown -= {dimension.field}
+    for name in unknown:
+        raise UserError(
+            f"{_option(name)} is none of the coordinates of {scenario.name} at level "
+            f"{level_name(level)}: leave it out"
+        )
+    case: Case = scenario.case_type(level=level, scenario=scenario, **given)
+    return case
+
+
+def _option(name: str) -> str:
+    """Return how a user gives a coordinate."""
+    return f"`{name}`" if name in c.COORDINATES else f"`at` {name}=NUMBER"

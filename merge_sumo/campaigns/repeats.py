@@ -31,7 +31,7 @@ from merge_sumo.records import Record, replaced, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import close_simulator, evaluate, simulate
+from merge_sumo.simulation.evaluate import close_simulator, simulate, submit_cases
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -83,9 +83,10 @@ def repeat(
     if not again:
         return []
     cases, found = [outcome.case for outcome in again], []
-    for place, ran in evaluate(plan, cases, workers):
+    job = submit_cases(plan, cases, workers)
+    for outcome, ran in zip(again, workers.collect(job), strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(repeat_of(again[place], recorded[again[place].index], ran))
+            found.append(repeat_of(outcome, recorded[outcome.index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
         first, second = (_simulated_again(plan, cases) for _ in range(2))
         drawn = {

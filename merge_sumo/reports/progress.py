@@ -180,11 +180,16 @@ class CampaignBars(Bars):
         self._folder, self._cases, self._tolerated = folder, cases, tolerated
         self._outcomes: list[Outcome] = []
 
-    def begin(self, title: str) -> None:
-        """Print what begins, and where its report is: the first case may take long."""
+    def begin(self, title: str, before: Sequence[Outcome] = ()) -> None:
+        """Print what begins, and where its report is: the first case may take long.
+
+        Cases that ran `before` a resume do not count in the rate.
+        """
         cases = counted(self._cases, "case")
         self.say(f"{printable(title)}: {cases}, watch {printable(str(self._folder / REPORT))}")
-        self.counted("cases", len(self._outcomes), self._cases, "cases")
+        self._outcomes += before
+        self._bars["cases"] = _Bar(self._cases, time.monotonic(), len(before))
+        self.counted("cases", len(before), self._cases, "cases")
 
     def ended(self, outcomes: Sequence[Outcome]) -> None:
         """Count cases."""
@@ -193,12 +198,6 @@ class CampaignBars(Bars):
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
         if before < FIRST_ANSWER <= len(self._outcomes) < self._cases:
             self._say_where()
-
-    def ran_before(self, outcomes: Sequence[Outcome]) -> None:
-        """Count cases that ran before a resume, which do not count in the rate."""
-        self._outcomes += outcomes
-        bar = self._bars.setdefault("cases", _Bar(self._cases, 0.0))
-        bar.before, bar.start_s = len(self._outcomes), time.monotonic()
 
     def _say_where(self) -> None:
         """Print where the failures so far lie, in the largest region of each level."""

@@ -56,7 +56,7 @@ def described(case: Case) -> str:
 def outside_of_the_pool(case: Case) -> list[str]:
     """Return in sentences which coordinates of a case are outside of the pool."""
     return [
-        f"note: {c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
+        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
         f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
         for c in coordinates(case.scenario, (case.level,))
         if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high

@@ -24,7 +24,7 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.workers import Workers, when_worker_ends
+from merge_sumo.workers import Job, Workers, when_worker_ends
 
 R = TypeVar("R")
 
@@ -115,9 +115,18 @@ def evaluate(
     def lost_result(case: Case) -> Any:
         return lost(plan, case) if keep is None else keep(lost(plan, case))
 
-    available = Workers(None, 1) if workers is None else workers
+    available = Workers() if workers is None else workers
     chunk = CHUNK if plan.engine is Engine.KINEMATIC else None
     return available.run(partial(simulate, plan, keep=keep), cases, lost_result, chunk=chunk)
+
+
+def submit_cases(
+    plan: SimulationPlan, cases: Sequence[Case], workers: Workers
+) -> Job[Case, Episode]:
+    """Submit cases to workers, a share to each; `collect` returns their episodes in order."""
+    size = workers.chunk_size(len(cases))
+    chunks = [cases[first : first + size] for first in range(0, len(cases), size)]
+    return workers.submit(partial(simulate, plan), chunks, partial(lost, plan))
 
 
 def open_simulators(plan: SimulationPlan, workers: Workers) -> None:

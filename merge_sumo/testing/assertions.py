@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from merge_sumo import api
 from merge_sumo.analysis.counterfactuals import causes
-from merge_sumo.api.results import CampaignRun
-from merge_sumo.api.verb import verb
+from merge_sumo.api import verb
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import failures
 from merge_sumo.config import NoFailures
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import printable
+from merge_sumo.results import CampaignRun
 from merge_sumo.scenario.coordinates import described
 from merge_sumo.scenario.scenario import level_name
 

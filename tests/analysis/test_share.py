@@ -12,9 +12,9 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo import api
 from merge_sumo.analysis import share
-from merge_sumo.analysis.share import SHARES, LevelShare, end_of, share_at, stream
+from merge_sumo.analysis.share import SHARES, LevelShare, end_of, stream, uniform_cases
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.evaluate import evaluate, simulate
 
 
 @pytest.mark.parametrize(
@@ -82,9 +82,11 @@ def test_of_a_controller_of_ones_own_is_measured_too():
     for level, one in enumerate(shares.levels):
         assert one.cases >= 200
         assert one.cases % 200 == 0
-        rng = stream(4, level)
-        rounds = [share_at(plan, level, 200, rng, None) for _ in range(one.cases // 200)]
-        assert one.failures == sum(found.failures for found in rounds)
+        rng, failures = stream(4, level), 0
+        for _ in range(one.cases // 200):
+            cases = uniform_cases(plan.scenario, level, 200, rng)
+            failures += sum(failed for failed, _ in simulate(plan.for_verdicts(), cases, end_of))
+        assert one.failures == failures
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
         assert any(said in line for line in run.lines())
@@ -112,12 +114,12 @@ def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
     run, now_s = run_campaign(settings, Path("run")), [0.0]
     told: list[tuple[int, int]] = []
 
-    def ran(_plan, level, cases, _rng, _workers):
+    def ran(_plan, cases, _workers, _keep):
         now_s[0] += 1.0
-        return LevelShare(level, cases, 1)
+        return enumerate([(place == 0, False) for place in range(len(cases))])
 
     monkeypatch.setattr(share, "perf_counter", lambda: now_s[0])
-    monkeypatch.setattr(share, "share_at", ran)
+    monkeypatch.setattr(share, "evaluate", ran)
     for took_s, rounds in ((0.0, 1), (19.9, 1), (20.0, 2), (49.0, 4)):
         told.clear()
         share.note_shares(

@@ -92,7 +92,7 @@ class TestACampaign:
 
     def test_counts_cases_and_not_runs_in_what_it_says(self, tmp_path):
         run_campaign(self.settings(tmp_path), tmp_path / "run")
-        opened = api.results.CampaignRun(tmp_path / "run", gates=["failures"])
+        opened = api.CampaignRun(tmp_path / "run", gates=["failures"])
         failing = failing_cases(opened.run.outcomes, 0.3)
         assert opened.summary.failures == opened.verdict.failures
         assert opened.summary.undecided == opened.verdict.undecided > 0

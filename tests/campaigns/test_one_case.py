@@ -94,7 +94,7 @@ class TestInSumoGui:
         """Return what sumo-gui is opened on, instead of opening it."""
         found: list[dict[str, bytes]] = []
 
-        def note(folder: Path, from_s: float | None) -> int:
+        def note(folder: Path, from_s: float | None, **_: bool) -> int:
             found.append({file.name: file.read_bytes() for file in folder.iterdir()})
             return 0
 

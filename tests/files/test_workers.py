@@ -186,17 +186,6 @@ def running(process: int) -> bool:
     return status.rpartition(")")[2].split()[0] != "Z"
 
 
-class TestWorkersThatBeginHere:
-    def test_go_on_in_processes_once_work_has_taken_its_time(self):
-        with open_workers(2, here_s=1e-9) as workers:
-            assert workers.here
-            assert list(workers.run(process_ids, [0], no_loss)) == [(0, os.getpid())]
-            found = dict(workers.run(process_ids, range(4), no_loss))
-            assert not workers.here
-        assert sorted(found) == [0, 1, 2, 3]
-        assert os.getpid() not in found.values()
-
-
 @pytest.fixture
 def cluster(tmp_path):
     """Start a Dask scheduler and two workers on loopback; give its address and the workers."""

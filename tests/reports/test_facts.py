@@ -15,11 +15,11 @@ from support.calling import invoke
 from support.handmade import write_run
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
-from merge_sumo.api.results import CampaignRun
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.facts import TOUCH, Fact, headline
 from merge_sumo.reports.report import report_page
+from merge_sumo.results import CampaignRun
 
 
 @pytest.fixture(scope="module")

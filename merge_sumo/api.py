@@ -14,11 +14,19 @@ Results print as the command prints them, and `to_record()` is what the command'
 
 from __future__ import annotations
 
-from contextlib import ExitStack
-from dataclasses import replace
+import ast
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, fields, replace
+from functools import cache, partial, update_wrapper
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from time import perf_counter
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from threadpoolctl import threadpool_limits
 
 from merge_sumo import config as c
 from merge_sumo.analysis import (
@@ -34,59 +42,71 @@ from merge_sumo.analysis import rerun as rerunning
 from merge_sumo.analysis import stress as ladder
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Comparison
-from merge_sumo.analysis.explanation import EXPLANATIONS, ExplanationResult
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance
+from merge_sumo.analysis.explanation import EXPLANATIONS, ExplanationResult, note_explanation
 from merge_sumo.analysis.probability import PROBABILITY, ProbabilityResult
 from merge_sumo.analysis.reproduction import Reproduction
-from merge_sumo.analysis.run_study import notice_changes
-from merge_sumo.analysis.sampler_study import SamplerStudy
+from merge_sumo.analysis.run_study import RunStudy, notice_changes
+from merge_sumo.analysis.sampler_study import SamplerStudy, Study
+from merge_sumo.analysis.share import note_shares
 from merge_sumo.analysis.stress import STRESS, StressResult
 from merge_sumo.analysis.truth import TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
-from merge_sumo.api.campaigns import notice_povs, run_and_report
-from merge_sumo.api.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
-from merge_sumo.api.settings import (
-    case_in,
+from merge_sumo.campaigns.again import call_again
+from merge_sumo.campaigns.campaign import SCENARIOS, case_name, run_campaign
+from merge_sumo.campaigns.plan import (
+    changed_scenario,
     explicit,
-    opened_study,
-    opened_truths,
-    path_of,
-    recorded_case,
-    scenario_of,
+    planned_case,
+    resolve,
     settings_for,
 )
-from merge_sumo.api.verb import verb
-from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.one_case import run_one
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import SETTINGS, read_settings
+from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
+from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.controllers.controller import Car, Seen
-from merge_sumo.controllers.in_memory import AnyVut, drivers_of
+from merge_sumo.controllers.in_memory import AnyVut, drivers_of, is_here
 from merge_sumo.controllers.parameters import Range
 from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
-from merge_sumo.errors import UserError, notice
+from merge_sumo.errors import UserError, WorkersLostError, notice
 from merge_sumo.files import (
     check_new,
     dated,
+    link_latest,
     make_folder,
     write_new,
 )
+from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.merge import check_from
+from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.summary import parse_gates
 from merge_sumo.printable import printable, quoted
 from merge_sumo.records import check_toml_size, to_plain
 from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.exports import export_cases
-from merge_sumo.reports.junit import JUNIT, write_junit_of_comparison
-from merge_sumo.reports.progress import Bars
+from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_junit_of_comparison
+from merge_sumo.reports.progress import Bars, CampaignBars, Counter
+from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.result import Shown
-from merge_sumo.road.scenario_file import SUFFIX
+from merge_sumo.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
+from merge_sumo.road.scenario_file import SUFFIX, spoken_name
 from merge_sumo.scenario.coordinates import outside_of_the_pool
-from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.simulation.plan import Engine
+from merge_sumo.scenario.scenario import (
+    LEVELS,
+    OWN,
+    US23,
+    MergeScenario,
+    Scenario,
+    lane_of,
+    level_name,
+)
+from merge_sumo.scratch import ScratchFolder
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import parse_levels, policies_folder
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
@@ -99,6 +119,55 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch", "dated"]
 
+P = ParamSpec("P")
+C = TypeVar("C")
+R = TypeVar("R")
+
+
+def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
+    """Return a decorator of a function of a config, which then takes the fields of that."""
+
+    def decorated(work: Callable[[C], R]) -> Callable[P, R]:
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
+            # One thread: products are small, and the cores are for workers.
+            with threadpool_limits(1):
+                return work(config(*args, **kwargs))
+
+        update_wrapper(call, work)
+        # What `help` shows.
+        signature = inspect.signature(config).replace(
+            return_annotation=work.__annotations__["return"]
+        )
+        vars(call)["__signature__"] = signature
+        call.__doc__ = f"{inspect.getdoc(config)}\n\nArgs:\n{_arguments(config)}"
+        return call
+
+    return decorated
+
+
+def _arguments(config: Any) -> str:
+    """Return the fields of a config with the docstrings under them."""
+    lines = []
+    for field in fields(config):
+        owner = next(kind for kind in config.__mro__ if field.name in kind.__annotations__)
+        lines.append(f"    {field.name}: {_docstrings()[owner.__name__, field.name]}")
+    return "\n".join(lines)
+
+
+@cache
+def _docstrings() -> dict[tuple[str, str], str]:
+    """Return the docstrings under the fields, by the name of the class and that of the field."""
+    found = {}
+    for kind in ast.parse(inspect.getsource(c)).body:
+        if not isinstance(kind, ast.ClassDef):
+            continue
+        for field, text in pairwise(kind.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                name = ast.unparse(field.target)
+                found[kind.name, name] = " ".join(ast.literal_eval(text.value).split())
+    return found
+
+
 # Campaigns
 
 
@@ -109,6 +178,7 @@ def campaign(config: c.Campaign) -> CampaignRun:
     folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = resolve(settings)
     notice_povs(settings, plan, config)
+    check_new(folder)
     return run_and_report(settings, plan, folder, where, config)
 
 
@@ -124,6 +194,7 @@ def resume(config: c.Resume) -> CampaignRun:
         own = settings.pov is not None
         levels = parse_levels(config.level, policies, settings.scenario.levels, own=own)
         settings = replace(settings, levels=levels)
+    check_report(folder)
     return run_and_report(settings, resolve(settings), folder, where, config, resumes=True)
 
 
@@ -139,17 +210,19 @@ def open_run(folder: c.AnyPath) -> CampaignRun:
 def run(config: c.RunCase) -> CaseRun:
     """Run one case and return it."""
     check_from(config.from_s)
-    settings, case = case_in(config) if config.recorded is None else recorded_case(config)
+    before = None if config.recorded is None else recorded(config.recorded[0])
+    settings, case = planned_case(config, before)
     if config.out is not None:
         check_new(Path(config.out))
     for sentence in outside_of_the_pool(case):
         notice(sentence)
     plan = resolve(settings, debug=config.debug)
-    if config.recorded is not None:
-        notice_changes(recorded(config.recorded[0]), plan)
+    if before is not None:
+        notice_changes(before, plan)
     if config.gui:
         check_display()
-    episode = run_one(plan, case)
+    with open_workers(1):  # which closes the simulator
+        (episode,) = simulate(plan.for_cases(1), [case])
     result = CaseRun(episode, config.from_s)
     with ExitStack() as opened:
         folder = path_of(config.out)
@@ -367,7 +440,7 @@ def check_vut(config: c.CheckVut) -> VutCheck:
     spec, _, _ = drivers_of(config.vut, None, 1)
     policies = None if config.policies is None else str(config.policies)
     fields = {"vut": spec, "levels": (0,), "policies": policies, **c.changed(config, c.Limits)}
-    plan = resolve(CampaignSettings(scenario=scenario_of(config.scenario), **fields))
+    plan = resolve(CampaignSettings(scenario=changed_scenario(config.scenario or US23), **fields))
     with Bars() as bars:
         bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
         return vut_check.check_vut(plan)
@@ -388,7 +461,7 @@ def new_scenario(config: c.NewScenario) -> Shown:
 def check_scenario(config: c.CheckScenario) -> Shown:
     """Say whether a scenario can be hosted, and whether the learned drivers were trained on it."""
     folder = None if config.policies is None else policies_in(config.policies)
-    scenario = scenario_of(config.scenario)
+    scenario = changed_scenario(config.scenario)
     name = scenario.name if isinstance(config.scenario, Scenario) else str(config.scenario)
     return own_scenario.check_scenario(scenario, name, folder)
 
@@ -404,6 +477,165 @@ def train(config: c.Train) -> PolicyChecks:
             )
     from merge_sumo.training.library import checks_of
 
-    scenario = None if config.scenario is None else scenario_of(config.scenario)
+    scenario = None if config.scenario is None else changed_scenario(config.scenario)
     with Bars(shown=config.progress) as bars:
         return checks_of(config, scenario, bars.counted, bars.say)
+
+
+# What the verbs share
+
+
+@contextmanager
+def opened_study(
+    run: Run,
+    config: c.Recorded,
+    title: str,
+    total: int | Mapping[Engine, int],
+    unit: str = "cases",
+    *,
+    engine: str | None = None,
+) -> Iterator[RunStudy]:
+    """Open a campaign for a study that runs cases of it, with a progress bar.
+
+    Args:
+        run: the campaign.
+        config: how and where cases of it run.
+        title: of the bar; "{vut}" in it stands for the VUT.
+        total: number of cases, which may depend on the engine.
+        unit: what the bar counts.
+        engine: what moves the vehicles.
+    """
+    overrides, where = explicit(config, run.vut)
+    settings = settings_of(run.folder, run.record, overrides)
+    plan = resolve(settings)
+    plan = plan.with_engine(engine)
+    number = total if isinstance(total, int) else total[plan.engine]
+    bar = Counter(title.format(vut=settings.vut), number, unit, shown=where.progress)
+    with open_workers(plan.workers(where.workers)) as workers, bar:
+        yield RunStudy(run, settings, plan, workers, bar.ended)
+
+
+@contextmanager
+def opened_truths(
+    settings: CampaignSettings, where: c.Execution, engine: str | None = None
+) -> Iterator[Study]:
+    """Open a study of truths; the cache of objects of this process is a passing one.
+
+    Raises:
+        UserError: for an engine that a level does not allow.
+    """
+    plan = resolve(settings)
+    for level in settings.levels:
+        plan.at_level(level).with_engine(engine)
+    passing = is_here(settings.vut) or is_here(settings.pov or "")
+    with (
+        open_workers(plan.workers(where.workers)) as workers,
+        ScratchFolder() as folder,
+        Bars(shown=where.progress) as bars,
+    ):
+        yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
+
+
+def path_of(path: Path | str | None) -> Path | None:
+    """Return a path of a user as one of `pathlib`."""
+    return None if path is None else Path(path)
+
+
+def run_and_report(
+    settings: CampaignSettings,
+    plan: SimulationPlan,
+    folder: Path,
+    where: c.Execution,
+    config: c.CampaignCalls,
+    *,
+    resumes: bool = False,
+) -> CampaignRun:
+    """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
+
+    An interruption has a note on how to continue.
+
+    Args:
+        settings: the settings of the campaign.
+        plan: how its cases run.
+        folder: a new folder, or that of the campaign.
+        where: where its cases run.
+        config: gates, JUnit file, and functions that are called.
+        resumes: whether the campaign continues in the folder.
+    """
+    junit = path_of(config.junit)
+    parse_gates(config.gates, against=settings.against is not None)
+    if junit is not None:
+        check_junit(junit, folder)
+    check = config.check or (lambda: None)
+    bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
+    title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
+
+    def on_cases(outcomes: Sequence[Outcome]) -> None:
+        if config.on_case is not None:
+            for outcome in outcomes:
+                config.on_case(outcome)
+        check()
+
+    try:
+        workers = open_workers(plan.workers(where.workers))
+        with workers, bars, RunningReport(folder) as report:
+            begun_s = perf_counter()
+            done = run_campaign(
+                settings,
+                plan,
+                folder,
+                (bars.ended, report.rewrite, on_cases),
+                resumes=resumes,
+                workers=workers,
+                begin=partial(bars.begin, title),
+            )
+            result = CampaignRun(done, config.gates)
+            plan = replace(plan, against=None)
+            if isinstance(plan.scenario, MergeScenario):  # careful drivers are models of merges
+                on_part = partial(bars.counted, "careful drivers", unit="failures")
+                known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
+                if known:
+                    AVOIDANCE.write_lines(folder, known)
+            on_part = partial(bars.counted, "uniform starts", unit="cases")
+            note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
+            note_explanation(done, plan, check)
+            link_latest(folder)
+            on_part = partial(bars.counted, "surrogates of the report", unit="levels")
+            write_report(done, result.summary, on_part)
+    except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
+        if folder.exists():
+            link_latest(folder)
+            address = {"workers": where.workers} if isinstance(where.workers, str) else {}
+            command = call_again("resume", folder, asdict(settings), **address)
+            stop.add_note(f"stopped; go on with {command}")
+        raise
+    if junit is not None:
+        write_junit(junit, done, result.facts, result.verdict, result.gates)
+    return result
+
+
+def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
+    """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT."""
+    levels = set(LEVELS) & set(settings.scenario.levels)
+    if config.level == "all" and not levels <= set(settings.levels):
+        present = ", ".join(map(level_name, settings.levels))
+        notice(
+            f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
+        )
+    if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
+        scenario = config.scenario or US23
+        name = spoken_name(scenario) if isinstance(scenario, Scenario) else str(scenario)
+        option = "" if config.policies is None else f" --policies {quoted(config.policies)}"
+        check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
+        notice(
+            f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"
+            f"{f': {check} says in what it differs' if name else ''}"
+        )
+    own, by_sumo = plan.povs.own, plan.vut.vut_type is not None
+    on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None
+    if on_lane and own is not None and own.vut_type is not None and not by_sumo:
+        # SUMO's drivers make room for a car next to them where its lane-change model asks them to.
+        notice(
+            f"until the VUT has merged, the POV {own.spec} keeps its speed: on an "
+            "acceleration lane SUMO's drivers see only a VUT that SUMO drives, too (sumo:MODEL)"
+        )
