@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, fields
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
@@ -274,11 +275,6 @@ def report(config: Options[c.Report], *, json: Json = False) -> int:
     return code
 
 
-@command(c.Explain, LOOK)
-def explain(config: Options[c.Explain], *, json: Json = False) -> int:
-    return print_result(ms.explain(**vars(config)), json)
-
-
 @command(c.ReplayCase, LOOK)
 def replay(
     config: Options[c.ReplayCase],
@@ -332,51 +328,44 @@ def compare(config: Options[c.Compare], *, json: Json = False) -> int:
     return print_result(ms.compare(**vars(config)), json, page=config.out)
 
 
-@command(c.Vuts, OWN)
-def vuts(config: Options[c.Vuts] = c.Vuts(), *, json: Json = False) -> int:
-    from merge_sumo import api  # `merge_sumo.vuts` may be the folder of that name
+def simple(
+    kind: type[Any], verb: str, group: Group | None = None, name: str = "", of: App = app
+) -> None:
+    """Register a command that calls a verb and prints what it returns.
 
-    return print_result(api.vuts(**vars(config)), json)
+    Args:
+        kind: the config of the command.
+        verb: the name of the function of the API.
+        group: where the list of commands shows it.
+        name: its name, by default that of the verb.
+        of: the application that has it.
+    """
+
+    def run_verb(config: Any, *, json: Json = False) -> int:
+        from merge_sumo import api  # not before a command runs: it loads much
+
+        return print_result(getattr(api, verb)(**vars(config)), json)
+
+    run_verb.__annotations__["config"] = Annotated[kind, Parameter(name="*")]
+    if not any(one.default is MISSING for one in fields(kind)):
+        run_verb.__defaults__ = (kind(),)
+    command(kind, group, name or verb, of)(run_verb)
 
 
-@command(c.CheckVut, OWN, "check-vut")
-def check_vut(config: Options[c.CheckVut], *, json: Json = False) -> int:
-    return print_result(ms.check_vut(**vars(config)), json)
+simple(c.Explain, "explain", LOOK)
+simple(c.Vuts, "vuts", OWN)
+simple(c.CheckVut, "check_vut", OWN, "check-vut")
+simple(c.NewScenario, "new_scenario", name="new", of=scenario)
+simple(c.CheckScenario, "check_scenario", name="check", of=scenario)
+simple(c.Train, "train", OWN)
+simple(c.GroundTruth, "truth", RESEARCH)
+simple(c.Benchmark, "benchmark", RESEARCH)
+simple(c.Reproduce, "reproduce", RESEARCH)
 
 
 @command(c.Scenarios, name="list", of=scenario)
 def list_scenarios(*, json: Json = False) -> int:
     return print_result(ms.scenarios(), json)
-
-
-@command(c.NewScenario, name="new", of=scenario)
-def new_scenario(config: Options[c.NewScenario], *, json: Json = False) -> int:
-    return print_result(ms.new_scenario(**vars(config)), json)
-
-
-@command(c.CheckScenario, name="check", of=scenario)
-def check_scenario(config: Options[c.CheckScenario], *, json: Json = False) -> int:
-    return print_result(ms.check_scenario(**vars(config)), json)
-
-
-@command(c.Train, OWN)
-def train(config: Options[c.Train] = c.Train(), *, json: Json = False) -> int:
-    return print_result(ms.train(**vars(config)), json)
-
-
-@command(c.GroundTruth, RESEARCH)
-def truth(config: Options[c.GroundTruth], *, json: Json = False) -> int:
-    return print_result(ms.truth(**vars(config)), json)
-
-
-@command(c.Benchmark, RESEARCH)
-def benchmark(config: Options[c.Benchmark], *, json: Json = False) -> int:
-    return print_result(ms.benchmark(**vars(config)), json)
-
-
-@command(c.Reproduce, RESEARCH)
-def reproduce(config: Options[c.Reproduce] = c.Reproduce(), *, json: Json = False) -> int:
-    return print_result(ms.reproduce(**vars(config)), json)
 
 
 def _check_working_folder() -> None:
