@@ -23,6 +23,40 @@ def whole_steps(time_s: float) -> tuple[int, float]:
     return int(steps), steps % 1.0
 
 
+class _Actuator:
+    """The actuator of one episode.
+
+    Attributes:
+        is_clipped: whether the last command was outside the limits.
+    """
+
+    def __init__(self, case: Case) -> None:
+        """Take the actuator of a case, which has commanded nothing so far."""
+        act = case.actuation
+        wait, self._share = whole_steps(act.at_most("delay_s"))
+        self._commands = [0.0] * (wait + 2)
+        """Those that wait, the oldest first."""
+        lag_s = act.at_most("lag_s")
+        # What a step leaves of the distance of a from u, at its end and in its mean.
+        self._decay = float(np.exp(-DT_S / lag_s)) if lag_s > 0.0 else 0.0
+        self._mean = lag_s / DT_S * (1.0 - self._decay)
+        self._power = act.at_most("power_w_per_kg")
+        self._low_mps2, self._high_mps2 = case.scenario.a_min_mps2, case.scenario.a_max_mps2
+        self._a_mps2 = 0.0
+        self.is_clipped = False
+
+    def mean_mps2(self, asked_mps2: float, v_mps: float) -> float:
+        """Return the mean acceleration of the next step for a command at a speed."""
+        command = min(max(asked_mps2, self._low_mps2), self._high_mps2)
+        self.is_clipped = abs(asked_mps2 - command) > ROUNDING_MPS2
+        self._commands = [*self._commands[1:], command]
+        before, now, *_ = self._commands
+        u = (1.0 - self._share) * now + self._share * before if self._share > 0.0 else now
+        mean = u + (self._a_mps2 - u) * self._mean
+        self._a_mps2 = u + (self._a_mps2 - u) * self._decay
+        return min(mean, self._power / max(v_mps, SLOWEST_MPS))
+
+
 class ActuatedDriver(DriverWrapper):
     """Drives as another driver commands, through an actuator that the case describes.
 
@@ -32,52 +66,27 @@ class ActuatedDriver(DriverWrapper):
     continuous lag. At last, power over speed limits it.
     """
 
-    def __init__(self, driver: Driver, longest_s: float) -> None:
-        """Take the driver, and the longest dead time of its cases."""
+    def __init__(self, driver: Driver) -> None:
+        """Take the driver."""
         super().__init__(driver)
-        corridors = driver.corridors
-        self._commands = np.zeros((whole_steps(longest_s)[0] + 2, corridors))
-        """The last commands, (D, K), a ring of rows."""
-        self._row = 0
-        self._wait, self._waits_on = np.zeros(corridors, dtype=np.int64), np.zeros(corridors)
-        """Dead time: whole steps, and the share of a further one."""
-        self._mean, self._decay = np.zeros(corridors), np.zeros(corridors)
-        """What a step leaves of the distance of a from u: in its mean, and at its end."""
-        self._power = np.full(corridors, np.inf)
-        self._a_mps2 = np.zeros(corridors)
-        """The lagged acceleration at the end of the last step."""
-        self._a_min, self._a_max = np.zeros(corridors), np.zeros(corridors)
-        self._clipped = np.zeros(corridors, dtype=np.bool_)
+        self._actuators: dict[int, _Actuator] = {}
+        self._clipped = np.zeros(driver.corridors, dtype=np.bool_)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the actuator of a case, which has commanded nothing so far."""
-        act = case.actuation
-        self._wait[corridor], self._waits_on[corridor] = whole_steps(act.at_most("delay_s"))
-        lag_s = act.at_most("lag_s")
-        decay = np.exp(-DT_S / lag_s) if lag_s > 0.0 else 0.0
-        self._decay[corridor], self._mean[corridor] = decay, lag_s / DT_S * (1.0 - decay)
-        self._power[corridor] = act.at_most("power_w_per_kg")
-        self._a_min[corridor] = case.scenario.a_min_mps2
-        self._a_max[corridor] = case.scenario.a_max_mps2
-        self._commands[:, corridor] = self._a_mps2[corridor] = 0.0
+        """Take the actuator of a case."""
+        self._actuators[corridor] = _Actuator(case)
         self._driver.begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the accelerations of the vehicle, (K,); what is no number is passed on at once."""
-        asked = self._driver.act(scene)
-        command = np.minimum(np.maximum(asked, self._a_min), self._a_max)
-        self._clipped = np.abs(asked - command) > ROUNDING_MPS2
-        finite = np.isfinite(asked)
-        rows, places, share = len(self._commands), np.arange(self.corridors), self._waits_on
-        self._commands[self._row] = np.where(finite, command, 0.0)
-        now = self._commands[(self._row - self._wait) % rows, places]
-        before = self._commands[(self._row - self._wait - 1) % rows, places]
-        self._row = (self._row + 1) % rows
-        u = np.where(share > 0.0, (1.0 - share) * now + share * before, now)
-        mean = u + (self._a_mps2 - u) * self._mean
-        self._a_mps2 = u + (self._a_mps2 - u) * self._decay
-        limited = np.minimum(mean, self._power / np.maximum(scene.v_vut_mps, SLOWEST_MPS))
-        return np.where(finite, limited, asked)
+        answers = np.array(self._driver.act(scene))
+        self._clipped[:] = False
+        for corridor in np.flatnonzero(scene.active & np.isfinite(answers)).tolist():
+            v_mps, asked_mps2 = float(scene.v_vut_mps[corridor]), float(answers[corridor])
+            actuator = self._actuators[corridor]
+            answers[corridor] = actuator.mean_mps2(asked_mps2, v_mps)
+            self._clipped[corridor] = actuator.is_clipped
+        return answers
 
     def clipped(self) -> NDArray[np.bool_]:
         """Return which of the last commands were outside the limits, (K,)."""

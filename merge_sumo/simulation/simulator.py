@@ -62,7 +62,7 @@ class Simulator:
         if not scenario.sense.is_perfect:
             self.vut = SensedDriver(self.vut, scenario)
         if not scenario.act.is_perfect:
-            self.vut = ActuatedDriver(self.vut, scenario.act.at_most("delay_s"))
+            self.vut = ActuatedDriver(self.vut)
         opened.callback(self.vut.close)
         self.pov = povs_for(scenario, plan.povs, world.corridors, sumo)
         opened.callback(self.pov.close)

@@ -4,11 +4,9 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 import struct
-import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,16 +21,12 @@ from support.vut_contract import factory, in_process, run_on
 
 from merge_sumo.controllers.traci import protocol
 from merge_sumo.controllers.traci.session import (
-    QUESTIONS,
     STAYED,
-    Effect,
     NotFiniteError,
-    effect_of,
 )
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.sumo.traci_names import EXAMPLES, functions
 
 SCRIPTS: dict[str, list[tuple]] = {
     "limits of the vehicle": [
@@ -43,10 +37,6 @@ SCRIPTS: dict[str, list[tuple]] = {
         (0, "vehicle", "setSpeed", 30.0),
         (8, "vehicle", "setSpeed", 10.0),
         (12, "vehicle", "setMaxSpeed", 17.9),
-    ],
-    "an acceleration after another": [
-        (0, "vehicle", "setAcceleration", 1.0, 0.5),
-        (3, "vehicle", "setAcceleration", -2.0, 1.5),
     ],
     "limits of the type after its own": [
         (0, "vehicletype", "setAccel", 0.8),
@@ -107,17 +97,6 @@ def test_sumo_drives_the_vut_as_the_same_commands_have_it_drive_a_car(drive, com
     assert ours != pytest.approx(18.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("function", ["setMaxSpeed", "setAccel", "setTau", "setImperfection"])
-@pytest.mark.parametrize("value", [-1.0, float("inf")])
-def test_numbers_that_cannot_be_are_refused_as_by_sumo(drive, function, value):
-    def refused(c):
-        with pytest.raises(traci.TraCIException, match="Invalid"):
-            getattr(c.vehicle, function)("vut", value)
-
-    drive.begin()
-    drive.both(refused)
-
-
 @pytest.mark.parametrize(
     ("function", "values"),
     [
@@ -138,6 +117,7 @@ def test_a_number_that_is_not_finite_is_a_fault(drive, function, values):
     [
         ("vehicle", "add", ("new", "route.vut")),
         ("vehicle", "setTau", ("pov", 1.0)),
+        ("vehicle", "setTau", ("vut", -1.0)),
         ("vehicletype", "setTau", ("pov", 1.0)),
         ("vehicle", "setPreviousSpeed", ("pov", 1.0)),
         ("edge", "setMaxSpeed", ("ramp", 5.0)),
@@ -161,58 +141,6 @@ def test_only_keys_of_the_controllers_own_reach_sumo(drive, tmp_path):
     with pytest.raises(traci.TraCIException, match="no device of type 'ssm' exists"):
         drive.ours.vehicle.getParameter("vut", "device.ssm.file")
     assert list(tmp_path.iterdir()) == []
-
-
-def commanded(connection, function: str) -> str | None:
-    """Return what is said to a command of the client on "vut"; None where it takes no example."""
-    domain, _, name = function.partition(".")
-    call = getattr(getattr(connection, domain), name)
-    parameters = inspect.signature(call).parameters.values()
-    needed = sum(p.default is p.empty and p.kind is p.POSITIONAL_OR_KEYWORD for p in parameters)
-    off = {p.name: False for p in parameters if p.default is True}
-    for example in EXAMPLES:
-        try:
-            call(*["vut", *[example] * (needed - 1)][:needed], **off)
-        except traci.TraCIException as error:
-            return str(error)
-        except (TypeError, ValueError, LookupError, AttributeError, struct.error):
-            connection._string, connection._queue = b"", []
-        else:
-            return ""
-    return None
-
-
-def test_every_command_that_the_client_has_goes_to_sumo_or_changes_nothing_or_is_refused(drive):
-    """No command but those on the VUT and its type reaches SUMO, and none moves the VUT away."""
-    effects = {f: effect_of(n) for n in functions().values() for f in n}
-    names = [f for key, n in functions().items() if key[0] not in QUESTIONS for f in n]
-    tried, called = 0, []
-    for function in names:
-        drive.begin()
-        sumo = drive.session.sumo
-        call = sumo.call
-
-        def noted(name, *arguments, call=call):
-            called.append((name, arguments[0]))
-            return call(name, *arguments)
-
-        with warnings.catch_warnings(), pytest.MonkeyPatch.context() as patch:
-            warnings.simplefilter("ignore")
-            patch.setattr(sumo, "call", noted)
-            said = commanded(drive.ours, function)
-        if said is None:
-            continue
-        tried += 1
-        if effects[function] is Effect.REFUSED:
-            assert said.startswith("merge-sumo does not carry out ")
-            assert function in said
-        elif effects[function] in (Effect.LOOKS, Effect.IN_VAIN):
-            assert said == "", function
-        assert drive.ours.vehicle.getLanePosition("vut") == pytest.approx(425.0 - 182.0)
-    assert tried > 200
-    assert {name.partition(".")[0] for name, _ in called} <= {"vehicle", "vehicletype"}
-    assert {object_id for _, object_id in called} == {"vut"}
-    assert {effects[name] for name, _ in called} == {Effect.CARRIED_OUT, Effect.OWN_KEYS}
 
 
 class TestBytes:

@@ -28,7 +28,7 @@ class Commands(Driver):
 def executed(commands, v_mps=20.0, **act):
     """Return what a vehicle does of commands, and which of them were clipped."""
     actuation = Actuation(**act)
-    driver = ActuatedDriver(Commands(commands), actuation.at_most("delay_s"))
+    driver = ActuatedDriver(Commands(commands))
     scenario = replace(US23, act=actuation)
     driver.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
     done, clipped = [], []
@@ -81,7 +81,7 @@ def test_an_answer_that_is_no_number_is_passed_on_at_once():
 
 
 def test_an_episode_begins_with_nothing_commanded():
-    driver = ActuatedDriver(Commands([2.0, 2.0, 2.0]), 0.1)
+    driver = ActuatedDriver(Commands([2.0, 2.0, 2.0]))
     scenario = replace(US23, act=Actuation(delay_s=0.1, lag_s=0.2))
     case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario)
     scene = Scene.of_pair(np.array([True]), np.array([0]), *np.full((4, 1), 20.0))

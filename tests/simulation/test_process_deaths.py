@@ -11,7 +11,6 @@ from support.campaigning import campaign_settings, run_campaign
 from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.trajectory import End
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX are needed")
 
@@ -73,20 +72,6 @@ class TestKills:
         assert struck.settings.ran_again >= bad
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] >= bad
         assert "cases ran again, because a process was killed" in struck.ran_again_in_words
-
-    @pytest.mark.slow
-    @pytest.mark.parametrize(
-        ("how", "said"), [(KILLED, "(SIGKILL)"), ("os._exit(3)", "exit code 3")]
-    )
-    def test_that_come_each_time_are_the_vuts_own_doing(self, campaign, how, said):
-        run = campaign("dies", DIES.format(how=how, times=99))
-        for outcome in run.outcomes:
-            if outcome.case.v_pov0_mps > 33.0:
-                assert outcome.measures.end is End.VUT_ERROR
-                assert said in outcome.measures.error
-            else:
-                assert not outcome.measures.end.is_error
-        assert run.settings.ran_again == 0
 
     @pytest.mark.slow
     def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, calm):

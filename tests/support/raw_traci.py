@@ -89,10 +89,7 @@ MISDEEDS = {
     "nan": lambda c: (c.set_speed(float("nan")), c.step()),
     "says goodbye": lambda c: (c.ask(command(CLOSE)), c.socket.close()),
     "half a message": lambda c: (c.socket.sendall(b"\0\0\0\x20\x05"), c.read(1)),
-    "half a message and closes": lambda c: (c.socket.sendall(b"\0\0\0\x20"), c.socket.close()),
     "a huge message": lambda c: (c.socket.sendall(b"\x7f\xff\xff\xff"), c.read(1)),
-    "steps to nan": lambda c: c.step(float("nan")),
-    "exits": lambda c: sys.exit(0),
     "crashes": lambda c: 1 / 0,
     "hangs": lambda c: time.sleep(600),
 }
