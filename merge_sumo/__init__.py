@@ -88,9 +88,7 @@ if not TYPE_CHECKING:
         from importlib import import_module
 
         home = "merge_sumo.errors" if name in ("Notice", "UserError") else "merge_sumo.api"
-        # Kept, as the import sets `vuts` to the folder of that name.
-        globals()[name] = value = getattr(import_module(home), name)
-        return value
+        return getattr(import_module(home), name)
 
 
 def __dir__() -> list[str]:

@@ -342,9 +342,7 @@ def simple(
     """
 
     def run_verb(config: Any, *, json: Json = False) -> int:
-        from merge_sumo import api  # not before a command runs: it loads much
-
-        return print_result(getattr(api, verb)(**vars(config)), json)
+        return print_result(getattr(ms, verb)(**vars(config)), json)
 
     run_verb.__annotations__["config"] = Annotated[kind, Parameter(name="*")]
     if not any(one.default is MISSING for one in fields(kind)):
