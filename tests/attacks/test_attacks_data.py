@@ -23,7 +23,7 @@ from support.writers import PLACES
 import merge_sumo as ms
 from merge_sumo.analysis.truth import Truth, ground_truth, read_truth
 from merge_sumo.api import open_run
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, read_settings
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import Severity
@@ -38,18 +38,6 @@ def copied(run, tmp_path) -> Path:
 
 
 class TestWhatWasChanged:
-    def test_of_a_line_is_named(self, copied):
-        lines = (copied / OUTCOMES).read_bytes().splitlines(keepends=True)
-        lines[25] = lines[25].replace(b'"index": 25', b'"index": 24')
-        (copied / OUTCOMES).write_bytes(b"".join(lines))
-        with pytest.raises(UserError, match=r"line 26 of .*outcomes\.jsonl"):
-            Run(copied)
-
-    def test_of_a_setting_is_taken(self, copied):
-        settings = read_settings(copied) | {"seed": 3}
-        (copied / SETTINGS).write_text(json.dumps(settings))
-        assert Run(copied).settings.seed == 3
-
     @pytest.mark.parametrize("name", [SETTINGS, OUTCOMES, f"{TRAJECTORIES}/00000.npz"])
     def test_into_a_pipe_is_not_waited_for(self, command_line, copied, name):
         (copied / name).unlink()
@@ -129,13 +117,6 @@ class TestACache:
         assert read_truth(KEPT.path(tmp_path), 0, CASES, US23) is None
         with pytest.raises(UserError, match=f"is not used: .*{how} "):
             ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
-
-    def test_with_a_file_of_another_seed_under_its_name_runs_again(self, true, tmp_path):
-        ground_truth(plan_for("design1"), 0, CASES, 1, cache=tmp_path)
-        key_of(cases=CASES, seed=1).path(tmp_path).rename(KEPT.path(tmp_path))
-        again = ground_truth(plan_for("design1"), 0, CASES, cache=tmp_path)
-        assert np.array_equal(again.margin, true[0].margin)
-        assert KEPT.path(tmp_path).read_bytes() == true[1]
 
     @pytest.mark.parametrize("kind", ["a folder", "a link to a file", "a pipe"])
     def test_with_no_file_there_is_refused_in_a_sentence(self, kind, tmp_path):

@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 from support.attacks import World
 from support.campaigning import campaign_settings, run_campaign
-from support.plans import plan_for
 
-from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.errors import UserError
 
@@ -91,13 +89,6 @@ class TestAFolderThatVanishes:
         with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
             run_campaign(replace(SETTINGS, sampler="annealing"), tmp_path / "run", on_case=gone)
         assert len(Run(tmp_path / "run").outcomes) == 20
-
-    def test_with_the_cache_is_made_again(self, tmp_path):
-        (tmp_path / "cache").mkdir()
-        gone = Vanishing(tmp_path / "cache", at=1)
-        truth = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache", on_cases=gone)
-        again = ground_truth(plan_for("design1"), 0, 200, cache=tmp_path / "cache")
-        assert again.margin.tobytes() == truth.margin.tobytes()
 
     def test_in_which_one_works_is_named(self, world):
         script = (

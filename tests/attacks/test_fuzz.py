@@ -26,7 +26,6 @@ from merge_sumo.campaigns.run import (
     TRAJECTORIES,
     Run,
     read_outcomes,
-    read_settings,
 )
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
@@ -156,25 +155,4 @@ def test_a_spoilt_file_is_a_value_or_a_sentence(written: Path, name: str, data: 
             reader(path)
     finally:
         manifest.write_bytes(manifest_before)
-        path.write_bytes(before)
-
-
-any_json = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner),
-    max_leaves=6,
-)
-
-
-@here
-@given(data=st.data())
-def test_a_setting_of_any_value_is_taken_or_refused(written: Path, data: Any) -> None:
-    path = written / "run" / SETTINGS
-    before, record = path.read_bytes(), read_settings(written / "run")
-    record[data.draw(st.sampled_from(sorted(record)))] = data.draw(any_json)
-    path.write_text(json.dumps(record))
-    try:
-        with suppress(UserError):
-            read_campaign(path)
-    finally:
         path.write_bytes(before)

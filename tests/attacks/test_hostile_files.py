@@ -20,7 +20,6 @@ from support.processes import cpu_s
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import default_net_path, road_of
-from merge_sumo.road.xml_input import MAX_BYTES
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import mirror
 from merge_sumo.sumo import replay as replay_module
@@ -282,18 +281,3 @@ def test_of_a_hostile_net_nothing_reaches_sumo_or_an_export(scene, name):
             assert not [
                 word for word in (*scene.names.values(), SECRET) if word.encode() in content
             ]
-
-
-def test_no_option_of_sumo_comes_from_the_environment(scene, monkeypatch):
-    for name in ("SUMO_HOME", "SUMO_LOGO", "SUMO_OPTIONS"):
-        monkeypatch.setenv(name, scene.names["{VICTIM}"])
-    result = scene.come_to(lambda: replay(scene.folder))
-    assert isinstance(result, Replay)
-
-
-def test_an_xml_file_is_read_up_to_a_size(tmp_path):
-    path = tmp_path / "a.net.xml"
-    path.touch()
-    os.truncate(path, MAX_BYTES + 1)
-    with pytest.raises(UserError, match="it is larger than 256 MiB"):
-        road_of(path)

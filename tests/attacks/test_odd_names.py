@@ -22,7 +22,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import printable
 from merge_sumo.reports.report import write_report
 from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.sumo.binding import sumo_program
 
 VUT = "def drive(seen):\n    return 1.0\n"
 NOT_UTF8 = os.fsdecode(b"vut-\xff\xfe")
@@ -96,17 +95,6 @@ def test_what_is_printed_moves_no_cursor_and_keeps_letters_of_all_languages():
 
 
 class TestSumo:
-    @pytest.mark.parametrize("name", ["a,b", "${HOME}"])
-    def test_plays_an_exported_folder_of_any_name_where_it_is(self, made, tmp_path, name):
-        export_case(made, 0, tmp_path / name)
-        done = subprocess.run(
-            [sumo_program("sumo"), "-c", "replay.sumocfg", "--no-step-log", "true"],
-            cwd=tmp_path / name,
-            capture_output=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-
     def test_says_so_where_there_is_no_folder_for_temporary_files(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
         with pytest.raises(UserError, match="set TMPDIR to a folder"):

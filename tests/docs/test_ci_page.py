@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import pytest
-from ci_snippets import PAGE, commands, main
+from ci_snippets import PAGE, main
 
 import merge_sumo as ms
 
 TEXT = PAGE.read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("kind", ["github", "gitlab"])
-def test_a_workflow_installs_runs_a_campaign_with_gates_and_the_test(kind):
-    install, again, campaign, test = commands(kind, TEXT)
-    assert install.startswith("pip install merge-sumo")
-    assert again.startswith("merge-sumo rerun cases.toml --vut controller.py:Controller")
-    assert campaign.startswith("merge-sumo campaign --vut controller.py:Controller")
-    assert "--gate failures" in campaign
-    assert test == "python -m pytest test_controller.py"
 
 
 def test_the_cases_of_the_page_are_those_of_its_controller(tmp_path, monkeypatch):

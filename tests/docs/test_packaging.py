@@ -25,13 +25,6 @@ def test_the_package_says_that_it_is_typed():
     assert "Typing :: Typed" in PROJECT["classifiers"]
 
 
-def test_the_classifiers_begin_with_the_oldest_python_that_it_takes():
-    prefix = "Programming Language :: Python :: 3."
-    versions = [c.removeprefix(prefix) for c in PROJECT["classifiers"] if c.startswith(prefix)]
-    assert f">=3.{versions[0]}" == PROJECT["requires-python"]
-    assert versions == ["11", "12", "13"]
-
-
 def test_a_release_has_the_same_day_in_the_changelog_and_in_the_citation():
     (released,) = re.findall(
         rf"^## {re.escape(PROJECT['version'])} \((.*)\)$",

@@ -11,8 +11,6 @@ import json
 import re
 from functools import cache
 
-import make_scenarios
-import numpy as np
 import pytest
 from docs_pages import ROOT
 
@@ -20,7 +18,6 @@ import merge_sumo as ms
 from merge_sumo.analysis.truth import REAL_REGION
 from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, FEATURES
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.metrics.score import measure
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.training.reward import RewardWeights
 
@@ -70,16 +67,6 @@ class TestTruths:
         assert row in page("README.md")
         assert row in page("docs/explanations/paper.md")
 
-    def test_of_other_samples(self):
-        for seed, told in ((1, [57, 22, 7]), (2, [51, 15, 5])):
-            failures, _, sizes = figures("design2", 1, 10_000, seed=seed)
-            assert sizes == told
-            assert f"{failures}" in page(DEFAULT).partition("With `--seed 1`")[2][:70]
-        assert "regions of 57, 22 and 7, and of 51, 15 and 5." in page(DEFAULT)
-        failures, fmc, sizes = figures("design2", 1, 100_000)
-        assert f"100000`: {failures} failures, FMC {fmc}, two regions;" in page(DEFAULT)
-        assert len(sizes) == 2
-
     @pytest.mark.parametrize("vut", ["design1", "design2"])
     @pytest.mark.parametrize(("level", "cases"), [(0, 10_000), (1, 10_000), (2, 20_000)])
     def test_of_the_drivers_of_people(self, vut, level, cases):
@@ -97,70 +84,6 @@ class TestTruths:
         assert row in page(ROUNDABOUT)
         said = ("none of 10,000 uniform", f"{failures}, all", f"{failures} of 20,000")[level]
         assert f"at level {level} in {said}" in page("docs/explanations/scenarios.md")
-
-    def test_of_a_queue(self):
-        sizes, queue = ((0, 20_000), (1, 10_000)), {"scenario": "us23-traffic"}
-        never, alone = (figures("design2", *of)[0] for of in sizes)
-        seldom, with_it = (figures("design2", *of, **queue)[0] for of in sizes)
-        assert never == 0
-        assert (
-            f"at level 0 in none of 20,000 uniform cases alone and in {seldom} with the queue; "
-            f"at level 1 in {alone} of 10,000 alone and in {with_it} with it"
-        ) in page("docs/explanations/scenarios.md")
-
-
-def test_the_failure_of_design_2_at_level_0_is_one():
-    command = r"--vut design2 --level 0 --x=(\S+) --v=(\S+)` .* dx = (\S+) m"
-    x_m, v_mps, dx_m = map(float, re.search(command, page(DEFAULT)).groups())
-    ran = ms.run("design2", level=0, x_pov0_m=x_m, v_pov0_mps=v_mps)
-    assert ran.failed
-    assert ran.measures.dx_m == pytest.approx(dx_m, abs=0.05)
-
-
-class TestTheExampleRuns:
-    TEXT = page(DEFAULT).partition("The example runs")[2]
-    SCENARIOS = page("scenarios/README.md")
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def runs(cls):
-        return {name: make_scenarios.play(e) for name, e in make_scenarios.EXAMPLES.items()}
-
-    def test_of_the_first_and_the_second(self, runs):
-        first, second = runs["pov-yields"], runs["vut-waits"]
-        ahead_m = first.x_vut_m[-1] - first.x_pov_m[-1]
-        assert f"the level-0 VUT merges {ahead_m:.0f} m ahead of it" in self.TEXT
-        waits_s = DT_S * np.flatnonzero(second.a_vut_mps2 > 0.0)[0]
-        gap_m, fastest_mps = second.x_pov_m[-1] - second.x_vut_m[-1], second.v_pov_mps.max()
-        assert (
-            f"waits for {waits_s:.1f} s, the POV accelerates to {fastest_mps:.1f} m/s and is "
-            f"{gap_m:.0f} m ahead"
-        ) in self.TEXT
-
-    def test_of_the_third(self, runs):
-        run = runs["stalemate"]
-        (braking,) = np.nonzero(run.a_vut_mps2 < -0.01)
-        (slowing,) = np.nonzero(run.a_pov_mps2 < -0.01)
-        begins_s, hardest_mps2 = DT_S * braking[0], -run.a_vut_mps2.min()
-        from_s, until_s = DT_S * slowing[0], DT_S * (slowing[-1] + 1)
-        dx_m = run.x_pov_m[-1] - run.x_vut_m[-1]
-        assert (
-            f"brakes from {begins_s:.1f} s on, by {hardest_mps2:.1f} m/s2 at last, the POV brakes "
-            f"before that, from {from_s:.1f} to {until_s:.1f} s, and they collide with dx = "
-            f"{dx_m:.1f} m"
-        ) in self.TEXT
-        closed_s = measure(run).last_avoidable_s
-        assert (
-            f"begins at {begins_s:.1f} s, after its last way out has closed at {closed_s:.1f} s"
-        ) in self.SCENARIOS
-
-    def test_of_the_roundabout(self, runs):
-        run = runs["roundabout-yields"]
-        fast, slow = run.v_pov_mps.max(), run.v_pov_mps.min()
-        ahead_m = run.x_vut_m[-1] - run.x_pov_m[-1]
-        assert (
-            f"slows down from {fast:.1f} to {slow:.1f} m/s and the VUT merges {ahead_m:.0f} m ahead"
-        ) in self.SCENARIOS
 
 
 @pytest.mark.parametrize("library", LIBRARIES, ids=["default", "human", "roundabout"])

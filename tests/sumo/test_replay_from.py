@@ -57,18 +57,15 @@ def assert_goes_on(played: Played, folder: Path, begins: dict[float, float]) -> 
         assert part.words[2].startswith(f"from {begin_s:.1f} s, ")
 
 
-@pytest.mark.parametrize("cases", [4, pytest.param(50, marks=pytest.mark.long)])
 @pytest.mark.parametrize("name", shipped_scenarios())
 def test_sumo_writes_the_same_bytes_from_there_on(
-    name: str, cases: int, played: Played, tmp_path: Path
+    name: str, played: Played, tmp_path: Path
 ) -> None:
     scenario = named_scenario(name)
-    levels = (0, 1, 2)
     settings = campaign_settings(
-        vut="design2", levels=levels, cases=cases, batch=cases, seed=1, scenario=scenario
+        vut="design2", levels=(0, 1, 2), cases=4, batch=4, seed=1, scenario=scenario
     )
     run = run_campaign(settings, tmp_path / "run")
-    assert len(run.outcomes) == cases
     for outcome in run.outcomes:
         folder = tmp_path / str(outcome.index)
         export_case(run, outcome.index, folder)
@@ -93,29 +90,9 @@ class TestTheCommand:
         # 8.5 to 14.6 s, and the 10 rows that hold the end: 71 rows of two cars.
         assert verdict == "identical: 142 rows of x, y and speed"
 
-    def test_begins_at_the_start_where_that_is_later(self, command_line: Any) -> None:
-        _, whole, _ = command_line("replay", STALEMATE)
-        _, out, _ = command_line("replay", STALEMATE, "--from", "-1e300")
-        begins, verdict = out.splitlines()[2:]
-        assert begins == "from 0.0 s, 11.5 s before the contact at 11.5 s"
-        assert verdict == whole.splitlines()[2]
-
     @pytest.mark.parametrize("number", ["3", "nan", "inf", "-inf"])
     @pytest.mark.parametrize(
         "command", [("replay", STALEMATE), ("replay", STALEMATE, "--gui"), ("run",)]
     )
     def test_refuses_another_number(self, command: Any, number: str, command_line: Any) -> None:
         assert_refused(command_line(*command, "--from", number), "--from", "not above 0, such as")
-
-    def test_refuses_a_car_that_is_not_on_its_path(self, command_line: Any, tmp_path: Path) -> None:
-        folder = tmp_path / "case"
-        folder.mkdir()
-        for file in STALEMATE.iterdir():
-            (folder / file.name).write_bytes(file.read_bytes())
-        record = etree.parse(folder / RECORD)
-        for car in record.iter("vehicle"):
-            if car.get("id") == "pov":
-                car.set("lane", "ramp1.0_0")
-        record.write(folder / RECORD)
-        said = command_line("replay", folder, "--from", "-3")
-        assert_refused(said, "has pov on lane ramp1.0_0, which is not on its path")

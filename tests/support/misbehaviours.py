@@ -34,8 +34,6 @@ CLASS: Final = """
 class Vut:
     def reset(self, seen):
         self.guilty = seen.v_pov_mps > {limit}
-        if self.guilty:
-{reset}
     def act(self, seen):
         if self.guilty and seen.t_s == 0.3:
 {act}
@@ -63,17 +61,11 @@ def code(text: str, spaces: int) -> str:
 
 
 def acts(
-    body: str, reason: str | None = None, setup: str = "", reset: str = "", methods: str = "", **how
+    body: str, reason: str | None = None, setup: str = "", methods: str = "", **how
 ) -> Misbehaviour:
     """Return a class that does it while it acts."""
-    source = CLASS.format(
-        limit=GUILTY_MPS, act=code(body, 12), reset=code(reset, 12), methods=code(methods, 4)
-    )
+    source = CLASS.format(limit=GUILTY_MPS, act=code(body, 12), methods=code(methods, 4))
     return Misbehaviour(source=dedent(setup) + source, reason=reason, **how)
-
-
-def resets(body: str, reason: str | None = None, **how) -> Misbehaviour:
-    return acts("", reason, reset=body, **how)
 
 
 def batched(body: str, reason: str | None = None, **how) -> Misbehaviour:
@@ -96,7 +88,6 @@ while True:
 
 CATALOGUE: Final = {
     "segfault": acts("import ctypes; ctypes.string_at(0)", "by signal 11 (SIGSEGV)"),
-    "dies while it resets": resets("import os; os._exit(7)", "exit code 7"),
     "sleeps and holds the interpreter": acts("import ctypes; ctypes.PyDLL(None).sleep(60)", LATE),
     "a list that grows": acts(
         """
