@@ -90,7 +90,6 @@ from merge_sumo.reports.exports import export_cases
 from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars, CampaignBars, Counter
 from merge_sumo.reports.report import RunningReport, check_report, write_report
-from merge_sumo.reports.reproduction_page import write_reproduction
 from merge_sumo.result import Shown
 from merge_sumo.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.road.scenario_file import SUFFIX, spoken_name
@@ -115,7 +114,7 @@ from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
 from merge_sumo.workers import open_workers
 
 if TYPE_CHECKING:
-    from merge_sumo.training.library import PolicyChecks
+    from merge_sumo.training.helix import PolicyChecks
 
 __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch", "dated"]
 
@@ -422,7 +421,7 @@ def reproduce(config: c.Reproduce) -> Reproduction:
         result = reproduction.reproduce(
             scale, policies=policies, workers=workers, on_part=bars.counted
         )
-    return replace(result, page=write_reproduction(result, folder))
+    return replace(result, page=figures.write_reproduction(result, folder))
 
 
 # Bring your own: VUTs, scenarios, learned drivers
@@ -475,7 +474,7 @@ def train(config: c.Train) -> PolicyChecks:
                 f"training needs {package}, which is not installed: run "
                 "`pip install 'merge-sumo[train]'`"
             )
-    from merge_sumo.training.library import checks_of
+    from merge_sumo.training.helix import checks_of
 
     scenario = None if config.scenario is None else changed_scenario(config.scenario)
     with Bars(shown=config.progress) as bars:

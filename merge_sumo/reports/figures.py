@@ -1,4 +1,4 @@
-"""Pictures of experiments, drawn by matplotlib (the extra `plot`) without a screen.
+"""Pictures of experiments, drawn by matplotlib (the extra `plot`), and the page of a reproduction.
 
 One colour per sampler in all pictures, and one per level of the POV; all of them are told apart
 with any kind of colour vision (Okabe and Ito, 2008).
@@ -15,11 +15,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from merge_sumo.analysis.reproduction import LevelBatches, Panel, PredictedMargins
+from merge_sumo.analysis.reproduction import LevelBatches, Panel, PredictedMargins, Reproduction
 from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.fmc import RADIUS
+from merge_sumo.records import to_json
+from merge_sumo.reports.pages import page
+from merge_sumo.reports.text import table_ii
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import OWN, US23, level_name
@@ -239,3 +242,42 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
     ink, marker = LEVEL_LOOKS[level]
     axes.fill_between(batches, parts[0], parts[2], color=ink, alpha=0.18, linewidth=0)
     axes.plot(batches, parts[1], color=ink, marker=marker, ms=4, label=level_name(level))
+
+
+def write_reproduction(result: Reproduction, folder: Path) -> Path:
+    """Write the table, the figures and the page of a reproduction; return the path of the page.
+
+    Raises `UserError` where a file is there already, or without matplotlib.
+    """
+    write_new(folder / "table2.json", to_json(result.to_record()))
+    write_new(folder / "table2.md", ("\n".join(result.lines()) + "\n").encode())
+    pictures = []
+    for name, figure in _figures(result):
+        save(figure, folder / f"{name}.png")
+        pictures.append(f"{name}.png")
+    text = page("reproduce.html.jinja", result=result, table=table_ii(result), pictures=pictures)
+    page_file = folder / "index.html"
+    write_new(page_file, text.encode())
+    return page_file
+
+
+def _figures(result: Reproduction) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of every picture; the template captions each by its name."""
+    for one in result.columns.values():
+        vut, level = one.column.vut, one.column.level
+        against = f"{vut} against a level-{level} POV"
+        curves = coverage_curves(f"Coverage of {against}", one.study)
+        yield f"curves-level{level}", curves
+        yield f"cases-level{level}", maps(f"Failures of {against}", one.panels, level)
+        if level == 1:
+            truth = one.panels["truth"]
+            yield (
+                f"gpr-surface-level{level}",
+                predicted_margins(
+                    f"The surrogate of gpr on {against}",
+                    *(one.predicted(), level, truth.points[truth.failed]),
+                ),
+            )
+    scale = result.scale
+    title = f"design2 against all levels, {scale.batches} batches of {2 * scale.batch}"
+    yield "allocation", allocation(title, result.levels)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -140,15 +140,11 @@ def _simple_returns(game: Game, state: FloatArray) -> FloatArray:
     return best
 
 
-@dataclass(frozen=True, slots=True)
-class BestGames:
-    """The result of a search from n states: best returns, (n,), and the actions that lead there.
+BestGames = tuple[FloatArray, IntArray]
+"""Best returns of a search from n states, (n,), and the actions that lead there, (n, decisions).
 
-    `plans` has shape (n, decisions): places in `game.actions_mps2`, -1 behind the end of the game.
-    """
-
-    returns: FloatArray
-    plans: IntArray
+Actions are places in `game.actions_mps2`, -1 behind the end of the game.
+"""
 
 
 def beam_search(
@@ -160,12 +156,13 @@ def beam_search(
     those with the best reward so far plus the agent's own estimate of the rest, and half to the
     best of each class of predicted gap at M, so that the agent's errors cannot hide an answer.
     """
-    chunks = [slice(start, start + _CHUNK) for start in range(0, len(state), _CHUNK)]
-    found = [_beam_chunk(game, state[c], svo_rad[c], agent, width) for c in chunks]
-    return BestGames(
-        np.concatenate([np.empty(0), *(f.returns for f in found)]),
-        np.concatenate([np.empty((0, game.max_decisions), np.int64), *(f.plans for f in found)]),
-    )
+    returns, plans = [np.empty(0)], [np.empty((0, game.max_decisions), np.int64)]
+    for start in range(0, len(state), _CHUNK):
+        rows = slice(start, start + _CHUNK)
+        best, plan = _beam_chunk(game, state[rows], svo_rad[rows], agent, width)
+        returns.append(best)
+        plans.append(plan)
+    return np.concatenate(returns), np.concatenate(plans)
 
 
 def _beam_chunk(
@@ -196,7 +193,7 @@ def _beam_chunk(
             _prune(game, cases[alive], state[alive], so_far[alive], svo_rad, agent, width)
         ]
         cases, state, so_far, plan = cases[alive], state[alive], so_far[alive], plan[alive]
-    return BestGames(best, best_plan)
+    return best, best_plan
 
 
 def _prune(

@@ -122,7 +122,7 @@ def check_network(
         best = best_response(game, start)
     else:
         # The driver's own games are some that a search may find.
-        searched = beam_search(game, start, svo_rad, network).returns
+        searched, _ = beam_search(game, start, svo_rad, network)
         rolled_out = game.play(start, svo_rad, game.improved(greedy(network, game.scenario)))
         best = np.maximum(np.maximum(searched, rolled_out), reached)
     gain = float((best - unmoved).mean())

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
@@ -22,12 +23,14 @@ from typing import Any, Final
 import numpy as np
 from safetensors.numpy import save
 
+from merge_sumo import config
 from merge_sumo.drivers.levelk import LIMIT, QNetwork
 from merge_sumo.drivers.policies import (
     MANIFEST,
     NETWORKS,
     load_network,
     plays_as,
+    policies_of,
     read_manifest,
     scenario_of,
     scenario_record,
@@ -42,15 +45,16 @@ from merge_sumo.files import (
 )
 from merge_sumo.printable import quoted
 from merge_sumo.records import to_json, to_plain
+from merge_sumo.result import Result
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.spawning import forget_safe_path, without_cwd
-from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network
+from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network, check_policy
 from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
 from merge_sumo.training.reward import Reward, RewardWeights, Role
-from merge_sumo.workers import is_daemonic, leave_signals_to_parent
+from merge_sumo.workers import leave_signals_to_parent
 
 OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
     "pov1": ("pov", "level0"),
@@ -119,7 +123,6 @@ def train_library(
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road_for(scenario)  # on which it is checked in the end
-    _check_process()
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
@@ -148,15 +151,6 @@ def train_library(
             _keep(folder, trained, network, entry, check)
             if on_done is not None:
                 on_done(trained, check)
-
-
-def _check_process() -> None:
-    """Raise `UserError` where this process may start none for the networks."""
-    if is_daemonic():
-        raise UserError(
-            "a training starts a process for each network, and a daemonic process, such as a "
-            "worker of multiprocessing.Pool, starts none: train outside of it"
-        )
 
 
 def _take(folder: Path) -> None:
@@ -324,3 +318,73 @@ def _keep(
     }
     entries = {name: known[name] for name in NETWORKS if name in known}
     replace_own(folder / MANIFEST, to_json({"networks": entries}, indent=2))
+
+
+class PolicyChecks(Result, dict[str, PolicyCheck]):
+    """`PolicyCheck` by the name of the network."""
+
+    def lines(self) -> list[str]:
+        """Return a table of the checks."""
+        return [
+            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0",
+            *(
+                f"{name:<7}  {one.mean_regret:11.2%}  {one.p99_regret:10.2%}  "
+                f"{one.collisions:10d}  {one.avoidable_collisions:9d}  "
+                f"{one.mean_return:11.3f}  {one.mean_best:.3f}  {one.mean_level0:.3f}"
+                for name, one in self.items()
+            ),
+        ]
+
+
+def checks_of(
+    asked: config.Train,
+    scenario: Scenario | None,
+    on_part: Callable[[str, int, int, str, str], None],
+    say: Callable[[str], None],
+) -> PolicyChecks:
+    """Train the learned drivers, or measure those that are there, and return what each loses.
+
+    Args:
+        asked: what is trained.
+        scenario: the scenario that is asked for.
+        on_part: told how far it is, as of studies.
+        say: told which networks are ready.
+
+    Raises:
+        UserError: for a network or a folder that is not known.
+    """
+    wanted = set(asked.only or NETWORKS)
+    if unknown := wanted - set(NETWORKS):
+        raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
+    names, played = [name for name in NETWORKS if name in wanted], scenario or US23
+    folder = policies_of(played) if asked.out is None else Path(asked.out)
+    if not asked.check:
+
+        def progressed(now: TrainingProgress) -> None:
+            on_part(f"{now.network} {now.stage}", now.done, now.total, "updates", now.note)
+
+        if asked.out is None and not plays_as(played, US23):
+            raise UserError(
+                f"the shipped policies are for {US23.name}: say with `out` where those for "
+                f"{played.name} are to go"
+            )
+        train_library(
+            *(folder, tuple(names), asked.seed),
+            scenario=played,
+            a_min_mps2=asked.a_min,
+            on_progress=progressed,
+            on_done=lambda n, check: say(f"{n} is {'there already' if check is None else 'ready'}"),
+        )
+    manifest = read_manifest(folder)
+    if missing := [name for name in names if name not in manifest]:
+        raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
+    trained_for = scenario_of(manifest[names[0]])
+    if scenario is None and not plays_as(trained_for, US23):
+        raise UserError(
+            f"{folder} was trained for {trained_for.name}: say with `scenario` in which one to "
+            f"check it, or {US23.name}"
+        )
+    if asked.check:
+        checked = partial(check_policy, count=asked.cases, scenario=played)
+        return PolicyChecks({name: checked(name, folder) for name in names})
+    return PolicyChecks({name: PolicyCheck(**manifest[name]["check"]) for name in names})

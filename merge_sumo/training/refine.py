@@ -172,14 +172,14 @@ def _try(
     """Play by the policy, from half of the starts with random actions too, and what is found."""
     start, svo_rad = starts
     policy, searched = greedy(network, game.scenario), slice(s.searched)
-    found = beam_search(game, start[searched], svo_rad[searched], network, s.beam)
+    _, plans = beam_search(game, start[searched], svo_rad[searched], network, s.beam)
     state = np.concatenate([start, start[::2], start[searched]])
     psi = np.concatenate([svo_rad, svo_rad[::2], svo_rad[searched]])
     index, total = np.arange(len(state)), np.zeros(len(state))
     plan = np.full((len(state), game.max_decisions), -1)
-    plan[len(state) - len(found.plans) :] = found.plans
+    plan[len(state) - len(plans) :] = plans
     random = np.zeros(len(state))
-    random[len(start) : len(state) - len(found.plans)] = s.exploration
+    random[len(start) : len(state) - len(plans)] = s.exploration
     steps: list[tuple[IntArray, FloatArray, IntArray, FloatArray]] = []
     for decision in range(game.max_decisions):
         planned = plan[index, decision]
@@ -193,9 +193,9 @@ def _try(
         index, state = index[~over], state[~over]
         if not index.size:
             break
-    gained = total[len(total) - len(found.plans) :] - total[searched]
+    gained = total[len(total) - len(plans) :] - total[searched]
     better = np.zeros(len(total), dtype=bool)
-    better[len(total) - len(found.plans) :] = gained > BETTER
+    better[len(total) - len(plans) :] = gained > BETTER
     most = np.argsort(-gained, kind="stable")[: len(gained) // 4]
     index = np.concatenate([step[0] for step in steps])
     return _Tried(

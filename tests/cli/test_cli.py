@@ -15,7 +15,6 @@ from support.calling import Said, assert_refused, commands, contents, invoke, ru
 
 from merge_sumo.analysis.reproduction import TABLE_II, Scale
 from merge_sumo.campaigns.run import Run, failures, spread_failures
-from merge_sumo.reports.reproduction_page import TABLE_JSON
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES
 from merge_sumo.sumo.replay_folder import RECORD
 
@@ -231,7 +230,7 @@ class TestReproduce:
         assert code == 0, err
         assert out.startswith("| FMC: ours (the paper's) |")
         assert "here/index.html" in out.splitlines()[-1]
-        assert json.loads((tmp_path / "here" / TABLE_JSON).read_text())["scale"]["seeds"] == 1
+        assert json.loads((tmp_path / "here" / "table2.json").read_text())["scale"]["seeds"] == 1
 
 
 def test_an_error_in_a_process_of_its_own_is_one_sentence_without_a_traceback(tmp_path):

@@ -239,12 +239,6 @@ class TestADaemonicProcess:
         texts = [(one.folder / OUTCOMES).read_bytes() for one in (alone, run)]
         assert texts[0] == texts[1]
 
-    def test_trains_nothing(self, daemonic, tmp_path):
-        helix = pytest.importorskip("merge_sumo.training.helix", exc_type=ImportError)
-        with pytest.raises(UserError, match="train outside of it"):
-            helix.train_library(tmp_path / "policies", scenario=US23)
-        assert not list(tmp_path.iterdir())
-
 
 class TestADaskCluster:
     @pytest.mark.slow

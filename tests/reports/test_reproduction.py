@@ -8,7 +8,7 @@ import pytest
 
 from merge_sumo.analysis.reproduction import TABLE_II, Reproduction, Scale, reproduce
 from merge_sumo.errors import UserError
-from merge_sumo.reports.reproduction_page import write_reproduction
+from merge_sumo.reports.figures import write_reproduction
 
 FIGURES = {
     "cases-level0.png",

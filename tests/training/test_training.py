@@ -155,7 +155,7 @@ class TestBestResponse:
         starts = np.stack([x, v, np.full(6, -182.0), np.full(6, 18.0)], axis=1)
         exact = best_response.best_response(Game("pov", None, REWARD), starts)
         game = Game("pov", always_1, REWARD)
-        found = best_response.beam_search(game, starts, np.zeros(6), always_1, width=400).returns
+        found, _ = best_response.beam_search(game, starts, np.zeros(6), always_1, width=400)
         assert (found <= exact + 1e-5).all()
         assert np.median(exact - found) < 0.02
 
