@@ -11,10 +11,10 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from unicodedata import category
 
 import pytest
 from conftest import some
+from support.calling import assert_refused
 from support.campaigning import resume_campaign
 from support.writers import INTO_FOLDERS, PLACES, WRITERS
 
@@ -82,14 +82,6 @@ def world(run, tmp_path, monkeypatch) -> Path:
     return here
 
 
-def assert_refused(said: tuple[int, str, str], what: object) -> None:
-    code, out, err = said
-    assert (code, out) == (2, ""), (what, said)
-    assert err.startswith("merge-sumo: "), what
-    assert err.count("\n") == 1, said
-    assert not any(category(letter)[0] == "C" for letter in err[:-1]), said
-
-
 @pytest.mark.parametrize("writer", WRITERS)
 def test_nothing_at_the_place_of_an_output_is_touched(
     world, no_cases, monkeypatch, command_line, writer
@@ -109,13 +101,13 @@ def test_nothing_at_the_place_of_an_output_is_touched(
         if added or (writer, name) == ("train", "an empty folder"):
             assert said.code in (0, 2), said
         else:
-            assert_refused(said, name)
+            assert_refused(said)
             assert after == planted, name
         for path in sorted(after.keys() - before.keys(), reverse=True):
             is_folder = Path(path).is_dir() and not Path(path).is_symlink()
             (Path(path).rmdir if is_folder else Path(path).unlink)()
     for name in (*NAMELESS, *BELOW, *TOO_LONG):
-        assert_refused(command_line(*shlex.split(command), name), name)
+        assert_refused(command_line(*shlex.split(command), name))
         assert tree(world) == before, name
 
 

@@ -9,7 +9,7 @@ import sys
 import time
 import uuid
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 MARK = "MERGE_SUMO_ATTACK"
@@ -21,13 +21,10 @@ PATIENCE_S = 600.0
 class World:
     """A working folder, a cache and a folder for temporary files, and the processes that use them.
 
-    `python` are options of the interpreter, `environment` is what it gets besides;
     `prefix` is the program that starts it.
     """
 
     root: Path
-    python: tuple[str, ...] = ()
-    environment: dict[str, str] = field(default_factory=dict)
     prefix: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -51,10 +48,9 @@ class World:
             "TMPDIR": str(self.temporary),
             "MERGE_SUMO_CACHE": str(self.cache),
             MARK: self.mark,
-            **self.environment,
         }
         return subprocess.Popen(
-            [*self.prefix, sys.executable, *self.python, *what, *map(str, arguments)],
+            [*self.prefix, sys.executable, *what, *map(str, arguments)],
             cwd=self.root,
             env=environment,
             stdin=subprocess.DEVNULL,

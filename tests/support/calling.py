@@ -8,6 +8,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import NamedTuple
+from unicodedata import category
 
 from cyclopts import App
 
@@ -80,6 +81,7 @@ def assert_refused(said: tuple[int, str, str], *parts: str) -> None:
     assert err.startswith("merge-sumo: ")
     assert err.endswith("\n")
     assert err.count("\n") == 1
+    assert not any(category(letter)[0] == "C" for letter in err[:-1]), err
     for part in parts:
         assert part in err
 
