@@ -11,9 +11,10 @@
 The first prints medians of FMC / truth after 100, 200 and 400 cases, `coverage` in batches of its
 own and the others in batches of 20; the second does so for `gpr` with one of its choices changed
 at a time; the third prints the seconds that a sampler takes for a batch after N cases; the fourth
-prints the CPU time of `coverage` with its twin for a case at three levels after N uniform cases,
-and the memory of the twin; `--trials` lets `coverage`, the same without its twin, and `gpr` search
-the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at which they fail;
+prints the CPU time of `coverage` with its model of the controller for a case at three levels after
+N uniform cases, and the memory of the model; `--trials` lets `coverage`, the same without that
+model, and `gpr` search the VUTs of `trial_vuts.py`, on which nothing was tuned, at every level at
+which they fail;
 `--held-out` lets samplers search the VUTs of `held_out_vuts.py`, whose failures nothing foretells,
 and prints medians with the least and the most after 100 and 400 cases.
 
@@ -46,8 +47,8 @@ from merge_sumo.metrics.fmc import RADIUS, fmc
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers import gpr
+from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.samplers.twin import Twin
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.scenario.trajectory import End
@@ -58,7 +59,7 @@ sys.path.append(str(Path(__file__).parent / "benchmark"))
 from oracle import greedy_cover
 
 CASES, BATCH = 400, 20
-WITHOUT = "coverage without its twin"
+WITHOUT = "coverage without its model"
 TRIALS = ("Idm", "Hysteresis", "Delayed", "Rss", "Courteous", "Table", "Noisy", "Hidden")
 HELD_OUT = ("Cells", "Islands", "Shell", "NoisySensors")
 DEVELOPMENT = ("Lots", "Stripes", "Ring")
@@ -103,7 +104,7 @@ def search(
 ) -> tuple[list[float], int, float]:
     """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
     pool = Pool(levels=(level,), scenario=US23)
-    games = None if name == WITHOUT else Twin(pool, plan.povs, seed)
+    games = None if name == WITHOUT else ControllerModel(pool, plan.povs, seed)
     sampler = make_sampler("coverage" if name == WITHOUT else name, pool, seed, games)
     batch = None if sampler.predictor else BATCH
     seconds = 0.0
@@ -187,7 +188,7 @@ def _failures(
 ) -> tuple[Any, Any]:
     """Return the failures that a sampler finds, (m, d), and their indices, (m,)."""
     pool = Pool(levels=(level,), scenario=US23)
-    sampler = make_sampler(name, pool, seed, Twin(pool, plan.povs, seed))
+    sampler = make_sampler(name, pool, seed, ControllerModel(pool, plan.povs, seed))
     batch = batch or (None if sampler.predictor else BATCH)
     groups: Groups = []
     SearchLoop(sampler, plan, cases, batch=batch).run(groups.extend)
@@ -255,7 +256,7 @@ def print_times(names: list[str]) -> dict[str, dict[int, float]]:
 
 
 def print_cost_per_case() -> dict[str, dict[int, float]]:
-    """Print and return what `coverage` with its twin takes for a case after N cases of design2."""
+    """Print and return what `coverage` with its model takes for a case after N cases of design2."""
     sizes = (100, 500, 5000, 12_000)
     settings = CampaignSettings(vut="design2", levels=LEVELS, scenario=US23)
     plan, pool = resolve(settings), settings.pool
@@ -268,10 +269,10 @@ def print_cost_per_case() -> dict[str, dict[int, float]]:
         told = Prediction.of(gap_m + rng.normal(0.0, 0.5, (2, 4)), chance, chance, chance)
         outcomes.append(result.at(index, index // BATCH, told).outcome)
         motions[index] = result.trajectory.motion
-    figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the twin": {}}
+    figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the model": {}}
     for size in sizes:
-        twin = Twin(pool, plan.povs, 0)
-        sampler = make_sampler("coverage", pool, 0, twin)
+        model = ControllerModel(pool, plan.povs, 0)
+        sampler = make_sampler("coverage", pool, 0, model)
         sampler.tell(outcomes[: size - BATCH], motions)
         sampler.ask(sampler.batch_size())  # what the first batch alone has to learn
         start = time.process_time()
@@ -279,7 +280,7 @@ def print_cost_per_case() -> dict[str, dict[int, float]]:
         batch = sampler.ask(sampler.batch_size())
         spent_s = time.process_time() - start
         figures["ms of CPU per case"][size] = 1e3 * spent_s / len(batch)
-        figures["MB of the twin"][size] = len(pickle.dumps(twin)) / 1e6
+        figures["MB of the model"][size] = len(pickle.dumps(model)) / 1e6
     print(f"{'after N =':30s}" + " ".join(f"{n:7d}" for n in sizes))
     for name, values in figures.items():
         print(f"{name:30s}" + " ".join(f"{value:7.1f}" for value in values.values()))

@@ -33,8 +33,8 @@ from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.result import Result
 from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.samplers.twin import Twin
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.plan import SimulationPlan
@@ -97,7 +97,7 @@ def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
     found = []
     for task in tasks:
         pool, lines = Pool(levels=task.levels, scenario=plan.scenario), centre_lines(plan.road)
-        twin = Twin(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
+        twin = ControllerModel(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
         sampler, ran = make_sampler(task.name, pool, task.seed, twin), SamplerRun([], [])
         batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
         groups: Groups = []

@@ -23,9 +23,9 @@ from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
 from merge_sumo.samplers.base import Sampler
+from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.pair import TwinPair
 from merge_sumo.samplers.registry import SAMPLERS
-from merge_sumo.samplers.twin import Twin
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -232,10 +232,10 @@ def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
     return settings.with_repeats(settings.new_sampler(predictor))
 
 
-def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> Twin:
-    """Return the twin of the VUT."""
+def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> ControllerModel:
+    """Return a model of the controller that has learned nothing."""
     lines = centre_lines(plan.road)
-    return Twin(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
+    return ControllerModel(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
 
 
 def case_name(index: int) -> str:

@@ -22,10 +22,10 @@ Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Prediction(Record, frozen=True):
-    """The gaps at M that a twin of the VUT had in its rollouts, and the chances of failing.
+    """The gaps at M that a model of the controller had in its rollouts, and P(fail).
 
     Attributes:
-        dx_m: signed gap at M by each member of each expert, (E, G); None where the VUT never
+        dx_m: signed gaps at M by the members of the ensemble, (E, G); None where the VUT never
             arrived.
         p_twin: P(fail) that follows from these.
         p_surrogate: P(fail) by the surrogate, which learns the outcomes.

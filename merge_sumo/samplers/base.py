@@ -17,7 +17,7 @@ from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
 
 if TYPE_CHECKING:
-    from merge_sumo.samplers.prediction_skill import Predictor
+    from merge_sumo.samplers.predictor import Predictor
 
 DEFAULT_BATCH: Final = 40
 """Cases of a batch of a sampler without a preferred size."""

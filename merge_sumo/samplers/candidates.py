@@ -9,39 +9,40 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from merge_sumo.metrics.fmc import radius_for
-from merge_sumo.samplers.belief import Belief
-from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.samplers.failure_probability import FailureProbability
 from merge_sumo.scenario.case import FloatArray
 
 UNIFORM_QUERIES: Final = 1500
 LOCAL_QUERIES: Final = 600
 BETWEEN_QUERIES: Final = 600
+WORST: Final = 20
 LINES: Final = 40
 LINE_STEPS: Final = 120
-"""Candidates of the surrogate: uniform, within LOCAL_REACH of a failure, between safe cases of the
-two merging orders, and on lines across the cube along the slope of the margin."""
+"""Candidates of the surrogate: uniform, within LOCAL_REACH of a failure (or of the WORST cases),
+between safe cases of the two merging orders, and on lines across the cube along the slope of what
+is learned."""
 LOCAL_REACH: Final = 2.0
 """Reach of candidates around a failure, in radii of the FMC."""
 REFINED_REACH: Final = 0.6
 """Reach of candidates around the best candidates, in radii of the FMC."""
 
 
-def of_belief(
-    history: LevelHistory, belief: Belief, rng: np.random.Generator, n: int
+def surrogate_candidates(
+    surrogate: FailureProbability, n: int, rng: np.random.Generator
 ) -> FloatArray:
     """Return more than `n` candidates, (m, d), of the surrogate alone."""
-    worst = history.points[np.argsort(history.margin, kind="stable")[:20]]
-    failing = history.points[history.failed]
-    local_reach = LOCAL_REACH * radius_for(history.dims)
-    along = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
-    base = rng.random((LINES, history.dims))
-    lines = base[:, None] + along[..., None] * belief.rotation[:, 0]
+    history = surrogate.history
+    centres = history.points[history.failed]
+    if not len(centres):
+        centres = history.points[np.argsort(history.margin, kind="stable")[:WORST]]
+    steps = np.linspace(-1.0, 1.0, LINE_STEPS) + rng.uniform(-0.01, 0.01, (LINES, LINE_STEPS))
+    lines = rng.random((LINES, 1, history.dims)) + steps[..., None] * surrogate.slope
     lines = lines.reshape(-1, history.dims)
     return np.concatenate(
         [
             rng.random((UNIFORM_QUERIES + n, history.dims)),
-            around(failing if len(failing) else worst, LOCAL_QUERIES, local_reach, rng),
-            between(belief, BETWEEN_QUERIES, rng),
+            around(centres, LOCAL_QUERIES, LOCAL_REACH * radius_for(history.dims), rng),
+            between(surrogate, BETWEEN_QUERIES, rng),
             lines[((lines >= 0.0) & (lines <= 1.0)).all(axis=1)],
         ]
     )
@@ -55,13 +56,13 @@ def around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -
     return np.clip(centres + reach * np.sqrt(rng.random((n, 1))) * direction, 0.0, 1.0)
 
 
-def between(belief: Belief, n: int, rng: np.random.Generator) -> FloatArray:
+def between(surrogate: FailureProbability, n: int, rng: np.random.Generator) -> FloatArray:
     """Return `n` points, (n, d), between safe cases of the two orders, most in narrow brackets.
 
     Empty, (0, d), without safe cases of both orders.
     """
-    points = belief.history.points
-    _, before, behind = (points[group] for group in belief.groups)
+    points = surrogate.history.points
+    _, before, behind = (points[group] for group in surrogate.groups)
     if not (len(before) and len(behind)):
         return np.empty((0, points.shape[1]))
     near = [*range(1, 1 + min(3, len(before), len(behind)))]

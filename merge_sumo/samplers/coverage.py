@@ -1,6 +1,6 @@
 """The default sampler: each batch maximises the expected new failure mode coverage.
 
-A case is worth P(fail) (`belief.py`) times the share of its ball (radius rho of the FMC) that is
+A case is worth P(fail) times the share of its ball (radius rho of the FMC) that is
 not covered yet. Candidates are uniform, near failures, and near where the merging order changes;
 the batch is picked from them greedily.
 """
@@ -8,25 +8,18 @@ the batch is picked from them greedily.
 from __future__ import annotations
 
 import math
-from functools import partial
 from typing import Final
 
 import numpy as np
 
-from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.summary import by_case
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.base_rate import BaseRate
-from merge_sumo.samplers.belief import Belief, Calibration, nearness
-from merge_sumo.samplers.candidates import REFINED_REACH, around, of_belief, spread_out
-from merge_sumo.samplers.gpr import exploiting
-from merge_sumo.samplers.greedy import EVEN_IF_COVERED, Proposal, covered_grid, greedy
-from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.prediction_skill import PredictionSkill, Predictor
-from merge_sumo.samplers.twin_guided import FEWEST, twin_guided_batch
-from merge_sumo.scenario.case import Case, FloatArray, to_unit
+from merge_sumo.samplers.batch import ROUNDS, LevelSearch
+from merge_sumo.samplers.candidates import spread_out
+from merge_sumo.samplers.greedy import Proposal
+from merge_sumo.samplers.predictor import gain_factor, model_weight
+from merge_sumo.scenario.case import Case, FloatArray
 
 FIRST_BATCH: Final = 10
 YOUNG: Final = 60
@@ -35,17 +28,11 @@ YOUNG_BATCH: Final = 5
 first outcomes change the next proposals most."""
 BATCHES: Final = ((100, 10, 5), (400, 20, 10), (math.inf, 40, 20))
 """Later batches: cases up to which a size holds, the size, and the least number per level."""
-REPLAYED: Final = 40
-"""Last cases of a level on which the predictor is evaluated."""
-REFINED_QUERIES: Final = 600
-BEST: Final = 150
-"""Candidates around the best ones, and the number of these."""
-SHORTLIST: Final = 2000
-"""Candidates among which the batch is picked."""
-NEAREST: Final = 3
-"""Fewest failures to aim at failures alone; otherwise as many nearest cases stand in for them."""
-PATIENCE: Final = 40
-"""Cases before near misses stand in for failures."""
+WORTHLESS: Final = 0.05
+JUDGED_FROM: Final = 40
+"""A model with less weight than that, after so many cases, proposes no candidates."""
+EMPTY_FROM: Final = 20
+"""Cases without a failure at a level from which every second one is of a space-filling sequence."""
 
 
 class CoverageSampler(Sampler):
@@ -66,18 +53,23 @@ class CoverageSampler(Sampler):
 
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
-            proposals = {level: self._propose(level, n) for level in self.pool.levels}
-        shares = self._shares(proposals, n)
-        self._predictions = [
-            prediction
-            for level, share in shares.items()
-            for prediction in proposals[level].predictions[:share]
-        ]
-        return [
-            case
-            for level, share in shares.items()
-            for case in self.pool.cases(proposals[level].points[:share], level)
-        ]
+            weight = model_weight(self.observed()) if self.predictor is not None else 0.0
+            searches = {
+                level: LevelSearch(
+                    self.history(level), self.pending(level), weight, self.rng(level)
+                )
+                for level in self.pool.levels
+            }
+            proposals = self._proposals(searches, weight, n)
+            chosen = {
+                level: proposals[level].points[:share]
+                for level, share in self._shares(proposals, n).items()
+            }
+            self._predictions = self._predicted(searches, chosen)
+        cases: list[Case] = []
+        for level, points in chosen.items():
+            cases += self.pool.cases(points, level)
+        return cases
 
     def prediction(self, place: int) -> Prediction | None:
         """Return the prediction of a case of the last batch, by its place in the batch."""
@@ -93,54 +85,72 @@ class CoverageSampler(Sampler):
         most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
         return max(most, a_level * levels)
 
-    def _propose(self, level: int, n: int) -> Proposal:
-        history, rng, pending = self.history(level), self.rng(level), self.pending(level)
-        few = len(history.points) < FEWEST
-        if self.predictor is None or not self.predictor.can_predict(level):
-            if few:
-                chance = np.ones(n)
+    def _proposals(
+        self, searches: dict[int, LevelSearch], weight: float, n: int
+    ) -> dict[int, Proposal]:
+        """Return a batch of `n` cases for each level."""
+        worthless = weight < WORTHLESS and len(self.observed()) >= JUDGED_FROM
+        guided = {}
+        for level, search in searches.items():
+            if self._is_modelled(level) and not (worthless and search.surrogate is not None):
+                guided[level] = search
+        self._guide(guided, n)
+        proposals = {}
+        for level, search in searches.items():
+            if level in guided:
+                proposal = search.batch(n)
+            elif search.surrogate is not None:
+                proposal = search.surrogate_batch(n)
+            else:
                 # The next points of the sequence that the pending ones began.
-                begun = len(pending)
-                told = self.proposed() - len(self._pending)
+                begun, told = len(search.pending), self.proposed() - len(self._pending)
                 rng = np.random.default_rng([self.seed, told, level])
-                spread = spread_out(begun + n, history.dims, rng)[begun:]
-                return Proposal(spread, chance, chance, (None,) * n)
-            return _LevelBatch(history, pending, rng, n).batch(n)
-        skill = self._skill(self.predictor, level)
-        base_rate = None
-        if skill.breaks_promises and not few:
-            base_rate = self._base_rate(level, history, pending, n)
-        if skill.is_worthless and not few:
-            batch = _LevelBatch(history, pending, rng, n).batch(n, base_rate)
-            return skill.annotated(batch, self.predictor.predict(level, batch.points))
-        return twin_guided_batch(self.predictor, history, pending, n, rng, level, skill, base_rate)
+                points = spread_out(begun + n, search.history.dims, rng)[begun:]
+                proposals[level] = Proposal(points, np.ones(n))
+                continue
+            outcomes, points = self.observed(level), proposal.points
+            if len(outcomes) >= EMPTY_FROM and not any(outcome.failed for outcome in outcomes):
+                begun, points = self.proposed(level), points.copy()
+                rng = np.random.default_rng([self.seed, level])
+                points[1::2] = spread_out(begun + n // 2, search.history.dims, rng)[begun:]
+            proposals[level] = Proposal(points, gain_factor(outcomes) * proposal.gain)
+        return proposals
 
-    def _base_rate(
-        self, level: int, history: LevelHistory, pending: FloatArray, n: int
-    ) -> BaseRate:
-        """Return the base rate of a level, with the sequence of its first batch."""
-        # A case is judged by what was predicted of its first run.
-        predictions = [case.outcomes[0].prediction for case in by_case(self.observed(level))]
-        errors = [
-            outcome.case
-            for outcome in self._outcomes.values()
-            if outcome.margin is None and outcome.case.level == level
-        ]
-        unknown = np.concatenate([pending, to_unit(errors, level, self.pool.scenario)])
-        begins = np.random.default_rng([self.seed, 0, level])
-        by_margin = partial(exploiting, history, pending)
-        return BaseRate(history, predictions, unknown, n, self.proposed(level), begins, by_margin)
+    def _guide(self, searches: dict[int, LevelSearch], n: int) -> None:
+        """Give searches their candidates, rolled out by the model at all levels together."""
+        if not searches or self.predictor is None:
+            return
+        points = {level: search.screened() for level, search in searches.items()}
+        gaps = self.predictor.predict(points, [self.proposed() % self.predictor.members])
+        for level, search in searches.items():
+            points[level] = search.first(points[level], gaps[level], n)
+        for round_ in range(1 + ROUNDS):
+            if round_:
+                points = {level: search.refined(n) for level, search in searches.items()}
+            gaps = self.predictor.predict(points)
+            for level, search in searches.items():
+                search.add(points[level], gaps[level])
 
-    def _skill(self, predictor: Predictor, level: int) -> PredictionSkill:
-        """Return the skill of the predictions so far, of all levels."""
-        last = self.observed(level)[-REPLAYED:]
-        replayed: dict[int, FloatArray] = {}
-        if last:
-            indices = [outcome.index for outcome in last]
-            points = to_unit((outcome.case for outcome in last), level, self.pool.scenario)
-            gaps = predictor.predict(level, points, held_out=indices)
-            replayed = dict(zip(indices, gaps.T, strict=True))
-        return PredictionSkill(self.observed(), level, self.pool.scenario.dx_crash_m, replayed)
+    def _is_modelled(self, level: int) -> bool:
+        return self.predictor is not None and self.predictor.can_predict(level)
+
+    def _predicted(
+        self, searches: dict[int, LevelSearch], chosen: dict[int, FloatArray]
+    ) -> list[Prediction | None]:
+        """Return the predictions of chosen cases by level, (n, d) each, as they are recorded."""
+        points = {level: of for level, of in chosen.items() if len(of) and self._is_modelled(level)}
+        gaps = self.predictor.predict(points) if self.predictor is not None and points else {}
+        predictions: list[Prediction | None] = []
+        for level, of_level in chosen.items():
+            if level not in points:
+                predictions += [None] * len(of_level)
+                continue
+            gaps_m = self.pool.scenario.dx_crash_m * gaps[level][None]
+            chances = searches[level].chances(of_level, gaps[level]).T.tolist()
+            for index, (by_model, by_surrogate, by_both) in enumerate(chances):
+                prediction = Prediction.of(gaps_m[..., index], by_model, by_surrogate, by_both)
+                predictions.append(prediction)
+        return predictions
 
     def _shares(self, proposals: dict[int, Proposal], n: int) -> dict[int, int]:
         """Return how many cases each level gets: half of them evenly, the rest by the next gain.
@@ -155,57 +165,3 @@ class CoverageSampler(Sampler):
             best = max(shares, key=lambda level: proposals[level].gain[shares[level]])
             shares[best] += 1
         return shares
-
-
-class _LevelBatch:
-    """One batch at one level."""
-
-    def __init__(
-        self, history: LevelHistory, pending: FloatArray, rng: np.random.Generator, n: int
-    ) -> None:
-        self._grid = covered_grid(history, pending)
-        limit, calibration = _limit(history), Calibration(history)
-        belief = Belief(history, limit)
-        candidates = of_belief(history, belief, rng, n)
-        aim, balls = (
-            calibration.of(belief.of(candidates), candidates),
-            self._grid.balls(candidates),
-        )
-        worth = aim * self._grid.new(balls)
-        best = candidates[np.argsort(-worth, kind="stable")[:BEST]]
-        refined = around(best, REFINED_QUERIES, REFINED_REACH * radius_for(history.dims), rng)
-        candidates = np.concatenate([candidates, refined])
-        aim = np.concatenate([aim, calibration.of(belief.of(refined), refined)])
-        balls = np.concatenate([balls, self._grid.balls(refined)])
-        worth = aim * (self._grid.new(balls) + EVEN_IF_COVERED)
-        kept = np.argsort(-worth, kind="stable")[: max(SHORTLIST, n)]
-        self._candidates, self._aim = candidates[kept], aim[kept]
-        self._calibration = calibration
-        self._belief = belief if limit is None else Belief(history)
-        self._above = self._aim
-        if limit is not None:
-            self._above = calibration.of(self._belief.of(self._candidates), self._candidates)
-
-    def batch(self, n: int, base_rate: BaseRate | None = None) -> Proposal:
-        """Return the greedy batch of `n` cases, with a base rate where its picks promise more."""
-        picks, gain = greedy(self._grid, self._candidates, self._aim, self._above, n)
-        points, unknown = self._candidates[picks], (None,) * n
-        batch = Proposal(points, gain, self._above[picks], unknown)
-        if base_rate is None:
-            return batch
-        following = base_rate.following
-        return base_rate.mixed(batch, Proposal(following, gain, self._chance(following), unknown))
-
-    def _chance(self, points: FloatArray) -> FloatArray:
-        """Return the calibrated P(fail) of points, (m, d), as (m,)."""
-        return self._calibration.of(self._belief.of(points), points)
-
-
-def _limit(history: LevelHistory) -> float | None:
-    """Return the gap, or the margin, that the search aims at; None for that of a failure.
-
-    With few failures, the nearest misses guide the search, as in subset simulation.
-    """
-    if history.ever_failed.sum() >= NEAREST or len(history.points) < PATIENCE:
-        return None
-    return float(np.partition(nearness(history), NEAREST - 1)[NEAREST - 1])

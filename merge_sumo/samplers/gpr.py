@@ -12,8 +12,7 @@ from scipy.linalg import solve_triangular
 from merge_sumo.samplers.allocation import last_failure_share, whole_shares
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.surrogate import most_telling
+from merge_sumo.samplers.history import LevelHistory, most_informative
 from merge_sumo.scenario.case import FloatArray
 
 QUERIES: Final = 4000
@@ -79,14 +78,6 @@ class GprSampler(LevelwiseSampler):
         return queries[picks]
 
 
-def exploiting(
-    history: LevelHistory, pending: FloatArray, queries: FloatArray, n: int
-) -> FloatArray:
-    """Return `n` of some queries, (n, d), where the process on the badness expects most."""
-    posterior = _Posterior(history, queries, pending)
-    return queries[[posterior.pick(*Z_EXPLOIT) for _ in range(n)]]
-
-
 class _Posterior:
     """The fitted surrogate at the queries, with a variance that knows the picks of the batch.
 
@@ -98,7 +89,7 @@ class _Posterior:
         queries = np.concatenate([queries, pending])
         self._queries = queries
         failures = history.points[history.failed]
-        history = most_telling(history, MAX_LEARNED)
+        history = most_informative(history, MAX_LEARNED)
         process = _fit(history)
         self._kernel, self._noise = process.kernel_, float(np.max(_noise(history)))
         cross = self._kernel(history.points, queries)

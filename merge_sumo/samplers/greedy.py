@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
@@ -26,14 +25,10 @@ class Proposal:
     Attributes:
         points: cases in the unit cube, (n, d).
         gain: expected new coverage of each, in balls, (n,).
-        probability: P(fail) of each, (n,).
-        predictions: of each case; None without a predictor.
     """
 
     points: FloatArray
     gain: FloatArray
-    probability: FloatArray
-    predictions: tuple[Prediction | None, ...]
 
 
 def covered_grid(history: LevelHistory, pending: FloatArray) -> CoverageGrid:

@@ -70,6 +70,11 @@ class LevelHistory:
         return np.asarray(self.failures / self.runs, dtype=np.float64)
 
     @property
+    def has_gaps(self) -> bool:
+        """Return whether the VUT gives trajectories."""
+        return not np.isnan(self.gap).all()
+
+    @property
     def ever_failed(self) -> NDArray[np.bool_]:
         """Return whether any run of a case failed, (N,)."""
         return self.failures > 0
@@ -82,3 +87,14 @@ class LevelHistory:
             if isinstance(values, np.ndarray):
                 chosen[column.name] = values[places]
         return replace(self, **chosen)
+
+
+def most_informative(history: LevelHistory, most: int) -> LevelHistory:
+    """Return at most `most` cases: half of them the worst ones, half spread over the rest."""
+    if len(history.points) <= most:
+        return history
+    order = np.argsort(history.margin, kind="stable")
+    half = most // 2
+    rest = np.sort(order[half:])
+    evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
+    return history.take(np.sort(np.concatenate([order[:half], rest[evenly]])))

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from merge_sumo.metrics.regression import regression_gaps
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.samplers.twin import Twin
+from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray
 
 
@@ -17,7 +17,9 @@ class TwinPair:
     learned from the same cases.
     """
 
-    def __init__(self, new: Twin, old: Twin) -> None:
+    members = ControllerModel.members
+
+    def __init__(self, new: ControllerModel, old: ControllerModel) -> None:
         """Take a twin of each version."""
         self._new, self._old = new, old
 
@@ -34,16 +36,8 @@ class TwinPair:
         return self._new.can_predict(level) and self._old.can_predict(level)
 
     def predict(
-        self,
-        level: int,
-        points: FloatArray,
-        *,
-        screening: int | None = None,
-        held_out: Sequence[int] = (),
-    ) -> FloatArray:
+        self, points: Mapping[int, FloatArray], members: Sequence[int] | None = None
+    ) -> dict[int, FloatArray]:
         """Return what stands for the gap of a regression in each case; see `Predictor`."""
-        new, old = (
-            twin.predict(level, points, screening=screening, held_out=held_out)
-            for twin in (self._new, self._old)
-        )
-        return regression_gaps(new, old)
+        new, old = self._new.predict(points, members), self._old.predict(points, members)
+        return {level: regression_gaps(new[level], old[level]) for level in points}

@@ -8,7 +8,7 @@ from merge_sumo.registry import Registry
 
 if TYPE_CHECKING:
     from merge_sumo.samplers.base import Sampler
-    from merge_sumo.samplers.prediction_skill import Predictor
+    from merge_sumo.samplers.predictor import Predictor
     from merge_sumo.scenario.case import Pool
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
@@ -27,11 +27,15 @@ from merge_sumo.simulation.povs import POLICIES, Povs
 
 Answer = Callable[[Inputs, NDArray[np.int64]], FloatArray]
 """Gives accelerations of the VUT, (R,), by inputs, (R, inputs), and the numbers of the cases."""
+FAR: Final = 5.0
+"""Distance behind M of all other cars, in units of the limit, from which a case cannot fail."""
+SLOWEST_MPS: Final = 0.5
+"""Speed at which a VUT that stands goes on, to estimate the gap of a case that cannot fail."""
 STILL: Final = 0.92
 """Share of rows that still move below which the others are dropped."""
 
 
-class TwinRollout:
+class ModelRollout:
     """Rolls cases of a pool out against a VUT that is given as a function."""
 
     def __init__(
@@ -59,7 +63,7 @@ class TwinRollout:
         known = level == 0 or level in self._networks
         return known and isinstance(self._scenario, MergeScenario) and not self._scenario.lane_m
 
-    def _starts(self, points: FloatArray, level: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
         scenario = self._scenario
         values = {
@@ -77,18 +81,25 @@ class TwinRollout:
             x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
         return x_m, v_mps, values.get("svo_rad", np.zeros(n))
 
-    def play(self, level: int, points: FloatArray, answer: Answer) -> FloatArray:
-        """Return the signed gaps of cases, (n, d), of a level: see `Outcome.signed_gap`, (n,).
+    def play(self, points: Mapping[int, FloatArray], copies: int, answer: Answer) -> FloatArray:
+        """Roll cases out; all step together, as arrays.
 
-        All step together, as arrays. NaN where the VUT never arrives.
+        Args:
+            points: cases of the unit cube by level, (n, d) each; N of all levels.
+            copies: how often each is rolled out.
+            answer: the VUT; rows 0 to N - 1 are the first copy of each case.
+
+        Returns:
+            Signed gaps (`Outcome.signed_gap`), (copies, N); NaN where the VUT never arrives.
         """
         if self._by_gap:
-            return self._play(level, points, answer) / self._scenario.dx_crash_m
+            gap_m = self._play(points, copies, answer)
+            return gap_m.reshape(copies, -1) / self._scenario.dx_crash_m
         played: list[FloatArray] = []
-        gap_m = self._play(level, points, answer, played)
-        motion = np.array(played)
-        found = np.empty(len(gap_m))
-        for row, case in enumerate(self._pool.cases(points, level)):
+        gap_m = self._play(points, copies, answer, played)
+        motion, gaps = np.array(played), np.empty(len(gap_m))
+        cases = [case for level, of in points.items() for case in self._pool.cases(of, level)]
+        for row, case in enumerate(cases * copies):
             arrived = motion[:, VUT, 0, row] >= 0.0
             last = int(arrived.argmax()) if arrived.any() else len(motion) - 1
             of_row = motion[: last + 1, :, :, row].copy()
@@ -96,10 +107,9 @@ class TwinRollout:
             end, after = End.TIMEOUT, None
             if not np.isnan(gap_m[row]):
                 end, after = End.MERGED, self._drives_on(of_row[-1])
-            found_of = Trajectory(case, of_row, end, after=after)
-            judged = self._criterion.judged(found_of, self._lines)
-            found[row] = judged.signed_gap
-        return found
+            trajectory = Trajectory(case, of_row, end, after=after)
+            gaps[row] = self._criterion.judged(trajectory, self._lines).signed_gap
+        return gaps.reshape(copies, -1)
 
     def _drives_on(self, at_m: FloatArray) -> FloatArray | None:
         """Predict the follow-up of a state at M, (A, 3): all keep their speeds for a reaction."""
@@ -110,15 +120,19 @@ class TwinRollout:
 
     def _play(
         self,
-        level: int,
-        points: FloatArray,
+        points: Mapping[int, FloatArray],
+        copies: int,
         answer: Answer,
         played: list[FloatArray] | None = None,
     ) -> FloatArray:
         """Return the gaps at M, (R,); add every step, (A, 3, R), to what is `played`."""
-        scenario, network = self._scenario, self._networks.get(level)
-        x_m, v_mps, svo_rad = self._starts(points, level)
-        rows = np.arange(len(points))
+        scenario = self._scenario
+        starts = [self._starts(level, of_level) for level, of_level in points.items()]
+        x_m, v_mps, svo_rad = (
+            np.tile(np.concatenate(of_all, axis=-1), copies) for of_all in zip(*starts, strict=True)
+        )
+        levels = np.tile(np.repeat(list(points), list(map(len, points.values()))), copies)
+        rows = np.arange(len(levels))
         gap_m = np.full(len(rows), np.nan)
         cars = [row for row in range(len(x_m)) if row != VUT]
         a_mps2 = np.zeros_like(x_m)
@@ -127,8 +141,12 @@ class TwinRollout:
         taken_m, decel = scenario.pov_length_m + scenario.min_gap_m, -scenario.a_min_mps2
         for step in range(scenario.max_steps):
             inputs = observation.see(x_m, v_mps, a_mps2[VUT])
-            if network is not None and step % DECISION_STEPS == 0:
-                held = self._decisions(network, x_m, v_mps, cars, svo_rad)
+            if step % DECISION_STEPS == 0:
+                for level, network in self._networks.items():
+                    of_level = np.flatnonzero(levels == level)
+                    if len(of_level):
+                        states = x_m[:, of_level], v_mps[:, of_level], svo_rad[of_level]
+                        held[:, of_level] = self._decisions(network, cars, *states)
             a_mps2[cars] = held
             if len(cars) > 1:
                 keep_safe(a_mps2, x_m, v_mps, taken_m, decel, scenario.tau_s)
@@ -141,18 +159,25 @@ class TwinRollout:
             if played is not None:
                 played.append(np.stack((x_before_m, v_mps, a_mps2), axis=1))
             v_mps = v_next
-            arrived = x_m[VUT] >= 0.0
-            if arrived.any():
-                gaps = x_m[cars][:, arrived] - x_m[VUT, arrived]
+            ended = x_m[VUT] >= 0.0
+            if played is None:
+                ended |= x_m[cars].min(axis=0) > FAR * scenario.dx_crash_m
+            if ended.any():
+                # Who has not arrived goes on at its speed.
+                left_s = np.maximum(-x_m[VUT, ended], 0.0) / np.maximum(
+                    v_mps[VUT, ended], SLOWEST_MPS
+                )
+                gaps = x_m[cars][:, ended] + v_mps[cars][:, ended] * left_s
+                gaps -= np.maximum(x_m[VUT, ended], 0.0)
                 nearest = np.abs(gaps).argmin(axis=0)
-                known = rows[arrived]
+                known = rows[ended]
                 fresh = np.isnan(gap_m[known])
                 gap_m[known[fresh]] = gaps[nearest, np.arange(gaps.shape[1])][fresh]
                 going = np.isnan(gap_m[rows])
                 if not going.any():
                     break
                 if played is None and going.mean() < STILL:
-                    rows, svo_rad = rows[going], svo_rad[going]
+                    rows, levels, svo_rad = rows[going], levels[going], svo_rad[going]
                     x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
                     held = held[:, going]
                     observation.keep(going)
@@ -163,9 +188,9 @@ class TwinRollout:
     def _decisions(
         self,
         network: QNetwork,
+        cars: list[int],
         x_m: FloatArray,
         v_mps: FloatArray,
-        cars: list[int],
         svo_rad: FloatArray,
     ) -> FloatArray:
         """Return what the cars of the mainline choose, (C, R), in states, (A, R)."""

@@ -40,8 +40,8 @@ def campaign(tmp_path_factory) -> tuple[Path, str]:
 
 def the_worst(arguments: list[str], case: str) -> list[str]:
     """Return the arguments with the case that the campaign named in the place of the page's."""
-    assert "22" in arguments
-    return [case if argument == "22" else argument for argument in arguments]
+    assert "27" in arguments
+    return [case if argument == "27" else argument for argument in arguments]
 
 
 def test_installing_is_all_that_comes_before():

@@ -16,15 +16,20 @@ from support.histories import history_of
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.belief import (
-    _calibrated,
-    what_is_learned,
+from merge_sumo.samplers.batch import (
+    NEAREST,
+    PATIENCE,
+    LevelSearch,
+    near_miss_limit,
 )
-from merge_sumo.samplers.coverage import NEAREST, PATIENCE, _LevelBatch, _limit
 from merge_sumo.samplers.coverage_grid import CoverageGrid
+from merge_sumo.samplers.failure_probability import (
+    FailureProbability,
+    fit_logistic,
+    learned_values,
+)
 from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.samplers.surrogate import Branches, Margin
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -122,9 +127,9 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
     gap = 10.0 * (points[:, 0] - 0.5)
     missing = np.where(points[:, 0] > 0.9, np.nan, gap)
     history = history_of(points, np.full(30, 0.99), failed=np.abs(gap) < 1.0, gap=missing)
-    values, low, high = what_is_learned(history)
+    values, _, _ = learned_values(history)
     assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(100.0 / 3.0) / np.arcsinh(1.0))
-    sure = Margin(points, values, low, high, rough=False).at(np.array([[0.5, 0.5], [0.97, 0.5]]))
+    sure = FailureProbability(history).predict(np.array([[0.5, 0.5], [0.97, 0.5]]))
     assert sure[0] > 0.5 > sure[1]
 
 
@@ -134,32 +139,6 @@ def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
     last = [o.case.level for o in outcomes if o.batch == 4]
     assert last.count(1) == 20, "5 of the half that is shared out evenly, and the other half"
     assert last.count(0) == last.count(2) == 5
-
-
-class TestTheBranches:
-    """A margin that comes up to `top` on the left of 0.5, and jumps to 3 on the right of it."""
-
-    @staticmethod
-    def chance(top: float) -> np.ndarray:
-        rng = np.random.default_rng(3)
-        points = rng.random((80, 2))
-        x = points[:, 0]
-        points = points[(x < 0.5) | (x > 0.54)]
-        x = points[:, 0]
-        values = np.where(x < 0.5, top - 8.0 * (0.5 - x), 3.0)
-        branches = Branches(points, values, Margin(points, values, -1.0, 1.0, rough=False))
-        left_out = branches.left_out()
-        assert left_out.shape == (len(points),)
-        assert left_out[x > 0.8].max() < 0.05
-        return branches.at(np.array([[0.47, 0.5], [0.2, 0.5], [0.9, 0.5]]))
-
-    def test_expect_no_failure_where_the_margin_jumps_over_it(self):
-        assert self.chance(top=-3.0).max() < 0.1
-
-    def test_expect_failures_where_one_side_comes_down_to_them_before_the_jump(self):
-        near, *far = self.chance(top=-0.3)
-        assert near > 0.7
-        assert max(far) < 0.05
 
 
 ONCE = np.ones(1, dtype=np.int64)
@@ -176,7 +155,7 @@ class TestTheCalibration:
         evidence, true = self.evidence(20_000), np.array([1.5, -1.0, 0.2, -0.3])
         luck = np.random.default_rng(9).random(len(evidence))
         failed = luck < 1.0 / (1.0 + np.exp(-evidence @ true))
-        assert _calibrated(evidence[None], failed, ONCE)[0][0] == pytest.approx(true, abs=0.08)
+        assert fit_logistic(evidence[None], failed, ONCE)[0][0] == pytest.approx(true, abs=0.08)
 
 
 @pytest.mark.parametrize("blind", [False, True], ids=["signed gap", "margin alone"])
@@ -186,9 +165,10 @@ def test_looks_where_cases_come_near_but_counts_on_failures_alone(blind):
     gap = 1.3 + 10.0 * points[:, 0]
     margin = 1.0 - 0.9 * np.exp(0.4 * (1.0 - gap))
     history = history_of(points, margin, gap=np.where(blind, np.nan, gap))
-    assert _limit(history) is not None
+    assert near_miss_limit(history) is not None
     enough = replace(history, failures=(np.arange(len(points)) < NEAREST).astype(np.int64))
-    assert _limit(enough) is None
-    proposal = _LevelBatch(history, np.empty((0, 2)), rng, 20).batch(20)
+    assert near_miss_limit(enough) is None
+    search = LevelSearch(history, np.empty((0, 2)), 0.0, rng)
+    proposal = search.surrogate_batch(20)
     assert np.median(proposal.points[:, 0]) < 0.1
     assert proposal.gain.sum() < 2.0

@@ -12,10 +12,9 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
-from merge_sumo.samplers.belief import learn_chance
+from merge_sumo.samplers.failure_probability import learn_chance
 from merge_sumo.samplers.history import bounded
 from merge_sumo.samplers.pair import TwinPair
-from merge_sumo.samplers.prediction_skill import PredictionSkill
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import evaluate
@@ -70,10 +69,8 @@ def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when
     pair.tell_old(old[:80], old_motions)
     regressions = [regression(*versions) for versions in zip(outcomes, old, strict=True)]
     for predictor, ran in ((twin, outcomes), (pair, regressions)):
-        gaps = predictor.predict(0, points[80:])
-        said = np.abs(np.median(gaps, axis=(0, 1))) < 1.0
+        gaps = predictor.predict({0: points[80:]})[0]
+        said = np.abs(np.median(gaps, axis=0)) < 1.0
         failed = np.array([outcome.failed for outcome in ran[80:]])
         assert failed.any()
         assert np.mean(said == failed) > 0.9
-        recorded = PredictionSkill([], 0, limit_m).prediction(gaps[..., 0], 0.5, 0.5, 0.5)
-        assert recorded.gaps_m == pytest.approx(limit_m * gaps[..., 0], abs=1e-4)

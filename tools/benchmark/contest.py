@@ -46,7 +46,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import decode
 from merge_sumo.result import Result
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.samplers.twin import Twin
+from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
@@ -225,7 +225,9 @@ def _search(
         sampler, predictor = sampler_class(task.sampler), None
         if sampler.uses_predictions:
             lines = centre_lines(plan.road)
-            predictor = Twin(pool, plan.povs, seed, criterion=plan.criterion, lines=lines)
+            predictor = ControllerModel(
+                pool, plan.povs, seed, criterion=plan.criterion, lines=lines
+            )
         return sampler(pool, seed, predictor)
 
     sampler = WatchedSampler(make, pool, seed, watch)

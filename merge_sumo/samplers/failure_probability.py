@@ -1,0 +1,232 @@
+"""Failure probability model of `coverage`: P(fail) of a case, from the outcomes so far.
+
+A case fails where the signed gap at M, in units of the scenario's limit, is within 1. Failures lie
+where the gap changes its sign, that is, where the merging order changes. There the gap may also
+jump, so that no case between the two sides fails.
+
+Two Gaussian processes on the gap (or on the margin, of a VUT that gives no trajectory), a smooth
+and a rough one, predict each case from all others, and are weighted by how well they do. Two
+corrections are fitted to these predictions. First, P(fail) of a case that is bracketed, with the
+nearest safe case of either merging order nearer than any failure, is multiplied by h / (h + w): h
+is the width of the bracket, w the typical width of what fails. That bisects the curve where the
+order changes, and gives up where the gap jumps. Then a logistic regression corrects the odds by the
+distances to the nearest failure and to that curve.
+
+Where runs of a case differ, P(fail) is that of a run: the processes learn a noise, too, and the
+corrections are fitted to k failures of n runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import expit, log_expit, logit, ndtr
+
+from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.prediction import NO_GAP
+from merge_sumo.samplers.gaussian_process import GaussianProcess
+from merge_sumo.samplers.history import LevelHistory, most_informative
+from merge_sumo.scenario.case import FloatArray
+
+MAX_LEARNED: Final = 500
+"""Cases that the process learns from; bounds the time per batch in a long campaign. The FMC
+after 1,100 cases of design2 at level 2 is .0207 and .0209 (seeds 1, 2); with 1000 .0208, .0214."""
+NEAR: Final = 0.005
+"""Distances below this count as this."""
+PRIOR_WEIGHTS: Final = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
+"""Prior mean and standard deviation of the weights of the log odds, of 1, and of the log distances
+to the nearest failure and to the curve."""
+NEWTON_STEPS: Final = 6
+WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
+LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
+"""Widths w that are tried, and prior mean and standard deviation of log w."""
+SURE: Final = 1e-3
+"""Probabilities are clipped this far from 0 and 1; also the smallest Newton step."""
+JUDGED_FROM: Final = 3
+"""Fewest failures, and fewest safe cases, for a published P(fail)."""
+
+
+class FailureProbability:
+    """P(fail) of the cases of a level.
+
+    Attributes:
+        history: what it was learned from.
+        groups: which cases failed, and which safe ones are of either merging order, each (N,).
+        slope: mean slope of the gap, or of the margin, (d,), of length 1.
+    """
+
+    def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
+        """Learn from a history; with a `limit`, all cases up to that gap (margin) count as failed.
+
+        Args:
+            history: outcomes of the level.
+            limit: None for the limit of the scenario.
+        """
+        if limit is not None:
+            failed = nearness(history) <= limit
+            history = replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
+        self.history = history
+        self.groups = _groups(history)
+        learned = most_informative(history, MAX_LEARNED)
+        values, *self._interval = learned_values(learned, limit)
+        distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
+        log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
+        self._fitted: list[tuple[GaussianProcess, float, FloatArray]] = []
+        posteriors = []
+        for rough in (False, True):
+            process = GaussianProcess(learned.points, values, rough=rough, noisy=history.varies)
+            lowered = _lowered(self._within(*process.leave_one_out()), distances, WIDTHS[:, None])
+            evidence = _evidence(lowered, distances, history.dims)
+            weights, posterior = fit_logistic(evidence, learned.failures, learned.runs)
+            best = int((posterior + log_prior).argmax())
+            self._fitted.append((process, float(WIDTHS[best]), weights[best]))
+            posteriors.append((posterior + log_prior)[best])
+        self._weights = np.exp(np.array(posteriors) - max(posteriors))
+        self.slope = process.rotation[:, 0]
+
+    def predict(self, points: FloatArray) -> FloatArray:
+        """Return P(fail) of a run of cases, (m, d), as (m,)."""
+        known = self.history.points
+        distances = [nearest(points, known[group]) for group in self.groups]
+        chances = []
+        for process, width, weights in self._fitted:
+            chance = _lowered(self._within(*process.predict(points)), distances, width)
+            chances.append(expit(_evidence(chance, distances, self.history.dims) @ weights))
+        return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
+
+    def _within(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
+        """Return the probability that a normal value is in the failing interval, (m,)."""
+        low, high = self._interval
+        deviation = np.sqrt(np.maximum(variance, 1e-12))
+        chance: FloatArray = ndtr((high - mean) / deviation) - ndtr((low - mean) / deviation)
+        return chance
+
+
+def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
+    """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
+
+    None with too few failures or too few safe cases.
+    """
+    if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
+        return None
+    return FailureProbability(history).predict
+
+
+def learned_values(
+    history: LevelHistory, limit: float | None = None
+) -> tuple[FloatArray, float, float]:
+    """Return what is learned, (N,), and the interval of it that means failure.
+
+    The signed gap in units of the limit, compressed like a logarithm where it is large: a
+    gap of 100 m says little more about failures than one of 50 m. Without gaps, the badness in
+    units of that at the limit.
+    """
+    if not history.has_gaps:
+        return np.minimum(history.badness / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
+    gap = np.nan_to_num(history.gap, nan=NO_GAP) / (limit or 1.0)
+    return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
+
+
+def nearness(history: LevelHistory) -> FloatArray:
+    """Return the size of the gap, or else the margin, (N,): the less, the nearer to a failure."""
+    if not history.has_gaps:
+        return history.margin
+    return np.abs(np.nan_to_num(history.gap, nan=NO_GAP))
+
+
+def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the distance of each point to the nearest of the others; 1 where there is none."""
+    if not len(others):
+        return np.ones(len(points))
+    return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
+
+
+def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
+    """Return which cases failed in a run, and which safe ones are of either order, each (N,).
+
+    Without a trajectory a safe case is of both merging orders.
+    """
+    failed = history.ever_failed
+    if not history.has_gaps:
+        return [failed, ~failed, ~failed]
+    pov_first = np.nan_to_num(history.gap, nan=NO_GAP) >= 0.0
+    return [failed, ~failed & ~pov_first, ~failed & pov_first]
+
+
+def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
+    """Return the distance of each point to the nearest of a group but itself; at most 1."""
+    distance = nearest(points, points[group])
+    if group.sum() > 1:
+        distance[group] = cKDTree(points[group]).query(points[group], k=2)[0][:, 1]
+    else:
+        distance[group] = 1.0
+    return np.minimum(distance, 1.0)
+
+
+def _lowered(
+    chance: FloatArray, distances: list[FloatArray], width: float | FloatArray
+) -> FloatArray:
+    """Return P(fail), lowered in a closed bracket of safe cases; (m,), or (W, m) for W widths."""
+    to_failing, before, behind = distances
+    bracket = before + behind
+    closed = to_failing > np.maximum(before, behind)
+    return np.where(closed, chance * bracket / (bracket + width), chance)
+
+
+def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> FloatArray:
+    """Return the inputs of the regression, (..., m, 4), by P(fail), (..., m)."""
+    to_failing, before, behind = distances
+    radius = radius_for(dims)
+    odds = logit(np.clip(chance, SURE, 1.0 - SURE))
+    columns = [odds, np.ones_like(odds)]
+    for distance in (to_failing, np.maximum(before, behind)):
+        log_distance = np.log((distance + NEAR) / (radius + NEAR))
+        columns.append(np.broadcast_to(log_distance, odds.shape))
+    return np.stack(columns, axis=-1)
+
+
+def fit_logistic(
+    evidence: FloatArray, failures: NDArray[np.integer | np.bool_], runs: NDArray[np.int64]
+) -> tuple[FloatArray, FloatArray]:
+    """Fit W logistic regressions at once, by Newton's method; a step that worsens one is halved.
+
+    Args:
+        evidence: inputs of each regression, (W, N, 4).
+        failures: number of failures, (N,), in so many
+        runs: (N,).
+
+    Returns:
+        Weights, (W, 4), and log posterior densities, (W,).
+    """
+    mean, deviation = PRIOR_WEIGHTS
+
+    def posterior(evidence: FloatArray, weights: FloatArray) -> FloatArray:
+        prior = -0.5 * np.square((weights - mean) / deviation).sum(axis=1)
+        odds = (evidence @ weights[..., None])[..., 0]
+        likelihood = failures * log_expit(odds) + (runs - failures) * log_expit(-odds)
+        return np.asarray(likelihood.sum(axis=1) + prior, dtype=np.float64)
+
+    weights = np.tile(mean, (len(evidence), 1))
+    best = posterior(evidence, weights)
+    active = np.arange(len(evidence))
+    for _ in range(NEWTON_STEPS):
+        inputs, now = evidence[active], weights[active]
+        chance = expit((inputs @ now[..., None])[..., 0])
+        slope = ((failures - runs * chance)[:, None] @ inputs)[:, 0] - (now - mean) / deviation**2
+        spread = (inputs * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ inputs
+        step = np.linalg.solve(spread + np.diag(deviation**-2.0), slope[..., None])[..., 0]
+        reached = posterior(inputs, now + step)
+        while (worse := (reached < best[active]) & (np.abs(step).max(axis=1) > SURE)).any():
+            step[worse] *= 0.5
+            reached[worse] = posterior(inputs[worse], now[worse] + step[worse])
+        better = reached > best[active]
+        active, now, reached = active[better], (now + step)[better], reached[better]
+        if not len(active):
+            break
+        weights[active], best[active] = now, reached
+    return weights, best
