@@ -71,6 +71,7 @@ from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
 from merge_sumo.errors import UserError, WorkersLostError, notice
 from merge_sumo.files import (
+    ScratchFolder,
     check_new,
     dated,
     link_latest,
@@ -103,7 +104,6 @@ from merge_sumo.scenario.scenario import (
     lane_of,
     level_name,
 )
-from merge_sumo.scratch import ScratchFolder
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import parse_levels, policies_folder

@@ -25,7 +25,7 @@ from numbers import Integral
 from typing import Any, Final, Generic, TypeVar
 
 from merge_sumo.errors import UserError, WorkersLostError, notice
-from merge_sumo.scratch import ScratchFolder
+from merge_sumo.files import ScratchFolder
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK: Final = 500

@@ -163,7 +163,7 @@ def test_files_are_removed_and_renamed_in_two_modules():
         for call in calls_in(file):
             if called(call) in removers or ast.unparse(call.func) in ("os.remove", "os.replace"):
                 removing.add(module)
-    assert removing == {"merge_sumo.files", "merge_sumo.scratch"}
+    assert removing == {"merge_sumo.files"}
 
 
 def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():

@@ -22,9 +22,9 @@ from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedErro
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
 from merge_sumo.errors import UserError
+from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import Left, as_signals
-from merge_sumo.scratch import ScratchFolder
 
 SUPPORTED: Final = os.name == "posix"
 """Elsewhere a controller runs in this process."""

@@ -23,10 +23,10 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.files import ScratchFolder
 from merge_sumo.limits import lower_limits
 from merge_sumo.printable import printable
 from merge_sumo.scenario.trajectory import as_reason
-from merge_sumo.scratch import ScratchFolder
 from merge_sumo.spawning import end_with, python_command
 
 LOG: Final = "controller.log"

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from merge_sumo.errors import UserError
+from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.scenario import DT_S
-from merge_sumo.scratch import ScratchFolder
 
 DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""

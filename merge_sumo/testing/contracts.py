@@ -20,13 +20,13 @@ import numpy as np
 from merge_sumo import api
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import load
+from merge_sumo.files import ScratchFolder
 from merge_sumo.metrics.measures import Measure
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.scratch import ScratchFolder
 
 __all__ = [
     "MeasureContract",

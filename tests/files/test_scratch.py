@@ -11,12 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from merge_sumo import scratch
-from merge_sumo.scratch import PREFIX, ScratchFolder
+from merge_sumo import files
+from merge_sumo.files import PREFIX, ScratchFolder
 
 BESIDE = (
     "import sys, time\n"
-    "from merge_sumo.scratch import ScratchFolder\n"
+    "from merge_sumo.files import ScratchFolder\n"
     "made = ScratchFolder()\n"
     "open(made.name + '/some', 'w').close()\n"
     "print(made.name, flush=True)\n"
@@ -28,8 +28,8 @@ BESIDE = (
 def temporary(tmp_path, monkeypatch):
     """Give an own folder for temporary files, in which this process has made nothing yet."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    monkeypatch.setattr(scratch, "YOUNG_S", 0.0)
-    scratch._remove_remains.cache_clear()
+    monkeypatch.setattr(files, "YOUNG_S", 0.0)
+    files._remove_remains.cache_clear()
     return tmp_path
 
 

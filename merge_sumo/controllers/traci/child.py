@@ -35,9 +35,9 @@ from merge_sumo.controllers.traci.protocol import (
 )
 from merge_sumo.controllers.traci.session import NotFiniteError, Session
 from merge_sumo.errors import UserError
+from merge_sumo.files import ScratchFolder
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.scenario import Scenario
-from merge_sumo.scratch import ScratchFolder
 from merge_sumo.sumo.binding import sumo_environment
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, State, write_files
 
