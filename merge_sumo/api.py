@@ -94,14 +94,12 @@ from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
 from merge_sumo.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.road.scenario_file import SUFFIX, spoken_name
-from merge_sumo.scenario.coordinates import outside_of_the_pool
+from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import (
     LEVELS,
     OWN,
     US23,
-    MergeScenario,
     Scenario,
-    lane_of,
     level_name,
 )
 from merge_sumo.simulation.evaluate import simulate
@@ -191,7 +189,7 @@ def resume(config: c.Resume) -> CampaignRun:
     if config.level != "all":
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
-        levels = parse_levels(config.level, policies, settings.scenario.levels, own=own)
+        levels = parse_levels(config.level, policies, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
     return run_and_report(settings, resolve(settings), folder, where, config, resumes=True)
@@ -590,11 +588,10 @@ def run_and_report(
             )
             result = CampaignRun(done, config.gates)
             plan = replace(plan, against=None)
-            if isinstance(plan.scenario, MergeScenario):  # careful drivers are models of merges
-                on_part = partial(bars.counted, "careful drivers", unit="failures")
-                known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
-                if known:
-                    AVOIDANCE.write_lines(folder, known)
+            on_part = partial(bars.counted, "careful drivers", unit="failures")
+            known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
+            if known:
+                AVOIDANCE.write_lines(folder, known)
             on_part = partial(bars.counted, "uniform starts", unit="cases")
             note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
             note_explanation(done, plan, check)
@@ -615,8 +612,7 @@ def run_and_report(
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
     """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT."""
-    levels = set(LEVELS) & set(settings.scenario.levels)
-    if config.level == "all" and not levels <= set(settings.levels):
+    if config.level == "all" and not set(LEVELS) <= set(settings.levels):
         present = ", ".join(map(level_name, settings.levels))
         notice(
             f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
@@ -631,7 +627,7 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Camp
             f"{f': {check} says in what it differs' if name else ''}"
         )
     own, by_sumo = plan.povs.own, plan.vut.vut_type is not None
-    on_lane = OWN in settings.levels and lane_of(settings.scenario) is not None
+    on_lane = OWN in settings.levels and settings.scenario.lane_m is not None
     if on_lane and own is not None and own.vut_type is not None and not by_sumo:
         # SUMO's drivers make room for a car next to them where its lane-change model asks them to.
         notice(

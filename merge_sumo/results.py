@@ -35,7 +35,7 @@ from merge_sumo.reports.facts import Fact, facts_of, headline
 from merge_sumo.reports.text import comparison_headline, episode_lines, transitions
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 

@@ -30,7 +30,7 @@ from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
-from merge_sumo.scenario.scenario import DT_S, US23, Bounds, as_merge
+from merge_sumo.scenario.scenario import DT_S, US23, Bounds
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.rollout import Rollout
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     add_record_option(parser)
     arguments = parser.parse_args()
-    scenario = as_merge(named_scenario("us23-lane"))
+    scenario = named_scenario("us23-lane")
     assert scenario.lane_m is not None, "a lane"  # noqa: S101
     points = np.random.default_rng(arguments.seed).random((arguments.cases, 2))
     cases = from_unit(points, 1, scenario=scenario)

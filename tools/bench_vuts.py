@@ -38,13 +38,13 @@ from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.road.merge import road_of
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
 
 STEPS = 80
 """Of an episode."""
-CASE = MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
 LAW = """
 class Vut:
     def act(self, seen):

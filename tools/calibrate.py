@@ -37,12 +37,12 @@ from merge_sumo.drivers.policies import load_driver, policies_of
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.metrics.fmc import RADIUS, fmc, regions
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, FloatArray, MergeCase, from_unit, to_unit
+from merge_sumo.scenario.case import Case, FloatArray, from_unit, to_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 
-YIELDING = MergeCase(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
+YIELDING = Case(level=1, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 """The first example run of the paper."""
-STALEMATE = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
+STALEMATE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
 """The second and the third."""
 
 

@@ -20,9 +20,8 @@ from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, MergeCase
-from merge_sumo.scenario.colours import COLOURS
-from merge_sumo.scenario.scenario import DT_S, US23, Scenario
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import COLOURS, DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -57,7 +56,7 @@ def _case(
     **headways_s: Any,
 ) -> Case:
     """Return a case with the VUT's own speed in its scenario."""
-    return MergeCase(
+    return Case(
         level=level,
         x_pov0_m=x_pov0_m,
         v_pov0_mps=v_pov0_mps,

@@ -16,14 +16,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import Measures, Outcome, record_fields
-from merge_sumo.records import (
-    Record,
-    convert,
-    read_toml,
-    to_json,
-)
-from merge_sumo.scenario.coordinates import outside_of_the_pool
-from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.records import Record, convert, read_toml, to_json
+from merge_sumo.scenario.case import outside_of_the_pool
+from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import POLICIES
 
@@ -54,7 +49,7 @@ class CasesFile(Run):
         line: dict[str, Any] = {}
         try:
             head = convert(record, Head)
-            scenario = scenario_of_record(head.scenario)
+            scenario = convert(head.scenario, Scenario)
             if "/" in (scenario.net or ""):
                 scenario = replace(scenario, net=str((path.parent / str(scenario.net)).resolve()))
             self.criterion = Criterion(head.fail_when, head.require)
@@ -76,7 +71,7 @@ class CasesFile(Run):
         """Add the case of a line; raise `UserError` where it is none."""
         if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
             raise UserError("it has a number that is not finite")
-        usual = Measures(end=End(self.scenario.ends_as), t_end_s=0.0)
+        usual = Measures(end=End.MERGED, t_end_s=0.0)
         names = (name for of in record_fields(self.scenario)[:2] for name in of)
         unsaid = {name: getattr(usual, name, None) for name in names} | {"batch": 0}
         unsaid["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]

@@ -44,8 +44,7 @@ from merge_sumo.metrics.summary import (
 )
 from merge_sumo.records import Record, to_plain
 from merge_sumo.result import Result
-from merge_sumo.scenario.case import Case, to_unit
-from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.case import Case, coordinates, to_unit
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.scenario.trajectory import Trajectory
 

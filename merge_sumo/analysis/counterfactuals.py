@@ -39,7 +39,7 @@ from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import either
 from merge_sumo.records import Record
 from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.scenario.case import Case, FloatArray, MergeCase
+from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, EpisodeTime, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.evaluate import opened_simulator
@@ -158,7 +158,7 @@ def avoidance(
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class _Counterfactual(MergeCase):
+class _Counterfactual(Case):
     """A failing case with another driver.
 
     Attributes:

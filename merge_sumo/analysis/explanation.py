@@ -30,8 +30,7 @@ from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import Record, replaced, to_plain
 from merge_sumo.result import Result
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.case import Case, coordinates
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan

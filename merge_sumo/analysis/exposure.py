@@ -27,7 +27,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
 from merge_sumo.records import Record, convert, decode, read_toml, record_type, to_plain
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import Dimension, Scenario, as_merge
+from merge_sumo.scenario.scenario import Dimension, Scenario
 
 Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[
@@ -217,7 +217,7 @@ class Traffic(Record, frozen=True):
             UserError: where the scenario has no coordinates of a single car of the mainline, or
                 the pool next to no speeds of this traffic.
         """
-        merge = as_merge(scenario)
+        merge = scenario
         if merge.vehicles > 2:
             raise UserError(
                 f"{merge.name} has cars ahead of the POV and behind it, at headways of its own: a "
@@ -243,7 +243,7 @@ class Traffic(Record, frozen=True):
 
     def cars_in_pool(self, scenario: Scenario) -> float:
         """Return how many cars of the mainline, per merge, start in the pool of a scenario."""
-        low_m, high_m = as_merge(scenario).x_pov0_m
+        low_m, high_m = scenario.x_pov0_m
         return self.density_veh_per_km / 1000.0 * (high_m - low_m) * self.share_in_pool(scenario)
 
 

@@ -21,7 +21,7 @@ from merge_sumo.result import Shown
 from merge_sumo.road.drawing import road_svg
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
-from merge_sumo.scenario.scenario import MergeScenario, Scenario
+from merge_sumo.scenario.scenario import Scenario
 
 
 def shipped() -> Shown:
@@ -31,7 +31,7 @@ def shipped() -> Shown:
     for name, scenario in known.items():
         x, v = scenario.dimensions(0)[:2]
         line = f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
-        if isinstance(scenario, MergeScenario) and scenario.lane_m is not None:
+        if scenario.lane_m is not None:
             line += "; acceleration lane from {:g} to {:g} m".format(*scenario.lane_m)
         lines.append(line)
     return Shown({name: scenario.to_record() for name, scenario in known.items()}, lines)
@@ -69,7 +69,7 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
     found = road_for(scenario)
     road, differing = about(found), unseen(scenario, policies)
     warnings, lines = lane_warnings(scenario, found), list[str]()
-    if isinstance(scenario, MergeScenario) and differing:
+    if differing:
         made = quoted(f"{scenario.name}-policies")
         lines = [
             "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
@@ -77,7 +77,7 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
             f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
             f"then name it to campaigns with `policies`: {made}",
         ]
-    elif isinstance(scenario, MergeScenario):
+    else:
         lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or like ones"]
     said = [*road, *(f"warning: {sentence}" for sentence in warnings), *lines]
     return Shown({"about": road, "warnings": warnings, "unseen": differing}, said)

@@ -22,7 +22,7 @@ from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.result import Result, Shown
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
-from merge_sumo.scenario.scenario import DT_S, US23, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
@@ -201,7 +201,7 @@ def _not_numbers(ground: Simulator, case: Case) -> list[str]:
     nothing = np.full((vehicles, corridors), np.nan)
     ground.vut.begin(0, case)
     step = np.zeros(corridors, dtype=np.int64)
-    merged = None if lane_of(case.scenario) is None else np.zeros(corridors, dtype=bool)
+    merged = None if case.scenario.lane_m is None else np.zeros(corridors, dtype=bool)
     scene = Scene(
         active, step, nothing, nothing, facing=step if vehicles > 2 else None, merged=merged
     )

@@ -46,7 +46,7 @@ def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPla
         options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
     vut = load(settings.vut, options)
     own = None if settings.pov is None else own_pov(settings.pov, options)
-    povs = Povs(policies=policies, own=own, scenario_levels=settings.scenario.levels)
+    povs = Povs(policies=policies, own=own)
     for level in settings.levels:
         povs.check_level(level)
     return SimulationPlan(
@@ -128,7 +128,7 @@ def settings_for(
         fields["stop_when_converged"] = True
     scenario, own = fields["scenario"], config.pov is not None
     folder = policies_folder(config.policies, scenario)
-    fields["levels"] = parse_levels(config.level, folder, scenario.levels, own=own)
+    fields["levels"] = parse_levels(config.level, folder, own=own)
     return _new_settings(fields | search), where
 
 
@@ -169,7 +169,7 @@ def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, 
     level = int(row.get("level", 0))
     if config.level is not None:
         folder, own = policies_folder(config.policies, scenario), config.pov is not None
-        level = one_level(str(config.level), folder, scenario.levels, own=own)
+        level = one_level(str(config.level), folder, own=own)
     fields |= {**ONE, "levels": (level,)}
     recorded = None if run is None else settings_of(run.folder, run.record, fields)
     settings = recorded or _new_settings(fields)
@@ -195,7 +195,7 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     Raises:
         UserError: a coordinate is missing or unknown, or a value is out of range.
     """
-    given: dict[str, float] = {}
+    given: dict[str, Any] = {}
     for name, value in values.items():
         if name not in scenario.notation and name != "v_vut0_mps":
             raise UserError(f"a case has no {name}: it has {', '.join(scenario.notation)}")
@@ -219,8 +219,7 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
             f"{_option(name)} is none of the coordinates of {scenario.name} at level "
             f"{level_name(level)}: leave it out"
         )
-    case: Case = scenario.case_type(level=level, scenario=scenario, **given)
-    return case
+    return Case(level=level, scenario=scenario, **given)
 
 
 def _option(name: str) -> str:

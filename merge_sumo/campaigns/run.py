@@ -33,7 +33,6 @@ from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import Record, RecordError, convert, decode, read_arrays, read_indexed
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
@@ -340,7 +339,7 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
     """Return the scenario of a campaign, the paper's where it names none."""
     recorded = settings.get("scenario")
     try:
-        return US23 if recorded is None else scenario_of_record(recorded)
+        return US23 if recorded is None else convert(recorded, Scenario)
     except UserError as error:
         raise UserError(f"{path} has no scenario: {error}") from error
 

@@ -12,16 +12,7 @@ import numpy as np
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
 from merge_sumo.road.corridor import MAX_LANE_M, MIN_LANE_M, Corridor, LanePath, lane_around_m
-from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import (
-    MAX_EPISODE_S,
-    US23,
-    V_VUT0_MPS,
-    Bounds,
-    MergeScenario,
-    Scenario,
-    as_merge,
-)
+from merge_sumo.scenario.scenario import MAX_EPISODE_S, US23, V_VUT0_MPS, Bounds, Scenario, Units
 
 MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""
@@ -84,7 +75,7 @@ def kind_of_merge(road: Corridor) -> list[str]:
     return lines
 
 
-def suggested(road: Corridor, name: str) -> MergeScenario:
+def suggested(road: Corridor, name: str) -> Scenario:
     """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
 
     The VUT starts as far from M as in the paper, or as the ramp allows, and before an acceleration
@@ -209,17 +200,15 @@ def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
     measure in the units of the scenario that they play, so what counts is what its numbers are like
     in the one that they were trained for. Outside, levels 1 and 2 are extrapolations.
     """
-    if not isinstance(scenario, MergeScenario):
-        return []
     folder = policies or policies_of(scenario)
     trained = {scenario_of(entry) for entry in read_manifest(folder).values()}
     if not trained:
         return [f"{folder} has no learned drivers"]
-    found = [sentence for known in trained for sentence in _differences(scenario, as_merge(known))]
+    found = [sentence for known in trained for sentence in _differences(scenario, known)]
     return list(dict.fromkeys(found))
 
 
-def _differences(scenario: MergeScenario, trained: MergeScenario) -> list[str]:
+def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
     """Return the numbers of a scenario that are not like those of training, in sentences."""
     unit, known = Units.of(scenario), Units.of(trained)
     length, speed, gap = (

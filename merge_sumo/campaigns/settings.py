@@ -27,6 +27,7 @@ from merge_sumo.samplers.predictor import Predictor
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import (
+    ALL_LEVELS,
     DEADLINE_S,
     MEMORY_GIB,
     OWN,
@@ -86,8 +87,8 @@ class CampaignSettings(Search):
     def _check_levels(self) -> None:
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
-        if not set(self.levels) <= set(self.scenario.levels):
-            known = ", ".join(map(level_name, self.scenario.levels))
+        if not set(self.levels) <= set(ALL_LEVELS):
+            known = ", ".join(map(level_name, ALL_LEVELS))
             raise UserError(f"the levels are {list(self.levels)}: choose from {known}")
         if OWN in self.levels and self.pov is None:
             raise UserError("level own is that of a POV of your own: name one as `pov`")

@@ -14,7 +14,7 @@ from merge_sumo.controllers.deadline import Deadline, closed, text_of
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
 from merge_sumo.drivers.following import car_met
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, POV, VUT, Bounds, lane_of
+from merge_sumo.scenario.scenario import DT_S, POV, VUT, Bounds
 from merge_sumo.scenario.signals import Left
 
 
@@ -161,7 +161,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
             seed=case.told_seed,
             a_min_mps2=float(scenario.a_min_mps2),
             a_max_mps2=float(scenario.a_max_mps2),
-            lane_m=lane_of(scenario),
+            lane_m=scenario.lane_m,
             met=met,
             x_m=tuple(x_m.tolist()),
             v_mps=tuple(v_mps.tolist()),

@@ -13,7 +13,7 @@ from merge_sumo.drivers.lane import acc_mps2, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, US23, VUT, lane_of
+from merge_sumo.scenario.scenario import DT_S, US23, VUT
 
 END_MARGIN_M: Final = 1.0
 """It stands so far before the end of the lane."""
@@ -69,7 +69,7 @@ class GapChoiceVut(Level0Vut):
         """Take the profile, the lane and the lengths of the case's scenario."""
         super().begin(corridor, case)
         scenario = case.scenario
-        self._lane_m[:, corridor] = lane_of(scenario) or (0.0, 0.0)
+        self._lane_m[:, corridor] = scenario.lane_m or (0.0, 0.0)
         self._pov_length_m[corridor] = scenario.pov_length_m
         self._vut_length_m[corridor] = scenario.vut_length_m
         if self._before_mps is not None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, Driver, DriverWrapper, Scene
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, OWN, US23, VUT, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, OWN, US23, VUT, Scenario
 
 RECOVERY_MPS2: Final = 1.0
 """Acceleration with which a POV comes back to the speed at which it started."""
@@ -127,7 +127,7 @@ class LanePov(DriverWrapper):
         """Take the first speed of a car, and the lane of its scenario."""
         scenario = case.scenario
         self._v_first_mps[corridor] = case.v_pov0_mps
-        self._end_m[corridor] = (lane_of(scenario) or (0.0, 0.0))[1]
+        self._end_m[corridor] = (scenario.lane_m or (0.0, 0.0))[1]
         self._pov_length_m[corridor] = scenario.pov_length_m
         self._vut_length_m[corridor] = scenario.vut_length_m
         self._is_own[corridor] = case.level == OWN
@@ -164,7 +164,7 @@ class Merging:
 
     def __init__(self, corridors: int, scenario: Scenario) -> None:
         """Take the lane of a scenario, and what its end does to a VUT."""
-        self.begin_m, self.end_m = lane_of(scenario) or (0.0, 0.0)
+        self.begin_m, self.end_m = scenario.lane_m or (0.0, 0.0)
         self._stops = getattr(scenario, "lane_end", "merge") == "stop"
         self._scenario = scenario
         self.merged = np.zeros(corridors, dtype=np.bool_)

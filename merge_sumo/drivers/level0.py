@@ -44,19 +44,11 @@ def level0_time_to(
 
 
 class Level0Pov(Driver):
-    """Keeps the acceleration that its case gives it; at a merge that is 0."""
-
-    def __init__(self, corridors: int) -> None:
-        super().__init__(corridors)
-        self._a_mps2 = np.zeros(corridors)
-
-    def begin(self, corridor: int, case: Case) -> None:
-        """Take the acceleration of a case."""
-        self._a_mps2[corridor] = case.level0_pov_mps2
+    """Keeps its speed."""
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the accelerations, (K,)."""
-        return self._a_mps2.copy()
+        """Return no acceleration, (K,)."""
+        return np.zeros(self.corridors)
 
 
 class Level0Vut(Driver):

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import US23, Scenario
+from merge_sumo.scenario.scenario import US23, Scenario, Units
 
 BRAKING: Final = (1.0, 0.75, 0.5, 0.25)
 """Shares of the hardest braking that a learned driver chooses from,"""

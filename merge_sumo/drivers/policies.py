@@ -15,7 +15,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import read_limited, resource
 from merge_sumo.printable import quoted
 from merge_sumo.records import Record, convert, decode
-from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import US23, Scenario
 
 MANIFEST: Final = "manifest.json"
@@ -120,13 +119,12 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
     record = entry.get("scenario", scenario_record(US23))
     if not set(convert(record, dict[str, Any])) <= {"name", *PLAYED, *LIMITS}:
         raise UserError("the scenario of a policy is a table of its numbers")
-    return scenario_of_record(record)
+    return convert(record, Scenario)
 
 
 def plays_as(one: Scenario, other: Scenario) -> bool:
     """Return whether a driver learns the same in two scenarios."""
-    numbers = [[getattr(scenario, name, None) for name in PLAYED] for scenario in (one, other)]
-    return one.kind == other.kind and numbers[0] == numbers[1]
+    return all(getattr(one, name) == getattr(other, name) for name in PLAYED)
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:

@@ -20,7 +20,7 @@ X, V = range(2)
 
 def far_m(scenario: Scenario) -> float:
     """Return the place, out of the way, of a car that a VUT does not see."""
-    ahead = 1.0 if scenario.pov_edges == scenario.vut_edges else -1.0
+    ahead = 1.0 if scenario.mainline == scenario.ramp else -1.0
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
 

@@ -22,18 +22,8 @@ import numpy as np
 
 from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.metrics.summary import message_of
-from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.coordinates import Coordinate, coordinates
-from merge_sumo.scenario.scenario import (
-    AHEAD,
-    BEHIND,
-    DT_S,
-    POV,
-    VEHICLES,
-    VUT,
-    MergeScenario,
-    Scenario,
-)
+from merge_sumo.scenario.case import Case, Coordinate, FloatArray, coordinates
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 BRAKED_MPS: Final = 1.0
@@ -151,15 +141,13 @@ def _due_s(row: int, case: Case) -> float:
 def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
     """Return the axes in which regions of a level are bounded.
 
-    Of a merge it is beside the coordinates the time at which a car would reach M at constant speed:
+    Besides the coordinates it is the time at which a car would reach M at constant speed:
     failures lie in bands along which it is the same.
     """
     own = [
         Feature(c.name, c.unit, DECIMALS.get(c.unit, c.digits), partial(_value, c))
         for c in coordinates(scenario, (level,))
     ]
-    if not isinstance(scenario, MergeScenario):
-        return tuple(own)
     due = [
         Feature(f"{NAMED[row]} due at M (at constant speed)", "s", 2, partial(_due_s, row))
         for row in range(scenario.vehicles)
@@ -290,8 +278,6 @@ def _happened(outcome: Outcome, trajectory: Trajectory | None) -> str:
     if found.impact_speed_mps is not None:
         became += f" at a relative speed of {found.impact_speed_mps:.1f} m/s"
     conduct = "" if course is None else f"{_conduct(course, met(found))}, and "
-    if found.end is End.COMPLETED:
-        return f"{became}: {conduct}the episode ends at {at}"
     if found.end is End.TIMEOUT:
         return f"{became}: {conduct}{message_of(outcome)}"
     reaches = "reaches M"
@@ -317,7 +303,7 @@ def _conduct(course: Diagnosis, other: str) -> str:
 def _way_out(outcome: Outcome) -> str:
     """Return until when the VUT could avoid that front bumpers are close, in a clause."""
     found, scenario = outcome.measures, outcome.case.scenario
-    if not outcome.failed or found.avoidable is None or not isinstance(scenario, MergeScenario):
+    if not outcome.failed or found.avoidable is None:
         return ""
     if found.last_avoidable_s is None:
         kept = f"{scenario.dx_crash_m:g} m at {scenario.place}"

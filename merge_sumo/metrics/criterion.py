@@ -30,7 +30,7 @@ from merge_sumo.metrics.score import (
 )
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
 from merge_sumo.printable import nearest, printable
-from merge_sumo.scenario.scenario import VEHICLES, VUT, MergeScenario, Scenario, lane_of
+from merge_sumo.scenario.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 PAPER: Final = "paper"
@@ -105,11 +105,6 @@ class Criterion:
 
         Also where it is no formula, or what evaluates one is missing.
         """
-        if self.is_papers and not isinstance(scenario, MergeScenario):
-            raise UserError(
-                f"`fail_when` {PAPER} is of merges, and {scenario.name} is of kind "
-                f"{scenario.kind}: choose {scenario.criterion}, or a condition"
-            )
         if self.require is not None:
             try_formula(self.require)
             return
@@ -120,7 +115,7 @@ class Criterion:
                 f"`fail_when` speaks of {min(named)}, which is measured {where}: say how long "
                 "with `follow_up_s` SECONDS"
             )
-        if lane_of(scenario) is None and (named := spoken.intersection(ON_LANE)):
+        if scenario.lane_m is None and (named := spoken.intersection(ON_LANE)):
             raise UserError(
                 f"`fail_when` speaks of {min(named)}, and {scenario.name} has no acceleration "
                 "lane: choose a scenario with one, such as us23-lane"
@@ -181,7 +176,7 @@ class Criterion:
 
     def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
         """Return the verdict on an episode, the same as that of its outcome."""
-        if self.is_papers and trajectory.case.scenario.measures is None:
+        if self.is_papers:
             # The score of a merge takes less time than all of its measures.
             found = CaseVerdict(margin_of(merge_score(trajectory)), trajectory.end.is_tested)
             return found._replace(is_tested=found.is_tested or found.failed)

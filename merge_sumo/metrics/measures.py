@@ -45,11 +45,11 @@ class Measure:
 
     def label_in(self, scenario: Scenario) -> str:
         """Return its name in the listing of an episode of a scenario."""
-        return scenario.said(scenario.measure_labels.get(self.name, self.label))
+        return scenario.said(self.label)
 
     def title_in(self, scenario: Scenario) -> str:
         """Return name and unit, as the head of a column of a scenario shows them."""
-        name = scenario.said(scenario.measure_labels.get(self.name, self.column))
+        name = scenario.said(self.column)
         return f"{name} {self.unit}".replace("s2", "s²").rstrip()
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import DT_S, VUT, MergeScenario, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 REACTION_S: Final = 0.75
@@ -58,7 +58,7 @@ def neighbours(trajectory: Trajectory) -> list[tuple[float, float]]:
 
 def place_of_merge_m(trajectory: Trajectory) -> float:
     """Return where the VUT merges: at M, or where it left the acceleration lane."""
-    on_road = lane_of(trajectory.case.scenario) is not None
+    on_road = trajectory.case.scenario.lane_m is not None
     return float(trajectory.x_vut_m[-1]) if on_road else 0.0
 
 
@@ -68,7 +68,7 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     There are none without an acceleration lane: ramp and mainline have the same lanes behind M.
     """
     merged = np.zeros(len(trajectory.whole), dtype=np.bool_)
-    leaves = lane_of(trajectory.case.scenario) is not None and trajectory.end is End.MERGED
+    leaves = trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED
     merged[len(trajectory.motion) - 1 :] = leaves
     return merged
 
@@ -79,7 +79,7 @@ def on_lane(trajectory: Trajectory) -> dict[str, float | None]:
     The place of the merge and its share of the lane, the bumper gaps and time gaps to the cars
     ahead of and behind the VUT at that moment, and for how long it stood on the lane.
     """
-    scenario, lane_m = trajectory.case.scenario, lane_of(trajectory.case.scenario)
+    scenario, lane_m = trajectory.case.scenario, trajectory.case.scenario.lane_m
     if lane_m is None:
         return {}
     before = trajectory.motion[:, VUT]
@@ -188,8 +188,6 @@ class Severity(StrEnum):
 
 def meanings(scenario: Scenario) -> dict[Severity, str]:
     """Return what the words mean in a scenario."""
-    if not isinstance(scenario, MergeScenario):
-        return {Severity.CONTACT: "bodies touch", Severity.SAFE: "no contact"}
     soon = f"within {scenario.follow_up_s:g} s after"
     found = {
         Severity.CONTACT: f"bodies touch at M or {soon} it",
@@ -256,7 +254,7 @@ class Conflict(NamedTuple):
         """Find it in what happened."""
         scenario = trajectory.case.scenario
         merges = len(trajectory.motion) - 1 if trajectory.end is End.MERGED else None
-        in_one_lane = scenario.vut_edges == scenario.pov_edges
+        in_one_lane = scenario.ramp == scenario.mainline
         return cls.find(trajectory.whole, 0 if in_one_lane else merges, scenario.lengths_m)
 
     def begin(self, from_s: float | None) -> tuple[int, list[str]]:

@@ -41,15 +41,7 @@ from merge_sumo.metrics.merge import (
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.records import convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import (
-    DT_S,
-    POV,
-    VEHICLES,
-    VUT,
-    Scenario,
-    Vehicle,
-    lane_of,
-)
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory, as_reason
 
 FAILURE_SCORE: Final = -500.0
@@ -256,7 +248,7 @@ class Outcome:
         case_names, measure_names, flat = record_fields(scenario)
         known = convert(decode(line), flat)
         coordinates = {name: getattr(known, name) for name in case_names}
-        case = scenario.case_type(**coordinates, draw=known.draw, scenario=scenario)
+        case = Case(**coordinates, draw=known.draw, scenario=scenario)
         measures = Measures(
             **{name: getattr(known, name) for name in measure_names},
             further=with_values({name: getattr(known, name) for name in further_measures()}),
@@ -275,29 +267,28 @@ ON_LANE: Final = (
 
 def measures_in(scenario: Scenario) -> list[Measure]:
     """Return the measures that episodes of a scenario may have, those of a lane only with one."""
-    left_out = () if lane_of(scenario) else ON_LANE
+    left_out = () if scenario.lane_m else ON_LANE
     return [measure for measure in MEASURES.values() if measure.name not in left_out]
 
 
 def record_fields(scenario: Scenario) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     """Return the fields of a case and of measures that a record has, and the type of the record."""
-    kind: Any = type(scenario)
     left_out = {
         *(() if scenario.vehicles > 2 else ("nearest",)),
         *(() if scenario.follow_up_s > 0.0 else FOLLOWED_UP),
-        *(ON_LANE if lane_of(scenario) is None else ()),
+        *(ON_LANE if scenario.lane_m is None else ()),
     }
-    return _record_fields(kind, scenario.case_fields, frozenset(left_out))
+    return _record_fields(scenario.case_fields, frozenset(left_out))
 
 
 @cache
 def _record_fields(
-    kind: type[Scenario], case_fields: tuple[str, ...], left_out: frozenset[str]
+    case_fields: tuple[str, ...], left_out: frozenset[str]
 ) -> tuple[tuple[str, ...], tuple[str, ...], Any]:
     case_names = ("level", *case_fields)
     not_fields = {"further", *left_out}
     measure_names = tuple(name for name in Measures.__slots__ if name not in not_fields)
-    types = get_type_hints(kind.case_type) | get_type_hints(Measures) | {"index": int, "batch": int}
+    types = get_type_hints(Case) | get_type_hints(Measures) | {"index": int, "batch": int}
     names = [name for name in measure_names if name not in FOLLOWED_UP]
     required = [(name, types[name]) for name in ("index", "batch", *case_names, *names)]
     further = [(name, float | None, None) for name in further_measures()]
@@ -351,8 +342,7 @@ def measure_all(
     """Return the same of episodes of one scenario, which takes less time than one by one."""
     if not trajectories:
         return []
-    of_kind = trajectories[0].case.scenario.measures or measure_merges
-    measured = of_kind(trajectories, lines, avoidability=avoidability)
+    measured = measure_merges(trajectories, lines, avoidability=avoidability)
     if not further_measures():
         return list(measured)
     return [
@@ -491,7 +481,7 @@ def _post_encroachment_time(trajectory: Trajectory) -> float | None:
     """Return PET at M, or at the place of a merge from a lane, where the VUT may have stood."""
     place_m = place_of_merge_m(trajectory)
     x_pov_m, x_vut_m = trajectory.x_pov_m - place_m, trajectory.x_vut_m
-    on_road = lane_of(trajectory.case.scenario) is not None
+    on_road = trajectory.case.scenario.lane_m is not None
     t_vut = trajectory.t_end_s if on_road else _crossing_time_s(x_vut_m, trajectory.v_vut_mps)
     t_pov = _crossing_time_s(x_pov_m, trajectory.v_pov_mps)
     if t_pov is None:

@@ -29,7 +29,7 @@ from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import counted, printable
 from merge_sumo.scenario.case import Case, to_unit
-from merge_sumo.scenario.scenario import Scenario, level_name
+from merge_sumo.scenario.scenario import US23, level_name
 from merge_sumo.scenario.trajectory import End
 
 CONFIDENCE: Final = 0.95
@@ -404,7 +404,7 @@ def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
         errors=errors,
         timeouts=len(wrong) - errors,
         troubles=tuple(sorted(troubles, key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))),
-        goal=ran[0].case.scenario.goal if ran else Scenario.default_goal,
+        goal=ran[0].case.scenario.goal if ran else US23.goal,
     )
 
 

@@ -16,8 +16,7 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.summary import judge
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
-from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.case import FloatArray, coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
 SHOWN: Final = 200

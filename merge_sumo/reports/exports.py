@@ -25,8 +25,8 @@ from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.reports.cases_toml import new_file_in, write_cases
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for
-from merge_sumo.scenario.coordinates import coordinates
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
+from merge_sumo.scenario.case import coordinates
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 
@@ -125,7 +125,7 @@ def write_table(run: Run, indices: Sequence[int], target: Path) -> Path:
 
 def columns_of(scenario: Scenario) -> tuple[str, ...]:
     """Return the columns of a table: time and motion of all vehicles, the case, its severity."""
-    merged = () if lane_of(scenario) is None else (MERGED,)
+    merged = () if scenario.lane_m is None else (MERGED,)
     place = (c.field for c in coordinates(scenario))
     return ("case", "level", "time_s", *_motion(scenario), *merged, *place, SEVERITY)
 
@@ -151,7 +151,7 @@ def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
             **start,
         }
         row |= {**dict(zip(names, state, strict=True)), SEVERITY: severity}
-        if lane_of(scenario) is not None:
+        if scenario.lane_m is not None:
             row[MERGED] = int(merged[step])
         for name, values in (trajectory.signals or {}).items():
             value = values[step]

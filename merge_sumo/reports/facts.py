@@ -24,7 +24,7 @@ from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, undecided
 from merge_sumo.printable import printable
-from merge_sumo.scenario.scenario import lane_of, level_name
+from merge_sumo.scenario.scenario import level_name
 
 PERCENT: Final = "%"
 PLACE: Final = "place of the merge, median"
@@ -252,7 +252,7 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         yield Fact("regions", regions, "", OUTCOMES, f"{FAILING}: starts", level)
         radius = radius_for(len(run.scenario.dimensions(level)))
         yield fact("FMC", found.fmc, f"{FAILING}: starts within {radius:.2g}")
-    if lane_of(run.scenario) is not None:
+    if run.scenario.lane_m is not None:
         yield from _of_lane(run, level)
 
 

@@ -26,7 +26,7 @@ from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.text import change_in_words, step_headline
-from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
 CLASS: Final = "merge-sumo"

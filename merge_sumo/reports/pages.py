@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from markupsafe import Markup
 
 from merge_sumo.printable import counted, printable, quoted
-from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
 if TYPE_CHECKING:

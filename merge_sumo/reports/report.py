@@ -34,7 +34,6 @@ from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.text import comparison_headline, robustness
-from merge_sumo.scenario.scenario import MergeScenario, lane_of
 
 REPORT: Final = "report.html"
 """By this a report is known as ours, and may be replaced by a newer one."""
@@ -117,6 +116,14 @@ def check_report(folder: Path) -> None:
     check_ours(folder / AGAINST_PAGE)
 
 
+LEVEL_ABOUT: Final = {
+    0: "keeps its speed",
+    1: "makes room for a VUT that accelerates",
+    2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
+}
+"""What the POV of a level does, in the words of a caption."""
+
+
 def report_page(
     run: Run,
     summary: Summary | None = None,
@@ -148,8 +155,8 @@ def report_page(
         run=run,
         vut=run.vut,
         scenario=scenario,
-        is_merge=isinstance(scenario, MergeScenario),
-        lane_m=lane_of(scenario),
+        level_about=LEVEL_ABOUT,
+        lane_m=scenario.lane_m,
         traffic=scenario.vehicles > 2,
         meanings=meanings,
         by_level=by_level,

@@ -21,17 +21,8 @@ from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import changes, name_and_unit
 from merge_sumo.road.drawing import road_data
-from merge_sumo.scenario.case import to_unit
-from merge_sumo.scenario.coordinates import Coordinate
-from merge_sumo.scenario.scenario import (
-    ALL_LEVELS,
-    DT_S,
-    VEHICLES,
-    MergeScenario,
-    Scenario,
-    lane_of,
-    level_name,
-)
+from merge_sumo.scenario.case import Coordinate, to_unit
+from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, level_name
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
 
@@ -52,7 +43,7 @@ Axes = tuple[int, int]
 
 def page_data(model: ReportModel) -> dict[str, Any]:
     """Return the data of a page as JSON has it."""
-    scenario, lane_m = model.run.scenario, lane_of(model.run.scenario)
+    scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
     speeds, offsets = packed(model.motion)
     columns = [m for m in measures_in(scenario) if m.column]
     said = causes(model.run, model.shown)
@@ -64,7 +55,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     others = [o for o in model.cases if o.index not in shown]
     return {
         "dt": DT_S,
-        "crash_m": scenario.dx_crash_m if isinstance(scenario, MergeScenario) else 0.0,
+        "crash_m": scenario.dx_crash_m,
         "varies": model.varies,
         "lane": lane_m,
         "place": "M" if lane_m is None else scenario.place,

@@ -26,7 +26,7 @@ from merge_sumo.metrics.summary import Summary, Trouble, by_case, judge, summari
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
-from merge_sumo.scenario.coordinates import coordinates
+from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import LEVELS
 
 LISTED: Final = 10

@@ -20,12 +20,7 @@ from merge_sumo.analysis.comparison import (
     short,
 )
 from merge_sumo.analysis.counterfactuals import causes
-from merge_sumo.analysis.explanation import (
-    PSI,
-    Axis,
-    Explanation,
-    ExplanationResult,
-)
+from merge_sumo.analysis.explanation import PSI, Axis, Explanation, ExplanationResult
 from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
 from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
 from merge_sumo.analysis.sampler_study import SamplerStudy, SamplerSummary, Spread
@@ -42,8 +37,7 @@ from merge_sumo.metrics.score import Outcome, measures_in
 from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either
 from merge_sumo.result import lines_of
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.coordinates import coordinates, described
+from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 

@@ -13,8 +13,7 @@ from typing import Any
 from lxml import etree
 
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.scenario.colours import COLOURS
-from merge_sumo.scenario.scenario import MergeScenario
+from merge_sumo.scenario.scenario import COLOURS, Scenario
 
 WIDTH_PX = 1000
 LANE_M = 3.2
@@ -24,7 +23,7 @@ AFTER_M = 120.0
 LANE_COLOUR = "#009e73"
 
 
-def road_svg(road: Corridor, scenario: MergeScenario) -> bytes:
+def road_svg(road: Corridor, scenario: Scenario) -> bytes:
     """Return the picture of a road with the starts of a scenario on it."""
     low_m = min(scenario.x_pov0_m[0], scenario.x_vut0_m)
     lane_m = scenario.lane_m or (0.0, 0.0)

@@ -12,7 +12,7 @@ from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import read_xml
-from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario, lane_of
+from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
 RAMP_EDGES: Final = ("ramp", "main_out")
@@ -64,7 +64,7 @@ def road_for(scenario: Scenario) -> Corridor:
     """
     # Where a path says nothing of folders, the net is one that the package brings.
     net = None if scenario.net is None else resource("sumo_net") / scenario.net
-    edges = scenario.pov_edges, scenario.vut_edges
-    road = road_of(net, *edges, scenario.room_after_m, lane_of(scenario))
+    edges = scenario.mainline, scenario.ramp
+    road = road_of(net, *edges, scenario.room_after_m, scenario.lane_m)
     road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
     return road

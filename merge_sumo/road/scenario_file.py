@@ -18,8 +18,7 @@ from typing import Final
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
 from merge_sumo.printable import meant
-from merge_sumo.records import read_toml, toml_value
-from merge_sumo.scenario.kinds import scenario_of_record
+from merge_sumo.records import convert, read_toml, toml_value
 from merge_sumo.scenario.scenario import US23, Scenario
 
 SUFFIX: Final = ".toml"
@@ -69,7 +68,7 @@ def _read(path: Path) -> Scenario:
     """Return the scenario of a file, with its net as the file names it."""
     text, record = read_toml(path, "scenario")
     try:
-        return scenario_of_record({"name": path.stem, **record})
+        return convert({"name": path.stem, **record}, Scenario)
     except UserError as error:
         raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
 

@@ -9,19 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.following import keep_safe
-from merge_sumo.drivers.levelk import (
-    DECISION_STEPS,
-    QNetwork,
-    actions_mps2,
-    feature_columns,
-)
+from merge_sumo.drivers.levelk import DECISION_STEPS, QNetwork, actions_mps2, feature_columns
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.merge import REACTION_S
 from merge_sumo.samplers.observation import Inputs, Observation
 from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, MergeScenario
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.povs import POLICIES, Povs
 
@@ -57,11 +52,10 @@ class ModelRollout:
     def can_predict(self, level: int) -> bool:
         """Return whether the POV of a level is known, and not a program of a person's own.
 
-        A rollout is of a merge and ends at M: none is possible of other kinds of scenarios, or
-        where the VUT chooses the place.
+        A rollout ends at M: none is possible where the VUT chooses the place of the merge.
         """
         known = level == 0 or level in self._networks
-        return known and isinstance(self._scenario, MergeScenario) and not self._scenario.lane_m
+        return known and self._scenario.lane_m is None
 
     def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""

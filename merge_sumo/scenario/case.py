@@ -1,20 +1,19 @@
 """A test case, and the pool that it is drawn from (Wang et al., section V-A).
 
-`Case` is what every kind of scenario has. A case of a merge is s = [x_POV0, v_POV0, psi, L]: where
-the POV starts, how fast, its social value orientation, and its level of reasoning. The orientation
-exists only at level 2, so the pool is three boxes: two-dimensional at levels 0 and 1,
-three-dimensional at level 2. Where a scenario has traffic, or a range of the VUT's speed, these are
-further coordinates.
+A case is s = [x_POV0, v_POV0, psi, L]: where the POV starts, how fast, its social value
+orientation, and its level of reasoning. The orientation exists only at level 2, so the pool is
+three boxes: two-dimensional at levels 0 and 1, three-dimensional at level 2. Where a scenario has
+traffic, or a range of the VUT's speed, these are further coordinates.
 """
 
 from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, field, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,17 +29,14 @@ from merge_sumo.scenario.imperfection import (
     with_numbers,
 )
 from merge_sumo.scenario.scenario import (
-    AHEAD,
     ALL_LEVELS,
-    BEHIND,
     COORDINATES,
+    LEVELS,
     OWN,
-    POV,
     SVO,
     US23,
     V_VUT0_MPS,
-    VUT,
-    MergeScenario,
+    Dimension,
     Scenario,
 )
 
@@ -54,15 +50,19 @@ MOST_DRAWS: Final = 2**32
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
-    """One test case, a point of a scenario; a kind of scenario has a subclass with its coordinates.
+    """One test case, a point of a scenario.
 
     Raises `UserError` for values with which the scenario cannot be set up. Values outside the
-    pool are allowed: a person may want to look at one.
+    pool are allowed: a user may want to look at one.
 
     Attributes:
         level: level of the POV.
         svo_rad: its social value orientation; None below level 2.
+        x_pov0_m: where it starts.
+        v_pov0_mps: how fast.
         v_vut0_mps: speed of the VUT at the start.
+        headway_ahead_s: time headway of the car ahead of the POV; None without traffic.
+        headway_behind_s: that of the car behind it.
         draw: which draw of what is random in its episode; no coordinate of the pool.
         scenario: the scenario.
 
@@ -71,7 +71,11 @@ class Case:
 
     level: int
     svo_rad: float | None = None
+    x_pov0_m: float
+    v_pov0_mps: float
     v_vut0_mps: float = V_VUT0_MPS
+    headway_ahead_s: float | None = None
+    headway_behind_s: float | None = None
     sense_delay_s: float | None = None
     sense_noise_x_m: float | None = None
     sense_noise_v_mps: float | None = None
@@ -84,11 +88,6 @@ class Case:
     draw: int = field(default=0, repr=False)
     scenario: Scenario = field(repr=False)
 
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            """Coordinates of a kind are fields of its own `Case`."""
-
     def __post_init__(self) -> None:
         """Check that the numbers describe a scenario."""
         if self.level not in ALL_LEVELS:
@@ -97,29 +96,44 @@ class Case:
             )
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
-        self._check_coordinates()
+        reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps
+        if not -reach_m <= self.x_pov0_m <= 0.0:
+            raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
+        for name, v_mps in (("v_pov0_mps", self.v_pov0_mps), ("v_vut0_mps", self.v_vut0_mps)):
+            if not 0.0 <= v_mps <= most_mps:
+                raise UserError(f"{name} is {v_mps}: choose between 0 and {most_mps:g}")
+        self._check_imperfections()
+        self._check_headways()
         if not 0 <= self.draw < MOST_DRAWS:
             raise UserError(f"draw is {self.draw}: choose 0 or more, and less than {MOST_DRAWS}")
         if self.svo_rad is not None and not 0.0 <= self.svo_rad < math.pi / 2:
             raise UserError(f"svo_rad is {self.svo_rad}: choose between 0 and below pi/2")
 
-    def _check_coordinates(self) -> None:
-        """Raise `UserError` where a coordinate of the kind does not describe a scenario."""
-        raise NotImplementedError
-
-    def _check_speed(self, name: str) -> None:
-        most_mps = self.scenario.v_start_max_mps
-        if not 0.0 <= getattr(self, name) <= most_mps:
-            raise UserError(f"{name} is {getattr(self, name)}: choose between 0 and {most_mps:g}")
+    def _check_headways(self) -> None:
+        """Raise `UserError` where a car would start too far away or in another."""
+        reach_m, least_m = self.scenario.reach_m, self.scenario.pov_length_m
+        for name, headway_s, side in (
+            ("headway_ahead_s", self.headway_ahead_s, 1.0),
+            ("headway_behind_s", self.headway_behind_s, -1.0),
+        ):
+            if (headway_s is not None) != (self.scenario.vehicles > 2):
+                raise UserError(f"{name} belongs to traffic: give it there, and only there")
+            if headway_s is None:
+                continue
+            apart_m = headway_s * self.v_pov0_mps
+            if not (apart_m >= least_m and abs(self.x_pov0_m + side * apart_m) <= reach_m):
+                raise UserError(
+                    f"{name} is {headway_s}: the cars would be {apart_m:g} m apart; choose "
+                    f"{least_m:g} m or more, and not more than {reach_m:g} m from M"
+                )
 
     def starts(self) -> list[tuple[float, float]]:
         """Return position and speed of every vehicle at the start, in the order of their rows."""
-        raise NotImplementedError
-
-    @property
-    def level0_pov_mps2(self) -> float:
-        """Acceleration of a level-0 POV, which it keeps whatever the VUT does."""
-        return 0.0
+        x, v = self.x_pov0_m, self.v_pov0_mps
+        starts = [(x, v), (self.scenario.x_vut0_m, self.v_vut0_mps)]
+        if self.headway_ahead_s is not None and self.headway_behind_s is not None:
+            starts += [(x + self.headway_ahead_s * v, v), (x - self.headway_behind_s * v, v)]
+        return starts
 
     @property
     def sensing(self) -> Sensing:
@@ -167,59 +181,20 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class MergeCase(Case):
-    """A case of a merge: start and speed of the POV and, in traffic, headways to its neighbours."""
-
-    x_pov0_m: float
-    v_pov0_mps: float
-    headway_ahead_s: float | None = None
-    headway_behind_s: float | None = None
-
-    def _check_coordinates(self) -> None:
-        """Raise `UserError` where a vehicle would start too far away, too fast or in another."""
-        reach_m = self.scenario.reach_m
-        if not -reach_m <= self.x_pov0_m <= 0.0:
-            raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
-        self._check_speed("v_pov0_mps")
-        self._check_speed("v_vut0_mps")
-        self._check_imperfections()
-        in_traffic = self.scenario.vehicles > 2
-        for name in ("headway_ahead_s", "headway_behind_s"):
-            headway_s = getattr(self, name)
-            if (headway_s is not None) != in_traffic:
-                raise UserError(f"{name} belongs to traffic: give it there, and only there")
-            if headway_s is None:
-                continue
-            apart_m, least_m = headway_s * self.v_pov0_mps, self.scenario.pov_length_m
-            ahead_m = apart_m if name == "headway_ahead_s" else -apart_m
-            if not (apart_m >= least_m and abs(self.x_pov0_m + ahead_m) <= reach_m):
-                raise UserError(
-                    f"{name} is {headway_s}: the cars would be {apart_m:g} m apart; choose "
-                    f"{least_m:g} m or more, and not more than {reach_m:g} m from M"
-                )
-
-    def starts(self) -> list[tuple[float, float]]:
-        """Return position and speed of every vehicle at the start, in the order of their rows."""
-        x, v = self.x_pov0_m, self.v_pov0_mps
-        rows = {POV: (x, v), VUT: (self.scenario.x_vut0_m, self.v_vut0_mps)}
-        if self.headway_ahead_s is not None and self.headway_behind_s is not None:
-            rows[AHEAD] = x + self.headway_ahead_s * v, v
-            rows[BEHIND] = x - self.headway_behind_s * v, v
-        return [rows[row] for row in range(len(rows))]
-
-
-MergeScenario.case_type = MergeCase
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
 class ToldCase(Case):
-    """What the driver of a vehicle may know of a case: where vehicles start, and own limits."""
+    """What the driver of a vehicle may know of a case: where vehicles start, and own limits.
 
+    It is made of a case that was checked, so it is not checked again: a sensor may show a car
+    anywhere.
+    """
+
+    x_pov0_m: float = math.nan
+    v_pov0_mps: float = math.nan
     told: tuple[tuple[float, float], ...]
     """Position and speed of every vehicle at the start, in the order of their rows."""
 
-    def _check_coordinates(self) -> None:
-        """Accept all: the case was checked where it was made."""
+    def __post_init__(self) -> None:
+        """Accept all numbers."""
 
     def starts(self) -> list[tuple[float, float]]:
         """Return position and speed of every vehicle at the start, in the order of their rows."""
@@ -257,9 +232,62 @@ def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Cas
     v_vut0_mps, _ = scenario.bounds("v_vut0_mps")
     cases = []
     for row in points.tolist():
-        values = {"v_vut0_mps": v_vut0_mps}
+        values: dict[str, Any] = {"v_vut0_mps": v_vut0_mps}
         values |= {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
         if level == 2:
             values["svo_rad"] = min(values["svo_rad"], math.nextafter(SVO.high, 0.0))
-        cases.append(scenario.case_type(level=level, scenario=scenario, **values))
+        cases.append(Case(level=level, scenario=scenario, **values))
     return cases
+
+
+@dataclass(frozen=True, slots=True)
+class Coordinate:
+    """A coordinate of a pool: its bounds, and how a value of it is written."""
+
+    dimension: Dimension
+    name: str
+    unit: str
+    digits: int
+
+    @property
+    def field(self) -> str:
+        """Name of the field of a case."""
+        return self.dimension.field
+
+    def of(self, case: Case) -> float | None:
+        """Return the value of a case; None where its level has no such coordinate."""
+        value: float | None = getattr(case, self.field)
+        return value
+
+    def share(self, case: Case) -> float:
+        """Return where a case is between the bounds, from 0 to 1; 0 where it has no value."""
+        low, high = self.dimension.low, self.dimension.high
+        return ((self.of(case) or low) - low) / (high - low)
+
+    def text(self, case: Case) -> str:
+        """Return the value as it stands in a table; empty where there is none."""
+        value = self.of(case)
+        return "" if value is None else f"{value:.{self.digits}f}"
+
+
+def coordinates(scenario: Scenario, levels: Sequence[int] = LEVELS) -> tuple[Coordinate, ...]:
+    """Return the coordinates that a scenario has at any of some levels, in the pool's order."""
+    most = max((scenario.dimensions(level) for level in levels), key=len)
+    return tuple(Coordinate(d, *astuple(scenario.notation[d.field])[:3]) for d in most)
+
+
+def described(case: Case) -> str:
+    """Return the coordinates of a case in one line."""
+    return ", ".join(
+        f"{c.name} {c.text(case)} {c.unit}" for c in coordinates(case.scenario, (case.level,))
+    )
+
+
+def outside_of_the_pool(case: Case) -> list[str]:
+    """Return in sentences which coordinates of a case are outside of the pool."""
+    return [
+        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
+        f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
+        for c in coordinates(case.scenario, (case.level,))
+        if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high
+    ]

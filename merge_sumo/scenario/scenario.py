@@ -1,19 +1,18 @@
 """Scenarios as values: where vehicles start, what they can do, what is too near.
 
-`Scenario` is what every kind of scenario has; `MergeScenario` is the kind of this package, a merge
-from a ramp. Each path has its own coordinate: the distance of the front bumper along its lanes from
-a reference point M, in metres, negative before M; of a merge that is the merge point. A case is a
-point of a scenario and knows which: drivers, rollout and score take what holds for it from the
-case. `US23` is the paper's: Wang et al., sections VI and VII and Table I.
+A `Scenario` is a merge from a ramp. Each path has its own coordinate: the distance of the front
+bumper along its lanes from the merge point M, in metres, negative before M. A case is a point of a
+scenario and knows which: drivers, rollout and score take what holds for it from the case. `US23` is
+the paper's: Wang et al., sections VI and VII and Table I.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Self
 
 from msgspec import Meta
 
@@ -24,7 +23,6 @@ from merge_sumo.scenario.imperfection import (
     PERFECT_SENSING,
     SENSE,
     Actuation,
-    Imperfection,
     Sensing,
 )
 
@@ -114,10 +112,19 @@ BEHIND: Final = 3
 on by the POV and, in traffic, by a car ahead of it and one behind it."""
 VEHICLES: Final = ("pov", "vut", "ahead", "behind")
 """Their names."""
+COLOURS: Final = {"pov": "#e69f00", "vut": "#0072b2", "ahead": "#009e73", "behind": "#a6518b"}
+"""Their colours in every picture (Okabe and Ito, 2008); `report.css` has lighter ones for dark
+pages."""
 Vehicle = Annotated[str, Meta(pattern="^(pov|vut|ahead|behind)$", description="a vehicle's name")]
 
 EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
 """A time of an episode in a record, in s."""
+
+
+def rgb(vehicle: str) -> tuple[int, int, int]:
+    """Return the colour of a vehicle as red, green and blue, of 255."""
+    red, green, blue = bytes.fromhex(COLOURS[vehicle][1:])
+    return red, green, blue
 
 
 _LENGTH_M: Final = (0.1, 100.0)
@@ -158,11 +165,9 @@ V_VUT0_MPS: Final = 18.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scenario:
-    """What every scenario has; `MergeScenario` is the merge.
+    """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
 
-    A kind says what its cases are (`case_type`, `notation`, `case_fields`), which roads they need
-    (`pov_edges`, `vut_edges`), when an episode ends (`has_ended`) and what is measured of it
-    (`measures`). Raises `UserError` for numbers that make no scenario.
+    Raises `UserError` for numbers that make no scenario.
 
     Attributes:
         name: how people call it.
@@ -177,7 +182,7 @@ class Scenario:
         a_min_mps2: hardest braking of all vehicles, negative.
         a_max_mps2: hardest acceleration of all vehicles.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
-        follow_up_s: how long all drive on behind M, 3 s where nothing is said.
+        follow_up_s: how long all drive on after M.
         v_hw_min_mps: lowest speed that the mainline drives at.
         v_hw_max_mps: highest speed that it drives at.
         v_min_mps: below this the VUT is slow.
@@ -190,213 +195,6 @@ class Scenario:
         v_start_max_mps: no vehicle starts faster than this.
         sense: how the VUT senses other cars.
         act: how it obeys its controller.
-    """
-
-    kind: ClassVar[str]
-    """Name of the class in a record."""
-    case_type: ClassVar[type[Any]]
-    """The `Case` of the kind."""
-    measures: ClassVar[Callable[..., Any] | None]
-    """Gives the `Measures` of episodes of the kind, in a list, by their trajectories, the centre
-    lines of the road (None: nothing is measured before M), and whether the last way out is searched
-    for. None where it is a merge, which `metrics/score.py` measures."""
-    levels: ClassVar[tuple[int, ...]] = ALL_LEVELS
-    """POV levels that the kind has."""
-    notation: ClassVar[Mapping[str, Notation]]
-    """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
-    name says by its range whether it is one; the SVO is one at level 2."""
-    ends_as: ClassVar[str] = "COMPLETED"
-    """The `End` of an episode that `has_ended`."""
-    level_about: ClassVar[Mapping[int, str]] = {}
-    """What the POV of a level does, in the words of a caption."""
-    default_goal: ClassVar[str] = "the end of the scenario"
-    """What the VUT reaches in an episode that is no TIMEOUT, where its cases do not say."""
-    measure_labels: ClassVar[Mapping[str, str]] = {}
-    """What listings call measures of which `MEASURES` has the words for merges, by name."""
-    default_criterion: ClassVar[str] = "contact"
-    """The criterion of a campaign that names none. The paper's is one of merges alone."""
-
-    name: str
-    net: str | None = None
-    x_vut0_m: float = -182.0
-    v_vut0_mps: float | Bounds = V_VUT0_MPS
-    tau_s: float = 1.0
-    min_gap_m: float = 2.5
-    pov_length_m: float = 5.0
-    vut_length_m: float = 5.0
-    a_min_mps2: float = -4.0
-    a_max_mps2: float = 2.0
-    timeout_s: float = 30.0
-    follow_up_s: float = 0.0
-    v_hw_min_mps: float = 24.6
-    v_hw_max_mps: float = 35.0
-    v_min_mps: float = 12.0
-    ttc_min_s: float = 7.0
-    dx_crash_m: float = 6.0
-    dx_critical_m: float = 15.0
-    level0_a_mps2: float = 1.0
-    level0_v_mps: float = 28.0
-    reach_m: float = 900.0
-    v_start_max_mps: float = 45.0
-    sense: Sensing = PERFECT_SENSING
-    act: Actuation = PERFECT_ACTUATION
-
-    def __post_init__(self) -> None:
-        """Check the numbers one by one, then together."""
-        for name, (low, high) in RANGES.items():
-            value = getattr(self, name, None)
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not math.isfinite(number):
-                    raise UserError(f"{name} is {value}: it must be finite")
-                if number is not None and not low <= number <= high:
-                    raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
-        for name, fits, wanted in self._checks():
-            if not fits:
-                raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
-
-    def _checks(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield (field, whether it fits with the others, what would)."""
-        v_vut0 = self.bounds("v_vut0_mps")
-        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
-        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, before
-        fits = 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps
-        yield "v_vut0_mps", fits, f"between 0 and {self.v_start_max_mps:g}"
-        yield "v_vut0_mps", self.v_vut0_mps != (v_vut0[0], v_vut0[0]), "low < high"
-        yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
-        for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
-            yield name, getattr(self, name) > 0.0, "above 0"
-        yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
-        yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
-        yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
-        known = COORDINATES.keys() & self.notation.keys()
-        for name, imperfection in self._imperfections():
-            fits = known.issuperset(f"{name}_{field}" for field in imperfection.ranged)
-            yield name, fits, f"numbers: a range is a coordinate that {self.kind} does not have"
-
-    def to_record(self) -> dict[str, Any]:
-        """Return the scenario as JSON keeps it.
-
-        `kind` is left out where it is a merge, and what is perfect of `sense` and `act`.
-        """
-        kind = {} if self.kind == MergeScenario.kind else {"kind": self.kind}
-        record = kind | asdict(self)
-        for name, known in self._imperfections():
-            del record[name]
-            record |= {} if known.is_perfect else {name: known.to_record()}
-        return record
-
-    def _imperfections(self) -> Iterator[tuple[str, Imperfection]]:
-        """Yield `sense` and `act` with their names."""
-        yield SENSE, self.sense
-        yield ACT, self.act
-
-    @property
-    def criterion(self) -> str:
-        """The criterion of a campaign that names none."""
-        return self.default_criterion
-
-    @property
-    def goal(self) -> str:
-        """What the VUT reaches in an episode that is no TIMEOUT."""
-        return self.default_goal
-
-    @property
-    def place(self) -> str:
-        """What sentences call the place of a merge; texts that are written with M are said so."""
-        return "M"
-
-    def said(self, text: str) -> str:
-        """Return a text of this package, written with M, as it is true of this scenario."""
-        if self.place == "M":
-            return text
-        return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
-
-    def bounds(self, name: str) -> Bounds:
-        """Return the bounds of a number that may be a range; twice the number where it is none."""
-        value = getattr(self, name)
-        return value if isinstance(value, tuple) else (value, value)
-
-    @property
-    def vehicles(self) -> int:
-        """A: how many vehicles an episode has, the VUT among them."""
-        return 2
-
-    @property
-    def lengths_m(self) -> tuple[float, float]:
-        """Length of a car of the mainline, and of the VUT."""
-        return self.pov_length_m, self.vut_length_m
-
-    @property
-    def pov_edges(self) -> tuple[str, ...]:
-        """Edges of the net on which the POV and other cars drive, in order, past M."""
-        raise NotImplementedError
-
-    @property
-    def vut_edges(self) -> tuple[str, ...]:
-        """Edges on which the VUT drives, past M, where they merge with those of the POV.
-
-        Where both drive on one lane, they are the same, and M is where the last edge begins.
-        """
-        raise NotImplementedError
-
-    @property
-    def farthest_start_m(self) -> float:
-        """Distance to M of the farthest start of a car other than the VUT."""
-        return self.reach_m
-
-    @property
-    def max_steps(self) -> int:
-        """Steps after which an episode that has not ended is a TIMEOUT."""
-        return round(self.timeout_s / DT_S)
-
-    @property
-    def room_after_m(self) -> float:
-        """How far behind M a POV may get until the timeout, at full acceleration."""
-        far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
-        ahead_m = self.reach_m if self.vehicles > 2 else 0.0
-        return max(far_m, ROOM_AFTER_M) + ahead_m
-
-    def dimensions(self, level: int) -> tuple[Dimension, ...]:
-        """Return the continuous coordinates of the pool at a level: those that have a range.
-
-        At level 2 the POV's orientation is the last one.
-        """
-        ranges = [
-            Dimension(name, *value)
-            for name in self.notation
-            if isinstance(value := self._given(name), tuple)
-        ]
-        return (*ranges, SVO) if level == 2 and SVO.field in self.notation else tuple(ranges)
-
-    def _given(self, coordinate: str) -> Any:
-        """Return what the scenario says of a coordinate: a number, a range, or None for nothing."""
-        if coordinate not in COORDINATES:
-            return getattr(self, coordinate, None)
-        prefix, _, name = coordinate.partition("_")
-        return getattr(getattr(self, prefix), name)
-
-    @property
-    def imperfect_fields(self) -> tuple[str, ...]:
-        """Fields of a case that are ranges of `sense` and `act`."""
-        known = (f"{name}_{field}" for name, of in self._imperfections() for field in of.ranged)
-        return tuple(known)
-
-    @property
-    def case_fields(self) -> tuple[str, ...]:
-        """Fields of a case beside its level that say where it is in the scenario."""
-        fields = [dimension.field for level in self.levels for dimension in self.dimensions(level)]
-        return tuple(dict.fromkeys((*fields, "v_vut0_mps")))
-
-    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return in which corridors the episode has ended in states (A, K), (K,)."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True, kw_only=True, slots=True)
-class MergeScenario(Scenario):
-    """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
-
-    Attributes:
         mainline: edges of the mainline, in driving order, past M.
         ramp: edges of the ramp, in driving order, past M.
         x_pov0_m: where the POV may start, low and high.
@@ -411,8 +209,6 @@ class MergeScenario(Scenario):
             the mainline, "stop" brakes it to a stand before the end.
     """
 
-    kind: ClassVar[str] = "merge"
-    measures: ClassVar[Callable[..., Any] | None] = None
     notation: ClassVar[Mapping[str, Notation]] = {
         "x_pov0_m": Notation("x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
         "v_pov0_mps": Notation("v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
@@ -422,17 +218,33 @@ class MergeScenario(Scenario):
         **COORDINATES,
         "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
     }
-    ends_as: ClassVar[str] = "MERGED"
-    level_about: ClassVar[Mapping[int, str]] = {
-        0: "keeps its speed",
-        1: "makes room for a VUT that accelerates",
-        2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
-    }
-    default_goal: ClassVar[str] = "the merge point"
-    default_criterion: ClassVar[str] = "paper"
-    follow_up_s: float = 3.0
+    """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
+    name says by its range whether it is one; the SVO is one at level 2."""
 
     name: str = "us23"
+    net: str | None = None
+    x_vut0_m: float = -182.0
+    v_vut0_mps: float | Bounds = V_VUT0_MPS
+    tau_s: float = 1.0
+    min_gap_m: float = 2.5
+    pov_length_m: float = 5.0
+    vut_length_m: float = 5.0
+    a_min_mps2: float = -4.0
+    a_max_mps2: float = 2.0
+    timeout_s: float = 30.0
+    follow_up_s: float = 3.0
+    v_hw_min_mps: float = 24.6
+    v_hw_max_mps: float = 35.0
+    v_min_mps: float = 12.0
+    ttc_min_s: float = 7.0
+    dx_crash_m: float = 6.0
+    dx_critical_m: float = 15.0
+    level0_a_mps2: float = 1.0
+    level0_v_mps: float = 28.0
+    reach_m: float = 900.0
+    v_start_max_mps: float = 45.0
+    sense: Sensing = PERFECT_SENSING
+    act: Actuation = PERFECT_ACTUATION
     mainline: Edges = ("main_in", "main_out")
     ramp: Edges = ("ramp", "main_out")
     x_pov0_m: Bounds = (-340.0, -180.0)
@@ -442,34 +254,57 @@ class MergeScenario(Scenario):
     lane_m: Bounds | None = None
     lane_end: Literal["merge", "stop"] = "merge"
 
+    def __post_init__(self) -> None:
+        """Check the numbers one by one, then together."""
+        for name, (low, high) in RANGES.items():
+            value = getattr(self, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not math.isfinite(number):
+                    raise UserError(f"{name} is {value}: it must be finite")
+                if number is not None and not low <= number <= high:
+                    raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
+        for name, fits, wanted in self._checks():
+            if not fits:
+                raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
+
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
         """Yield (field, whether it fits with the others, what would)."""
-        x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
-        shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
-        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
-        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
-        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, before
-        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
+        x_m, v_mps, v_vut0 = self.x_pov0_m, self.v_pov0_mps, self.bounds("v_vut0_mps")
+        reach = f"metres before M, -{self.reach_m:g} to 0, low < high"
         most = f"between 0 and {self.v_start_max_mps:g}"
+        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, reach
+        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
         yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, most
         has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
         yield "headway_behind_s", has_both, "both headways, or none"
+        shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
+        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
         for name in ("headway_ahead_s", "headway_behind_s"):
             headway_s = getattr(self, name)
-            fits = headway_s is None or shortest_s <= headway_s[0] < headway_s[1]
-            yield name, fits, apart
+            yield name, headway_s is None or shortest_s <= headway_s[0] < headway_s[1], apart
         near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
         yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
         begin_m, end_m = self.lane_m or (0.0, 0.0)
         around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
         fits = self.lane_m is None or self.x_vut0_m <= begin_m <= 0.0 < end_m
         yield "lane_m", fits, around
-        # No zero-argument super(): `slots` makes another class of this one.
-        yield from Scenario._checks(self)
+        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, reach
+        yield "v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, most
+        yield "v_vut0_mps", self.v_vut0_mps != (v_vut0[0], v_vut0[0]), "low < high"
+        yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
+        for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
+            yield name, getattr(self, name) > 0.0, "above 0"
+        yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
+        yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
+        yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
 
     def to_record(self) -> dict[str, Any]:
-        """Return the scenario as JSON keeps it; without a lane, nothing is said of one."""
-        record = Scenario.to_record(self)
+        """Return the scenario as JSON keeps it; what is perfect, or of no lane, is left out."""
+        record = asdict(self)
+        for name, imperfection in ((SENSE, self.sense), (ACT, self.act)):
+            del record[name]
+            if not imperfection.is_perfect:
+                record[name] = imperfection.to_record()
         if self.lane_m is None:
             del record["lane_m"], record["lane_end"]
         return record
@@ -477,17 +312,28 @@ class MergeScenario(Scenario):
     @property
     def criterion(self) -> str:
         """The criterion of a campaign that names none; the paper's is not for a lane."""
-        return "unsafe" if self.lane_m is not None else self.default_criterion
+        return "paper" if self.lane_m is None else "unsafe"
 
     @property
     def goal(self) -> str:
-        """The merge point; on an acceleration lane that is no point."""
-        return "the mainline" if self.lane_m is not None else self.default_goal
+        """What the VUT reaches in an episode that is no TIMEOUT."""
+        return "the merge point" if self.lane_m is None else "the mainline"
 
     @property
     def place(self) -> str:
         """M; on an acceleration lane, where M is only expected, the merge."""
-        return "the merge" if self.lane_m is not None else "M"
+        return "M" if self.lane_m is None else "the merge"
+
+    def said(self, text: str) -> str:
+        """Return a text of this package, written with M, as it is true of this scenario."""
+        if self.lane_m is None:
+            return text
+        return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
+
+    def bounds(self, name: str) -> Bounds:
+        """Return the bounds of a number that may be a range; twice the number where it is none."""
+        value = getattr(self, name)
+        return value if isinstance(value, tuple) else (value, value)
 
     @property
     def vehicles(self) -> int:
@@ -495,14 +341,9 @@ class MergeScenario(Scenario):
         return 2 if self.headway_ahead_s is None else len(VEHICLES)
 
     @property
-    def pov_edges(self) -> tuple[str, ...]:
-        """The mainline."""
-        return self.mainline
-
-    @property
-    def vut_edges(self) -> tuple[str, ...]:
-        """The ramp."""
-        return self.ramp
+    def lengths_m(self) -> tuple[float, float]:
+        """Length of a car of the mainline, and of the VUT."""
+        return self.pov_length_m, self.vut_length_m
 
     @property
     def farthest_start_m(self) -> float:
@@ -511,14 +352,48 @@ class MergeScenario(Scenario):
         return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
 
     @property
+    def max_steps(self) -> int:
+        """Steps after which an episode that has not ended is a TIMEOUT."""
+        return round(self.timeout_s / DT_S)
+
+    @property
+    def room_after_m(self) -> float:
+        """How far after M a POV may get until the timeout, at full acceleration."""
+        far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
+        ahead_m = self.reach_m if self.vehicles > 2 else 0.0
+        return max(far_m, ROOM_AFTER_M) + ahead_m
+
+    def dimensions(self, level: int) -> tuple[Dimension, ...]:
+        """Return the continuous coordinates of the pool at a level: those that have a range.
+
+        At level 2 the POV's orientation is the last one.
+        """
+        ranges = []
+        for name in self.notation:
+            owner, field = self, name
+            if name in COORDINATES:
+                part, _, field = name.partition("_")
+                owner = getattr(self, part)
+            value = getattr(owner, field, None)
+            if isinstance(value, tuple):
+                ranges.append(Dimension(name, *value))
+        return (*ranges, SVO) if level == 2 else tuple(ranges)
+
+    @property
+    def imperfect_fields(self) -> tuple[str, ...]:
+        """Fields of a case that are ranges of `sense` and `act`."""
+        sensed = [f"{SENSE}_{field}" for field in self.sense.ranged]
+        return (*sensed, *(f"{ACT}_{field}" for field in self.act.ranged))
+
+    @property
     def case_fields(self) -> tuple[str, ...]:
-        """Start and speed of the POV, speed of the VUT, orientation; in traffic, headways."""
+        """Fields of a case besides its level that say where it is in the scenario."""
         headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
         own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
         return (*own, *headways, *self.imperfect_fields)
 
-    def has_ended(self, x_m: NDArray[np.float64], v_mps: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return in which corridors the VUT has to be on the mainline in states (A, K), (K,).
+    def has_ended(self, x_m: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return in which corridors the VUT has to be on the mainline in positions (A, K), (K,).
 
         It is there from M on, or from the end of the acceleration lane on.
         """
@@ -527,19 +402,34 @@ class MergeScenario(Scenario):
         return arrived
 
 
-US23: Final = MergeScenario()
+US23: Final = Scenario()
 """The paper's."""
 
 
-def lane_of(scenario: Scenario) -> Bounds | None:
-    """Return where the acceleration lane of a scenario begins and ends; None without one."""
-    return scenario.lane_m if isinstance(scenario, MergeScenario) else None
+@dataclass(frozen=True, slots=True)
+class Units:
+    """How large a scenario is next to the paper's, of which all units are 1.
 
+    A driver that measures in these units sees the same numbers in merges that are alike. Where
+    lengths, speeds and accelerations are all the same multiple of the paper's, all else is equal,
+    to the last bit if that is a power of two.
+    """
 
-def as_merge(scenario: Scenario) -> MergeScenario:
-    """Return a scenario that is a merge; `UserError` for another kind."""
-    if not isinstance(scenario, MergeScenario):
-        raise UserError(
-            f"{scenario.name} is a scenario of kind {scenario.kind}: this needs a merge"
+    length: float  # of the way of the VUT to M
+    speed: float  # of the VUT at M, on the level-0 profile
+    time: float  # that such a way takes at such a speed
+    gap: float  # of the gap below which two vehicles collide
+    acceleration: float  # of the hardest acceleration
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        """Return the units of a scenario."""
+        length = scenario.x_vut0_m / US23.x_vut0_m
+        speed = scenario.level0_v_mps / US23.level0_v_mps
+        return cls(
+            length=length,
+            speed=speed,
+            time=length / speed,
+            gap=scenario.dx_crash_m / US23.dx_crash_m,
+            acceleration=scenario.a_max_mps2 / US23.a_max_mps2,
         )
-    return scenario

@@ -22,13 +22,11 @@ class End(StrEnum):
     TIMEOUT = "TIMEOUT"
     VUT_ERROR = "VUT_ERROR"
     SIM_ERROR = "SIM_ERROR"
-    COMPLETED = "COMPLETED"
-    """Of kinds of scenarios without a merge: the episode ended as the kind says."""
 
     @property
     def is_tested(self) -> bool:
-        """Whether the VUT reached the merge point, or else the end of its scenario."""
-        return self in (End.MERGED, End.COMPLETED)
+        """Whether the VUT reached the merge point."""
+        return self is End.MERGED
 
     @property
     def is_error(self) -> bool:

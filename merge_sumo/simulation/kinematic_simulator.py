@@ -21,7 +21,7 @@ import numpy as np
 from merge_sumo.errors import UserError
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import VUT, lane_of
+from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import Engine, SimulationPlan
@@ -82,14 +82,14 @@ class KinematicSimulator(Simulator):
         criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
         last = np.concatenate([one.motion[-2:] for one in ended])
         starts = np.cumsum([0, *(min(2, len(one.motion)) for one in ended)])[:-1]
-        x_m, v_mps = last[..., 0].T, last[..., 1].T
+        x_m = last[..., 0].T
         by_shift = []
         for shift_m in (ROUNDING, -ROUNDING):
             shifted_m = x_m.copy()
             shifted_m[VUT] += shift_m
-            by_shift.append(self._plan.scenario.has_ended(shifted_m, v_mps))
+            by_shift.append(self._plan.scenario.has_ended(shifted_m))
         differ = by_shift[0] != by_shift[1]
-        begin_m, _ = lane_of(self._plan.scenario) or (0.0, 0.0)
+        begin_m, _ = self._plan.scenario.lane_m or (0.0, 0.0)
         differ |= (np.abs(x_m[VUT] - begin_m) <= ROUNDING) | (np.abs(x_m[VUT]) <= ROUNDING)
         unclear = np.logical_or.reduceat(differ, starts)
         return {

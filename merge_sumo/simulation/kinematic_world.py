@@ -75,11 +75,11 @@ class EquationWorld:
         """
         has_ended = self.scenario.has_ended
         goes_on = np.ones(self.corridors, dtype=np.bool_)
-        ended_before = has_ended(self.x_m, self.v_mps)
+        ended_before = has_ended(self.x_m)
         part_s = DT_S / self.substeps
         for _ in range(self.substeps):
             x_m = self.x_m + self.v_mps * part_s
             v_mps = np.maximum(self.v_mps + a_mps2 * part_s, 0.0)
             self.x_m = np.where(goes_on, x_m, self.x_m)
             self.v_mps = np.where(goes_on, v_mps, self.v_mps)
-            goes_on = ended_before | ~has_ended(self.x_m, self.v_mps)
+            goes_on = ended_before | ~has_ended(self.x_m)

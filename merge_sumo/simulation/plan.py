@@ -17,7 +17,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import MEASURES
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.scenario.scenario import OWN, Scenario, lane_of
+from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.workers import AnyWorkers
 
@@ -130,7 +130,7 @@ class SimulationPlan:
 
     def for_verdicts(self) -> SimulationPlan:
         """Return the plan for verdicts alone: where these are those of M, without a follow-up."""
-        if not self.criterion.is_papers or lane_of(self.scenario) is not None:
+        if not self.criterion.is_papers or self.scenario.lane_m is not None:
             return self
         return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
 

@@ -22,7 +22,6 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.files import Files
-from merge_sumo.printable import either
 from merge_sumo.scenario.case import Case, FloatArray, ToldCase
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
@@ -30,7 +29,6 @@ from merge_sumo.scenario.scenario import (
     VUT,
     AnyLevels,
     Scenario,
-    lane_of,
     level_name,
     names_of_levels,
 )
@@ -47,21 +45,19 @@ class Povs:
     Attributes:
         policies: folder of the networks that drive at levels 1 and 2.
         own: makes the controller that drives at the level of a person's own; None without one.
-        scenario_levels: the levels that the kind of scenario has.
     """
 
     policies: Path
     own: ControllerKind | None = None
-    scenario_levels: tuple[int, ...] = ALL_LEVELS
 
     @property
     def levels(self) -> tuple[int, ...]:
         """The levels for which there is a POV; level 0 needs no policy."""
-        return levels_in(self.policies, self.scenario_levels, own=self.own is not None)
+        return levels_in(self.policies, own=self.own is not None)
 
     def check_level(self, level: int) -> None:
         """Raise `UserError` where there is no POV of a level."""
-        check_level(level, self.policies, self.scenario_levels, own=self.own is not None)
+        check_level(level, self.policies, own=self.own is not None)
 
     def sha256(self) -> dict[str, str]:
         """Return the hashes of the policies by name."""
@@ -90,35 +86,26 @@ CHOICE: Final = "0, 1, 2, several with commas, all alone, or own with `pov`"
 ONE: Final = "0, 1 or 2, or own with `pov`"
 
 
-def levels_in(
-    policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
-) -> tuple[int, ...]:
-    """Return the levels of a scenario for which there is a POV; level 0 needs no policy."""
+def levels_in(policies: Path, *, own: bool) -> tuple[int, ...]:
+    """Return the levels for which there is a POV; level 0 needs no policy."""
     trained = policies_sha256(policies)
-    learned = {level for level, name in POLICIES.items() if name in trained}
-    ready = {0, *learned, OWN} if own else {0, *learned}
-    return tuple(level for level in scenario_levels if level in ready)
+    learned = [level for level, name in POLICIES.items() if name in trained]
+    return (0, *learned, OWN) if own else (0, *learned)
 
 
-def check_level(
-    level: int, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
-) -> None:
+def check_level(level: int, policies: Path, *, own: bool) -> None:
     """Raise `UserError` where there is no POV of a level."""
     if level not in ALL_LEVELS:
         raise UserError(f"there is no POV level {level}: choose {CHOICE}")
-    if level not in scenario_levels:
-        levels = either(map(level_name, scenario_levels))
-        raise UserError(f"this scenario has no POV level {level_name(level)}: choose {levels}")
     if level == OWN and not own:
         raise UserError("`level` own is a POV that you bring: name it with `pov`")
-    if level not in levels_in(policies, scenario_levels, own=own):
+    if level not in levels_in(policies, own=own):
         raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
 
 
 def parse_levels(
     asked: AnyLevels,
     policies: Path,
-    scenario_levels: tuple[int, ...] = ALL_LEVELS,
     *,
     own: bool,
     choice: str = CHOICE,
@@ -129,24 +116,22 @@ def parse_levels(
     """
     names = names_of_levels(asked)
     if names == ("all",):
-        return levels_in(policies, scenario_levels, own=own)
+        return levels_in(policies, own=own)
     by_name = {level_name(level): level for level in ALL_LEVELS}
     for name in names:
         if name not in by_name:
             raise UserError(f"there is no POV level {name!r}: choose {choice}")
-        check_level(by_name[name], policies, scenario_levels, own=own)
+        check_level(by_name[name], policies, own=own)
     if own and level_name(OWN) not in names:
         raise UserError(f"`pov` drives at `level` own or all, not at `level` {','.join(names)}")
     return tuple(level for name, level in by_name.items() if name in names)
 
 
-def one_level(
-    text: str, policies: Path, scenario_levels: tuple[int, ...] = ALL_LEVELS, *, own: bool
-) -> int:
+def one_level(text: str, policies: Path, *, own: bool) -> int:
     """Return the one level that a person names."""
     if text == "all" or "," in text:
         raise UserError(f"`level` {text} does not go here: choose {ONE}")
-    return parse_levels(text, policies, scenario_levels, own=own, choice=ONE)[0]
+    return parse_levels(text, policies, own=own, choice=ONE)[0]
 
 
 def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
@@ -251,7 +236,7 @@ def seen_from(case: Case, car: int) -> Case:
     x_other_m, v_other_mps = starts.pop(VUT)
     x_m, v_mps = starts[car]
     place: dict[str, Any] = {"x_vut0_m": min(x_m, BEFORE_M), "v_vut0_mps": v_mps}
-    if lane_of(case.scenario) is not None:
+    if case.scenario.lane_m is not None:
         place["lane_m"] = None
     scenario = replace(case.scenario, **place)
     told = (x_other_m, v_other_mps), (x_m, v_mps)

@@ -14,7 +14,7 @@ from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import Following
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT, lane_of
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
 from merge_sumo.scenario.signals import Left, series
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 from merge_sumo.simulation.kinematic_world import EquationWorld
@@ -113,9 +113,8 @@ class Rollout:
         """Rows of the record at which episodes time out."""
         self.next_timeout = NEVER
         # One row per step of the world: x, v, a of every vehicle. An episode lies in one piece.
-        self.ends_as = End(world.scenario.ends_as)
         self.follow_steps = round(world.scenario.follow_up_s / DT_S)
-        has_lane = lane_of(world.scenario) is not None
+        has_lane = world.scenario.lane_m is not None
         self.merging = Merging(corridors, world.scenario) if has_lane else None
         self.ring = RING_ROWS + self.follow_steps
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
@@ -152,7 +151,7 @@ class Rollout:
             if self.merging is not None:
                 arrived = self.merging.merged & self.active
             else:
-                arrived = world.scenario.has_ended(world.x_m, world.v_mps) & self.active
+                arrived = world.scenario.has_ended(world.x_m) & self.active
             # In most steps no episode ends.
             if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
                 ended = arrived | (self.row >= self.timeout_at)
@@ -164,7 +163,7 @@ class Rollout:
                     if corridor in self.errors:
                         self.finish(corridor, *self.errors.pop(corridor))
                     else:
-                        self.finish(corridor, self.ends_as if arrived[corridor] else End.TIMEOUT)
+                        self.finish(corridor, End.MERGED if arrived[corridor] else End.TIMEOUT)
                 self.refill(corridors)
         return [trajectory for _, trajectory in sorted(self.ended.items())]
 
@@ -344,6 +343,6 @@ class Rollout:
             after, clipped = None, int(self.clipped[corridor])
         else:
             motion, after = cut_at(motion, episode.merge_row - episode.first_row)
-            end, clipped = self.ends_as, episode.clipped
+            end, clipped = End.MERGED, episode.clipped
         ended = Trajectory(episode.case, motion, end, error, clipped, after, *left)
         self.ended[episode.index] = ended

@@ -11,7 +11,7 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.lane import LanePov
 from merge_sumo.drivers.sensing import SensedDriver
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import Scenario, lane_of
+from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import SimulationPlan
@@ -95,5 +95,5 @@ def corridors_of(plan: SimulationPlan, most: int) -> int:
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:
     """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
     library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
-    drives_on = lane_of(scenario) is not None or scenario.follow_up_s > 0.0
+    drives_on = scenario.lane_m is not None or scenario.follow_up_s > 0.0
     return LanePov(library) if drives_on else library

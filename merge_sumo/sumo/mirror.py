@@ -17,8 +17,7 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
 from merge_sumo.road.xml_input import harmless_net, to_bytes
-from merge_sumo.scenario.colours import rgb
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, rgb
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
 NET: Final = "road.net.xml"

@@ -30,7 +30,6 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.road.netfile import FARTHEST_M
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.kinds import scenario_of_record
 from merge_sumo.scenario.scenario import (
     DT_S,
     MAX_EPISODE_S,
@@ -38,7 +37,7 @@ from merge_sumo.scenario.scenario import (
     US23,
     VEHICLES,
     VUT,
-    lane_of,
+    Scenario,
 )
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.sumo.binding import run_program, scratch_folder
@@ -222,7 +221,7 @@ def _outcome(path: Path) -> Outcome:
     record: Any = read_record(path, dict[str, Any])
     try:
         written = record.pop(SCENARIO, None)  # folders of older versions have none
-        scenario = US23 if written is None else scenario_of_record(written)
+        scenario = US23 if written is None else convert(written, Scenario)
         return Outcome.from_json(to_json(record), scenario)
     except UserError as error:
         raise UserError(f"{path} is not the case of a replay: {error}") from error
@@ -235,7 +234,7 @@ def _road(path: Path, outcome: Outcome) -> Road:
         if content != shipped.path.read_bytes():
             raise UserError(f"{path} is not the net of this version: export the case again")
         return Road(content, shipped, NET)
-    corridor = corridor_of_hosted(content, path, lane_of(outcome.case.scenario))
+    corridor = corridor_of_hosted(content, path, outcome.case.scenario.lane_m)
     return Road(hosted_net(corridor, 1, lane_goes_on=True), corridor, HOSTED_NET)
 
 

@@ -28,10 +28,8 @@ from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import to_bytes
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.colours import rgb
-from merge_sumo.scenario.coordinates import described
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name
+from merge_sumo.scenario.case import Case, described
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 

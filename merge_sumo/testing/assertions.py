@@ -11,7 +11,7 @@ from merge_sumo.config import NoFailures
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import printable
 from merge_sumo.results import CampaignRun
-from merge_sumo.scenario.coordinates import described
+from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
 

@@ -24,8 +24,7 @@ from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario
+from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario, Units
 from merge_sumo.training.game import Game, of_two, pool_starts
 from merge_sumo.training.picture import GamePicture
 from merge_sumo.training.reward import Reward, RewardWeights, Role

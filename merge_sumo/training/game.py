@@ -16,24 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
-from merge_sumo.drivers.levelk import (
-    ACTIONS,
-    DECISION_STEPS,
-    QNetwork,
-    actions_mps2,
-    features,
-)
+from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork, actions_mps2, features
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import DT_S, MergeScenario, Scenario, as_merge
+from merge_sumo.scenario.scenario import DT_S, Scenario, Units
 from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 
 IntArray = NDArray[np.int64]
 
 
-def of_two(scenario: Scenario) -> MergeScenario:
+def of_two(scenario: Scenario) -> Scenario:
     """Return a scenario without other cars: a level is a driver's answer to the VUT alone."""
-    return replace(as_merge(scenario), headway_ahead_s=None, headway_behind_s=None)
+    return replace(scenario, headway_ahead_s=None, headway_behind_s=None)
 
 
 Policy = Callable[[FloatArray, FloatArray], IntArray]
@@ -176,7 +169,7 @@ def inputs_of(
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
     """Return `n` starting states, (n, 4), uniform over the pool."""
-    merge = as_merge(scenario)
+    merge = scenario
     x_pov = rng.uniform(*merge.x_pov0_m, n)
     v_pov = rng.uniform(*merge.v_pov0_mps, n)
     v_vut = _starting_speeds(n, rng, scenario)
@@ -199,7 +192,7 @@ def exploring_starts(
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
     x_vut0, a, v_cruise = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
-    merge = as_merge(scenario)
+    merge = scenario
     (x_low, _), (v_low, v_high) = merge.x_pov0_m, merge.v_pov0_mps
     x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
     v_vut0 = _starting_speeds(n, rng, scenario)

@@ -15,8 +15,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.colours import COLOURS
-from merge_sumo.scenario.scenario import Scenario
+from merge_sumo.scenario.scenario import COLOURS, Scenario
 
 ROAD: Final = "#c9c7c1"
 INK: Final = "#1c2228"

@@ -16,8 +16,7 @@ from typing import Final, Literal, Self
 import numpy as np
 
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scale import Units
-from merge_sumo.scenario.scenario import DT_S, Scenario
+from merge_sumo.scenario.scenario import DT_S, Scenario, Units
 
 Role = Literal["pov", "vut"]
 FULL_GAP_M: Final = 45.0

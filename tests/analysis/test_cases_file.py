@@ -337,7 +337,7 @@ def test_a_net_of_ones_own_is_found_from_the_file(tmp_path):
         ("tolerance = 0.01", "tolerance = nan", "tolerance is nan"),
         ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': did you mean tolerance?"),
         ('scenario = {name = "us23"}', 'scenario = "us99"', "scenario is 'us99': it must be a"),
-        ('name = "us23"', 'kind = "us99"', "kind is 'us99'"),
+        ('name = "us23"', 'kind = "us99"', "has no 'kind'"),
         ('fail_when = "paper"', 'fail_when = "scores < 3"', "there is no measure 'scores'"),
         ("level = 0", "level = 0, was = 1", "has no 'was'"),
         ("x_pov0_m = -", "x_pov0_m = -9", "choose between -900 and 0"),

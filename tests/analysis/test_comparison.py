@@ -18,12 +18,7 @@ from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 from support.handmade import drive
 
-from merge_sumo.analysis.comparison import (
-    Change,
-    ComparedCase,
-    Region,
-    compare,
-)
+from merge_sumo.analysis.comparison import Change, ComparedCase, Region, compare
 from merge_sumo.analysis.rerun import rerun
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.journal import Journal
@@ -36,12 +31,12 @@ from merge_sumo.metrics.score import Measures, Outcome, measure
 from merge_sumo.metrics.summary import RunsOfCase
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
-from merge_sumo.scenario.case import MergeCase, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
 BALL = math.pi * 0.05**2
-CASE = MergeCase(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 Point = tuple[float, float, str]
 
 

@@ -25,7 +25,7 @@ from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
 from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.merge import road_for
-from merge_sumo.scenario.case import Case, MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -44,7 +44,7 @@ maybe = st.none() | number
 def cases(draw) -> Case:
     level = draw(st.sampled_from([0, 1, 2]))
     svo = st.floats(0.0, math.nextafter(math.pi / 2, 0.0)) if level == 2 else st.none()
-    return MergeCase(
+    return Case(
         level=level,
         x_pov0_m=draw(st.floats(-900.0, 0.0)),
         v_pov0_mps=draw(st.floats(0.0, 45.0)),
@@ -84,7 +84,7 @@ any_outcome = st.builds(
 def episode(index: int, batch: int = 0, steps: int = 60) -> Episode:
     """Return an episode with numbers that no short decimal holds."""
     rng = np.random.default_rng(index)
-    case = MergeCase(
+    case = Case(
         level=0, x_pov0_m=-200.0 - index / 3.0, v_pov0_mps=30.0 + 1.0 / (index + 3.0), scenario=US23
     )
     motion = rng.normal(size=(steps + 1, 2, 3))

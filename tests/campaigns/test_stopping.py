@@ -12,7 +12,7 @@ from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, has_converged
 from merge_sumo.metrics.score import Measures, Outcome
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
@@ -22,7 +22,7 @@ def outcomes(*failing: int, cases: int) -> list[Outcome]:
     ran: list[Outcome] = []
     for place in range(cases):
         x_m = -338.0 + 17.0 * failing.index(place) if place in failing else -181.0
-        case = MergeCase(level=0, x_pov0_m=x_m, v_pov0_mps=30.0, scenario=US23)
+        case = Case(level=0, x_pov0_m=x_m, v_pov0_mps=30.0, scenario=US23)
         score = -600.0 if place in failing else -1.0
         ran.append(Outcome(place, place, case, Measures(end=End.MERGED, score=score, t_end_s=8.3)))
     return ran
@@ -43,7 +43,7 @@ class TestTheRule:
 
     def test_goes_on_where_one_level_grows(self):
         ran = outcomes(3, cases=200)
-        late = MergeCase(level=1, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        late = Case(level=1, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         measures = Measures(end=End.MERGED, score=-600.0, t_end_s=8.3)
         assert has_converged(ran)
         assert not has_converged([*ran, Outcome(200, 200, late, measures)])

@@ -19,7 +19,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.run import OUTCOMES
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.scenario.case import Case, MergeCase, Pool
+from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
 
 CRITERION = "after_gap_m < 12 or ttc_s < 3"
@@ -139,7 +139,7 @@ def probability_judges_as_run(world: World) -> None:
     assert found["missed"], "else nothing is told apart"
     for given in found["missed"][:3]:
         fixed = {"v_vut0_mps": world.scenario.bounds("v_vut0_mps")[0]}
-        assert world.judged(MergeCase(scenario=world.scenario, **{**fixed, **given}))
+        assert world.judged(Case(scenario=world.scenario, **{**fixed, **given}))
 
 
 def exports_and_replay_have_the_motion(world: World, records: list[dict[str, Any]]) -> None:

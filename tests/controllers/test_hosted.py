@@ -25,7 +25,7 @@ from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Scene, VutLostError
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 
 OPTIONS = ControllerOptions(deadline_s=0.3)
@@ -196,7 +196,7 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
 
 def test_the_lane_and_who_has_merged_reach_the_process_and_the_rest_of_the_case_does_not():
     lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
-    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
     sent = scene(2)._replace(merged=np.array([False, True]))
     request = decode_request(
         encode(HostRequest("act", starts=[(1, Start.of(case))], scene=packed(sent)))

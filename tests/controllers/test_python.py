@@ -16,7 +16,7 @@ from support.campaigning import campaign_settings, run_campaign
 from support.vut_contract import LEVEL0_CLASS, cases_of, in_process, run_cases
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23, VUT
 from merge_sumo.scenario.trajectory import End
 
@@ -95,7 +95,7 @@ class Vut:
 
 
 def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
-    case = MergeCase(
+    case = Case(
         level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
     )
     (trajectory,) = run_cases(in_process(vut(WATCHER)), [case])

@@ -14,13 +14,13 @@ from support.vut_contract import cases_of, factory, run_cases, run_on
 from merge_sumo.controllers.sumo_model import LANE_CHANGE_OPTIONS, MODELS
 from merge_sumo.errors import UserError
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.binding import sumo_program
 from merge_sumo.sumo.world import World
 
-FREE = MergeCase(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
+FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
 """The POV is gone before the VUT arrives."""
 
 

@@ -35,11 +35,11 @@ from merge_sumo.controllers.traci.vut import TraciVut
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End
 
-CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )

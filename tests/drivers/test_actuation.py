@@ -9,7 +9,7 @@ import pytest
 
 from merge_sumo.drivers.actuation import ActuatedDriver
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
 
@@ -30,7 +30,7 @@ def executed(commands, v_mps=20.0, **act):
     actuation = Actuation(**act)
     driver = ActuatedDriver(Commands(commands))
     scenario = replace(US23, act=actuation)
-    driver.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
+    driver.begin(0, Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
     done, clipped = [], []
     for step in range(len(commands)):
         x, v = np.array([-100.0]), np.array([v_mps])
@@ -83,7 +83,7 @@ def test_an_answer_that_is_no_number_is_passed_on_at_once():
 def test_an_episode_begins_with_nothing_commanded():
     driver = ActuatedDriver(Commands([2.0, 2.0, 2.0]))
     scenario = replace(US23, act=Actuation(delay_s=0.1, lag_s=0.2))
-    case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario)
+    case = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario)
     scene = Scene.of_pair(np.array([True]), np.array([0]), *np.full((4, 1), 20.0))
     driver.begin(0, case)
     assert driver.act(scene)[0] == 0.0

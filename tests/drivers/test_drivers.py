@@ -11,10 +11,10 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 
-CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 DESIGN = RuleBasedDesign(x1_m=100.0, x2_m=40.0, gap_m=15.0, target_m=15.0, kp=0.2, ki=0.1, kd=0.05)
 
 

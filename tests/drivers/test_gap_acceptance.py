@@ -9,10 +9,10 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.gap_acceptance import ROUNDABOUT, GapAcceptanceVut
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 
 SCENARIO = named_scenario("roundabout")
-CASE = MergeCase(level=0, x_pov0_m=-50.0, v_pov0_mps=8.0, v_vut0_mps=6.0, scenario=SCENARIO)
+CASE = Case(level=0, x_pov0_m=-50.0, v_pov0_mps=8.0, v_vut0_mps=6.0, scenario=SCENARIO)
 
 
 @pytest.fixture

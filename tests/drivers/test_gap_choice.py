@@ -13,7 +13,7 @@ from support.vut_contract import LANE, ON_LANE, begin, factory, run_on
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End
 
@@ -106,6 +106,6 @@ def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
 
 def test_a_point_of_its_own_is_the_scenarios():
     shorter = replace(LANE, lane_m=(-20.0, 40.0))
-    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=shorter)
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=shorter)
     assert asked([500.0, -40.0], [30.0, 20.0], case=case)[1] == STAY
     assert asked([500.0, -22.0], [30.0, 20.0], case=case)[1] == MERGE

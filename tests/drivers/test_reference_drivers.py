@@ -18,19 +18,14 @@ from merge_sumo.drivers.reference import (
     Reg157Vut,
     RssVut,
 )
-from merge_sumo.drivers.safety_models import (
-    FsmModel,
-    Pair,
-    rss_distance_m,
-    ttc_s,
-)
+from merge_sumo.drivers.safety_models import FsmModel, Pair, rss_distance_m, ttc_s
 from merge_sumo.metrics.merge import brake_after_mps2
-from merge_sumo.scenario.case import MergeCase
-from merge_sumo.scenario.scenario import DT_S, US23, MergeScenario
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.povs import PovLibrary
 
-CASE = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=US23)
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 OF_TABLE = {"CC": "careful", "FSM": "fsm", "Reg157": "reg157", "RSS": "rss"}
 
@@ -46,7 +41,7 @@ def one(value):
 
 def started(driver, scenario=US23):
     made = driver(1)
-    made.begin(0, MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
+    made.begin(0, Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
     return made
 
 
@@ -96,7 +91,7 @@ class TestRampDrivers:
         assert answers(started(CarefulVut), at_m(0.0), 13) == [0.0] * 13
         # Perceived for the first time: 0.4 s and 0.75 s, with the pedal released.
         near = scene(-36.0, 20.0, -55.9, 28.0)
-        found = answers(started(CarefulVut, MergeScenario(a_min_mps2=-9.0)), near, 15)
+        found = answers(started(CarefulVut, Scenario(a_min_mps2=-9.0)), near, 15)
         assert found == [-0.4] * 12 + [-1.665, -2.93, -4.195]
 
     def test_reg157_reacts_when_it_would_just_stop_before_m(self):
@@ -121,7 +116,7 @@ class TestRampDrivers:
         assert answers(fsm, at_m(0.0), 9) == [0.0] * 8 + [-1.265]
 
     def test_fsm_brakes_by_6_where_4_is_too_late(self):
-        hard = MergeScenario(a_min_mps2=-9.0)
+        hard = Scenario(a_min_mps2=-9.0)
         # 0.5 s before M braking by 4 m/s2 costs 0.02 s and by 6 m/s2 0.03 s: 0.6 m and 0.9 m.
         late = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-14.0), 14)[-1]
         early = answers(started(FsmVut, hard), at_m(5.25, x_vut_m=-80.0), 14)[-1]
@@ -163,7 +158,7 @@ class TestTables:
         rows = [row for row in rows_of("ramp.csv") if row["driver"] == name]
         assert len(rows) == 240
         cases = [
-            MergeCase(
+            Case(
                 level=int(row["level"]),
                 x_pov0_m=float(row["x_pov0_m"]),
                 v_pov0_mps=float(row["v_pov0_mps"]),

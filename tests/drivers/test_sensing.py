@@ -12,7 +12,7 @@ import merge_sumo as ms
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.sensing import SensedDriver, far_m
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import POV, US23, VUT
 
@@ -35,9 +35,9 @@ class Sees(Driver):
         return np.zeros(self.corridors)
 
 
-def case_with(x_pov0_m=-200.0, v_pov0_mps=30.0, **sense: Any) -> MergeCase:
+def case_with(x_pov0_m=-200.0, v_pov0_mps=30.0, **sense: Any) -> Case:
     scenario = replace(US23, sense=Sensing(**sense))
-    return MergeCase(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, scenario=scenario)
+    return Case(level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, scenario=scenario)
 
 
 def seen_of(case, steps=8, v_vut_mps=18.0):
@@ -117,7 +117,7 @@ def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
     from merge_sumo.road.scenario_file import named_scenario
 
     scenario = replace(named_scenario("us23-traffic"), sense=Sensing(range_m=40.0))
-    case = scenario.case_type(
+    case = Case(
         level=0,
         x_pov0_m=-300.0,
         v_pov0_mps=30.0,

@@ -65,12 +65,6 @@ def test_without_the_motion_is_how_they_arrived():
     assert cause(outcome, None) == f"Safe: {arrived}"
 
 
-def test_of_a_scenario_without_a_merge_is_the_motion_and_its_end():
-    text = said(meeting(BRAKES, COASTS, gap_m=-30.0), end=End.COMPLETED)
-    course = "the VUT accelerates, the POV begins to brake at 3.0 s, and the episode ends at 8 s"
-    assert text == f"Safe: {course}."
-
-
 @pytest.mark.parametrize("message", ["boom", "boom."])
 def test_of_an_error_is_its_message(message):
     trajectory = replace(meeting(KEEP, LEVEL0), end=End.VUT_ERROR, error=message)

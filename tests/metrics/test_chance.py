@@ -22,15 +22,15 @@ from merge_sumo.metrics.summary import (
     runs_needed,
     undecided,
 )
-from merge_sumo.scenario.case import MergeCase, to_unit
+from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
-CASE = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.5, scenario=US23)
+CASE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.5, scenario=US23)
 FAILS, PASSES = -600.0, -20.0
 
 
-def outcomes(runs: Sequence[tuple[MergeCase, int, float | None]]) -> list[Outcome]:
+def outcomes(runs: Sequence[tuple[Case, int, float | None]]) -> list[Outcome]:
     """Return outcomes of (case, draw, score), without a verdict for None."""
     return [
         Outcome(

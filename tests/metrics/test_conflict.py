@@ -7,7 +7,7 @@ import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import Conflict, check_from
-from merge_sumo.scenario.case import FloatArray, MergeCase
+from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 
@@ -38,14 +38,14 @@ def test_is_looked_for_from_the_merge_on(
     whole = motion(gaps_m, closing_mps)
     row, what = Conflict.find(whole, 2, LENGTHS_M)
     assert (row, what.startswith(expected[1])) == (expected[0], True)
-    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
     before, after = cut_at(whole, 2)
     assert Conflict.of(Trajectory(case, before, End.MERGED, after=after)) == (row, what)
 
 
 @pytest.mark.parametrize("end", [End.TIMEOUT, End.VUT_ERROR, End.SIM_ERROR])
 def test_is_the_end_without_a_merge(end: End) -> None:
-    case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
     trajectory = Trajectory(case, motion([-1.0, 2.0, 1.0], [5.0] * 3), end)
     assert Conflict.of(trajectory) == (2, "the end of the episode")
 

@@ -104,7 +104,7 @@ class TestRefused:
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
             ("zzzzzzzz < 1.5", "choose score, dx_m"),
             ("papr", "did you mean paper?"),
-            ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is COMPLETED,"),
+            ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is MERGED or"),
             ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
             ('end < "TIMEOUT"', "compare it with == or !="),
             ("end == merged_first", "with a text in quotes"),

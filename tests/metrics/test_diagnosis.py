@@ -10,7 +10,7 @@ import pytest
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -40,7 +40,7 @@ def meeting(a_pov: np.ndarray, a_vut: np.ndarray, gap_m: float = 1.0) -> Traject
     pov = drive(0.0, 30.0, a_pov)
     vut[:, 0] -= vut[-1, 0]
     pov[:, 0] += gap_m - pov[-1, 0]
-    case = MergeCase(level=1, x_pov0_m=float(pov[0, 0]), v_pov0_mps=30.0, scenario=US23)
+    case = Case(level=1, x_pov0_m=float(pov[0, 0]), v_pov0_mps=30.0, scenario=US23)
     return Trajectory(case, np.stack([pov, vut], axis=1), End.MERGED)
 
 
@@ -79,7 +79,7 @@ class TestWhichVehicleBrakes:
         # The POV keeps its speed far away; the car behind is the one that arrives with the VUT.
         pov = drive(-400.0, 30.0, KEEP)
         motion = np.stack([pov, pair.motion[:, VUT], ahead, pair.motion[:, POV]], axis=1)
-        case = MergeCase(
+        case = Case(
             level=1,
             x_pov0_m=-400.0,
             v_pov0_mps=30.0,
@@ -116,7 +116,7 @@ class TestTheKind:
 def outcome(index: int, x: float, v: float, failed: bool, level: int = 1) -> Outcome:
     """Return an outcome of a case at (x, v), with both cars at M or far apart."""
     svo = 0.5 if level == 2 else None
-    case = MergeCase(level=level, x_pov0_m=x, v_pov0_mps=v, svo_rad=svo, scenario=US23)
+    case = Case(level=level, x_pov0_m=x, v_pov0_mps=v, svo_rad=svo, scenario=US23)
     gap = 0.0 if failed else 40.0
     motion = np.array(
         [[[gap - v * DT_S, v, 0.0], [-1.8, 18.0, 0.0]], [[gap, v, 0.0], [0.0, 18.0, 0.0]]]

@@ -21,11 +21,11 @@ from merge_sumo.metrics.score import (
     sustained_brake_mps2,
     time_to_collision,
 )
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-CASE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def ending(dx, v_pov=30.0, v_vut=26.0, end=End.MERGED, steps=10, a_vut=0.0):

@@ -26,7 +26,7 @@ from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.scenario import US23, as_merge, lane_of
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 TRIALS = Path(__file__).parents[2] / "tools" / "trial_vuts.py"
@@ -41,9 +41,7 @@ VUTS = (
 )
 CASES = 40
 """Of each controller."""
-ON_LANE = replace(
-    as_merge(named_scenario("us23-lane")), name="stop", follow_up_s=0.0, lane_end="stop"
-)
+ON_LANE = replace(named_scenario("us23-lane"), name="stop", follow_up_s=0.0, lane_end="stop")
 LENGTH_M, NEAR_M, DT_S, BRAKED_MPS = 5.0, 6.0, 0.1, 1.0
 NUMBER = r"(-?\d+(?:\.\d+)?)"
 DOES = rf"(begins to brake at {NUMBER} s|accelerates|keeps its speed within 1 m/s)".replace(
@@ -75,7 +73,7 @@ class Told:
         self.after = trajectory.whole[len(self.vut) - 1 :, :2].tolist()
         x_pov, x_vut = self.pov[-1][0], self.vut[-1][0]
         self.dx, self.end_s = x_pov - x_vut, (len(self.vut) - 1) * DT_S
-        self.lane_m = lane_of(trajectory.case.scenario)
+        self.lane_m = trajectory.case.scenario.lane_m
         self.place_m = x_vut if self.lane_m else 0.0
         self.arrived = trajectory.end is End.MERGED if self.lane_m else x_vut >= 0.0
 

@@ -9,13 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.foreign_nets import (
-    FOREIGN,
-    LANE_M,
-    LANES,
-    lane_corridor_of,
-    lane_drop,
-)
+from support.foreign_nets import FOREIGN, LANE_M, LANES, lane_corridor_of, lane_drop
 
 from merge_sumo import api
 from merge_sumo.errors import UserError
@@ -24,7 +18,7 @@ from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.scenario import MergeScenario
+from merge_sumo.scenario.scenario import Scenario
 
 EXACT = 1e-9
 
@@ -94,16 +88,14 @@ class TestTheWindow:
 
 class TestAScenario:
     @staticmethod
-    def new(
-        folder: Path, build, mainline: str, ramp: str, **more
-    ) -> tuple[MergeScenario, list[str]]:
+    def new(folder: Path, build, mainline: str, ramp: str, **more) -> tuple[Scenario, list[str]]:
         folder.mkdir(exist_ok=True)
         file = folder / "mine.toml"
         lines = api.new_scenario(
             file, net=build(folder), mainline=mainline, ramp=ramp, **more
         ).lines()
         scenario = named_scenario(str(file))
-        assert isinstance(scenario, MergeScenario)
+        assert isinstance(scenario, Scenario)
         return scenario, lines
 
     def test_for_a_marked_lane_begins_before_the_gore_and_has_m_at_a_share_of_035(self, tmp_path):

@@ -25,16 +25,13 @@ from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.road.xml_input import MAX_BYTES
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo import mirror
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.replay_folder import (
-    HOLD_STEPS,
-    write_scenario,
-)
+from merge_sumo.sumo.replay_folder import HOLD_STEPS, write_scenario
 from merge_sumo.sumo.world import World
 
 LANE_WIDTH_M = 3.2
@@ -43,7 +40,7 @@ LANE_WIDTH_M = 3.2
 def commanded(a_mps2: np.ndarray, road) -> Trajectory:
     """Return the motion of eq. (4) under accelerations, (steps, 2); no speed falls below 0."""
     far_m = (road.mainline.before_m, road.ramp.before_m)
-    case = MergeCase(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
+    case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
     x, v = -np.minimum([-case.x_pov0_m, 182.0], far_m), np.array([case.v_pov0_mps, case.v_vut0_mps])
     rows = []
     for wanted in a_mps2:

@@ -6,12 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.metrics.score import Measures, Outcome
-from merge_sumo.samplers.allocation import (
-    even_shares,
-    last_failure_share,
-    whole_shares,
-)
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.samplers.allocation import even_shares, last_failure_share, whole_shares
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
@@ -30,7 +26,7 @@ batch_sizes = st.integers(0, 300)
 def outcome(index: int, batch: int, level: int, *, failed: bool) -> Outcome:
     end, score = End.MERGED, -700.0 if failed else -3.0
     svo = 0.5 if level == 2 else None
-    case = MergeCase(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo, scenario=US23)
+    case = Case(level=level, x_pov0_m=-200.0, v_pov0_mps=30.0, svo_rad=svo, scenario=US23)
     return Outcome(index, batch, case, Measures(end=end, score=score, t_end_s=8.3))
 
 

@@ -15,11 +15,11 @@ from merge_sumo.samplers.predictor import (
     gain_factor,
     model_weight,
 )
-from merge_sumo.scenario.case import MergeCase
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
-CASE = MergeCase(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 
 
 def outcome(*, failed, model=0.5, surrogate=0.5, p_fail=0.5, predicted=True):

@@ -13,15 +13,15 @@ from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.samplers.failure_probability import FailureProbability
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
-from merge_sumo.scenario.case import MergeCase, Pool
+from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
-CASE = MergeCase(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
+CASE = Case(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
 OTHER = replace(CASE, v_pov0_mps=31.0)
 
 
-def told(*runs: tuple[MergeCase, int, float, float], tolerated: float = 0.0) -> LevelHistory:
+def told(*runs: tuple[Case, int, float, float], tolerated: float = 0.0) -> LevelHistory:
     """Return the history of runs (case, draw, score, dx)."""
     sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
     sampler.tolerated = tolerated

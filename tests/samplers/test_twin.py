@@ -23,7 +23,10 @@ from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.samplers.observation import NOW, Observation
 from merge_sumo.samplers.rollout import FAR, ModelRollout
-from merge_sumo.scenario.case import MergeCase, Pool
+from merge_sumo.scenario.case import (
+    Case,
+    Pool,
+)
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.evaluate import simulate
@@ -164,7 +167,7 @@ class TestTwin:
 def outcome(
     index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
 ) -> Outcome:
-    case = MergeCase(
+    case = Case(
         level=level,
         x_pov0_m=-300.0,
         v_pov0_mps=30.0,

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import MergeCase, from_unit, to_unit
+from merge_sumo.scenario.case import Case, from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
 
 
@@ -53,4 +53,4 @@ def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
 def test_a_case_that_is_no_scenario_is_refused_with_a_sentence(change, sentence):
     values = {"level": 1, "x_pov0_m": -273.0, "v_pov0_mps": 33.0} | change
     with pytest.raises(UserError, match=sentence):
-        MergeCase(**{"scenario": US23, **values})
+        Case(**{"scenario": US23, **values})

@@ -11,7 +11,7 @@ from merge_sumo.analysis.comparison import compare
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.pages import X_AXIS, source_of
 from merge_sumo.reports.report import report_page
-from merge_sumo.scenario.colours import COLOURS
+from merge_sumo.scenario.scenario import COLOURS
 
 PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
 

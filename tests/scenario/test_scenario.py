@@ -16,8 +16,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.score import measure
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
-from merge_sumo.scenario.case import MergeCase, Pool, to_unit
-from merge_sumo.scenario.scenario import RANGES, US23, MergeScenario
+from merge_sumo.scenario.case import Case, Pool, to_unit
+from merge_sumo.scenario.scenario import RANGES, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 
@@ -66,7 +66,7 @@ class TestAFile:
         assert said in str(refused.value)
         assert str(refused.value).startswith(f"{path}, line 3: ")
 
-    @pytest.mark.parametrize("field", [f for f in fields(MergeScenario) if f.name in RANGES])
+    @pytest.mark.parametrize("field", [f for f in fields(Scenario) if f.name in RANGES])
     @pytest.mark.parametrize("number", ["1e200", "-1e200", "1" + "0" * 400, "1e5"])
     def test_beyond_a_road_and_its_cars_is_refused_with_a_range(self, tmp_path, field, number):
         value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
@@ -115,8 +115,8 @@ class TestACase:
         verdicts = [
             measure(Trajectory(case, motion, End.MERGED)).is_close
             for case in (
-                MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
-                MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
+                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
+                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
             )
         ]
         assert verdicts == [True, False]

@@ -13,7 +13,7 @@ from support.campaigning import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.scenario import US23, VUT
+from merge_sumo.scenario.scenario import LEVELS, US23, VUT
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +25,7 @@ def campaign_of(folder, name="us23"):
     scenario, cases = named_scenario(name), 24
     settings = CampaignSettings(
         vut="design2",
-        levels=scenario.levels[:3],
+        levels=LEVELS,
         cases=cases,
         batch=cases,
         sampler="uniform",

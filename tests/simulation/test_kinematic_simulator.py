@@ -16,7 +16,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.kinematic_simulator import CHECKED_SHARE, drawn
@@ -68,7 +68,7 @@ class TestACloseCall:
     def test_is_what_sumo_says(self):
         """The front bumpers are 6 m apart at M, to rounding errors."""
         plan = plan_for("level0")
-        case = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         (found,) = simulate(plan, [case])
         assert found.outcome.measures.dx_m is not None
         x_m = case.x_pov0_m + US23.dx_crash_m - found.outcome.measures.dx_m

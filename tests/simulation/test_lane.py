@@ -13,8 +13,8 @@ from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.metrics.score import measure
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import MergeCase
-from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, MergeScenario
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.evaluate import simulate
 
@@ -24,7 +24,7 @@ LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 class TestAWish:
     """Of the VUT: granted from the lane's begin on, in the next step; at its end it is forced."""
 
-    def step(self, x_m: float, wish: int | None, scenario: MergeScenario = LANE) -> bool:
+    def step(self, x_m: float, wish: int | None, scenario: Scenario = LANE) -> bool:
         merging = Merging(1, scenario)
         merging.begin(0)
         state = np.array([[-500.0], [x_m]]), np.full((2, 1), 20.0)
@@ -115,7 +115,7 @@ class TestAControllerThatRaisesAfterItsMerge:
 
 class TestAnEpisode:
     def merged(self, x_pov: float, v_pov: float, x_vut: float, v_vut: float) -> Trajectory:
-        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        case = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
         before = [[x_pov - v_pov * DT_S, v_pov, 0.0], [x_vut - v_vut * DT_S, v_vut, 0.0]]
         motion = np.array([before, [[x_pov, v_pov, 0.0], [x_vut, v_vut, 0.0]]])
         return Trajectory(case, motion, End.MERGED, after=motion[1:])
@@ -129,7 +129,7 @@ class TestAnEpisode:
         assert measures.dx_m == 10.0
 
     def test_of_a_vut_that_stood_has_the_time_since_the_pov_passed(self):
-        case = MergeCase(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
+        case = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=LANE)
         motion = np.zeros((31, 2, 3))
         motion[:, VUT, 0] = 30.0
         motion[:, POV, 0] = -27.0 + 3.0 * np.arange(31)  # passes the VUT after 1.9 s

@@ -18,12 +18,11 @@ from merge_sumo.drivers.levelk import actions_mps2, features
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, MergeCase, from_unit
-from merge_sumo.scenario.scenario import as_merge
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation import evaluate
 
-ROAD = as_merge(named_scenario("us23-lane"))
+ROAD = named_scenario("us23-lane")
 BEGIN_M, END_M = -70.0, 130.0
 DT_S, LENGTH_M, A_MIN, A_MAX = 0.1, 5.0, -4.0, 2.0
 CRUISE_MPS = 28.0
@@ -97,7 +96,7 @@ def acc_mps2(gap_m: float, v: float, v_leader: float, a_leader: float, v_wanted:
 class Pov:
     """Plays its level before the merge, with M at 0 and then at the lane's end; follows after."""
 
-    def __init__(self, case: MergeCase) -> None:
+    def __init__(self, case: Case) -> None:
         self.case, self.held = case, 0.0
 
     def policy_mps2(self, now: SimpleNamespace) -> float:
@@ -121,7 +120,7 @@ class Pov:
         return recovery if now.merged or past else policy
 
 
-def simulate(case: MergeCase, vut: Vut) -> tuple[float | None, float, float]:
+def simulate(case: Case, vut: Vut) -> tuple[float | None, float, float]:
     """Return the place of the merge, the least bumper gap within 5 s, and the needed braking."""
     now = SimpleNamespace(x_pov=case.x_pov0_m, v_pov=case.v_pov0_mps, x_vut=-182.0, a_vut=0.0)
     now.v_vut, now.merged, now.step, pov = case.v_vut0_mps, False, 0, Pov(case)
@@ -164,7 +163,7 @@ def test_an_episode_is_that_of_the_definition(name, level, tmp_path):
     results = evaluate.simulate(plan_for(spec, scenario=ROAD, criterion=Criterion("unsafe")), cases)
     for case, result in zip(cases, results, strict=True):
         verdict = result.outcome.verdict
-        assert isinstance(case, MergeCase)
+        assert isinstance(case, Case)
         place, least_m, braking = simulate(case, VUTS[name]())
         measures = result.outcome.measures
         assert (result.trajectory.end is End.MERGED) == (place is not None)

@@ -18,10 +18,10 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
-from merge_sumo.scenario.scenario import US23, as_merge
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.training.reward import RewardWeights
 
-ROUNDABOUT = as_merge(named_scenario("roundabout"))
+ROUNDABOUT = named_scenario("roundabout")
 
 
 class TestItsDrivers:

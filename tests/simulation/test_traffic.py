@@ -77,7 +77,7 @@ class TestCarsOfTheMainline:
         alone = cases_of(level, 60, US23)
         far = [
             replace(
-                case,  # type: ignore[call-arg]
+                case,
                 headway_ahead_s=18.0,
                 headway_behind_s=16.0,
                 scenario=TRAFFIC,

@@ -19,8 +19,7 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
-from merge_sumo.scenario.colours import rgb
-from merge_sumo.scenario.scenario import DT_S
+from merge_sumo.scenario.scenario import DT_S, rgb
 from merge_sumo.sumo.replay_folder import LABELS, VIEW
 
 PICTURE_TIMES_S = (2.0, 7.0)

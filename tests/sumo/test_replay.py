@@ -25,8 +25,8 @@ from merge_sumo.metrics.score import Outcome, measure
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case, MergeCase
-from merge_sumo.scenario.scenario import DT_S, US23, MergeScenario
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program, sumo_program
@@ -72,7 +72,7 @@ def constant(_: int) -> float:
 
 
 def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> Case:
-    return MergeCase(
+    return Case(
         level=0, x_pov0_m=x_pov0_m, v_pov0_mps=v_pov0_mps, v_vut0_mps=v_vut0_mps, scenario=US23
     )
 
@@ -146,7 +146,7 @@ class TestAnExport:
         assert {path.name for path in collision.iterdir()} == FILES
 
 
-OF_LEVEL_2 = MergeCase(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
+OF_LEVEL_2 = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
 MOTIONS: dict[str, tuple[Case, Command, Command, int, End]] = {
     "a timeout": (at_level_0(-250.0, 30.0), constant, lambda _: -4.0, 300, End.TIMEOUT),
     "bodies that overlap": (at_level_0(-182.0, 18.0), constant, constant, 102, End.MERGED),
@@ -183,10 +183,10 @@ class TestAnHonestRecordReplaysIdentically:
 def lane_road(tmp_path):
     """Return a function that finds the road of a net with an acceleration lane."""
 
-    def find(name: str) -> tuple[Corridor, MergeScenario]:
+    def find(name: str) -> tuple[Corridor, Scenario]:
         if name == "us23-lane":
             scenario = named_scenario(name)
-            assert isinstance(scenario, MergeScenario)
+            assert isinstance(scenario, Scenario)
             return road_for(scenario), scenario
         return lane_corridor_of(name, tmp_path), replace(US23, lane_m=LANE_M)
 
@@ -196,12 +196,12 @@ def lane_road(tmp_path):
 class TestAMergeFromALane:
     """The VUT drives at 20 m/s from 201 m before M, and merges in the first row past a place."""
 
-    def motion(self, scenario: MergeScenario, place_m: float, end: End) -> Trajectory:
+    def motion(self, scenario: Scenario, place_m: float, end: End) -> Trajectory:
         steps = int(np.ceil((place_m + 201.0) / 2.0))
         x_m = -201.0 + 2.0 * np.arange(steps + 1)
         vut = np.stack((x_m, np.full_like(x_m, 20.0), np.zeros_like(x_m)), axis=1)
         pov = vut + np.array([-30.0, 0.0, 0.0])
-        case = MergeCase(level=0, x_pov0_m=-231.0, v_pov0_mps=20.0, scenario=scenario)
+        case = Case(level=0, x_pov0_m=-231.0, v_pov0_mps=20.0, scenario=scenario)
         return Trajectory(case, np.stack((pov, vut), axis=1), end)
 
     def written(self, folder: Path, road: Corridor, trajectory: Trajectory) -> Path:

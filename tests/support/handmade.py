@@ -56,7 +56,7 @@ def cases_of(level: int, count: int, scenario: Scenario = US23) -> list[Case]:
     meets = {0: 8.9, 1: 8.8, 2: 8.7}[level]
     near = [
         replace(
-            case,  # type: ignore[call-arg]
+            case,
             x_pov0_m=max(-340.0, -meets * case.v_pov0_mps + float(rng.normal(0.0, 6.0))),
         )
         for case in cases[::2]

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any
 
-from merge_sumo.scenario.scenario import US23, MergeScenario
+from merge_sumo.scenario.scenario import US23, Scenario
 
-LIKE_A_ROUNDABOUT = MergeScenario(
+LIKE_A_ROUNDABOUT = Scenario(
     name="ring",
     x_pov0_m=(-60.0, -20.0),
     v_pov0_mps=(4.0, 10.0),
@@ -24,7 +24,7 @@ LIKE_A_ROUNDABOUT = MergeScenario(
 else many ways end at M to the last bit, and rounding decides in which step."""
 
 
-def times(scenario: MergeScenario, factor: float, units: tuple[str, ...]) -> MergeScenario:
+def times(scenario: Scenario, factor: float, units: tuple[str, ...]) -> Scenario:
     """Return a scenario with the numbers of some units multiplied."""
 
     def multiplied(value: Any) -> Any:

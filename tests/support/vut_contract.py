@@ -12,7 +12,7 @@ from support.plans import plan_for
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.scenario.case import Case, MergeCase, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.simulator import Simulator
@@ -26,7 +26,7 @@ class Level0:
 
 LANE = replace(US23, lane_m=(-70.0, 130.0), follow_up_s=5.0)
 """The paper's ramp with an acceleration lane."""
-ON_LANE = MergeCase(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
+ON_LANE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
 
 
 def on_lane(x_vut_m: Sequence[float], merged: Sequence[bool] | None = None) -> Scene:

@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 
 from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import TEMPLATES
-from merge_sumo.scenario.colours import COLOURS
+from merge_sumo.scenario.scenario import COLOURS
 from merge_sumo.training import picture
 from merge_sumo.training.env import MergeEnv
 from merge_sumo.training.registration import ENV_ID

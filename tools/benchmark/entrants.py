@@ -223,7 +223,7 @@ class WatchedSampler(Sampler):
 
     def _check(self, case: Case) -> None:
         scenario = self.pool.scenario
-        if not isinstance(case, scenario.case_type) or case.level not in self.pool.levels:
+        if not isinstance(case, Case) or case.level not in self.pool.levels:
             raise SamplerFaultError(
                 f"it gives {text_of(case, repr)[:60]}, which is no case of the pool"
             )

@@ -27,14 +27,7 @@ from merge_sumo.controllers.process import (
     split_command,
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.controllers.traci.child import (
-    HOST,
-    START_S,
-    WORK_S,
-    Answer,
-    Child,
-    FaultError,
-)
+from merge_sumo.controllers.traci.child import HOST, START_S, WORK_S, Answer, Child, FaultError
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
@@ -42,7 +35,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, lane_of
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.world import World
 
 DEFAULT_PORT: Final = 8813
@@ -136,7 +129,7 @@ class TraciVut(Driver):
         self._child = Child(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
         self._begins_m[VUT] = -road.ramp.before_m
-        self._lane_m = lane_of(scenario)
+        self._lane_m = scenario.lane_m
         self._limits_mps2 = scenario.a_min_mps2, scenario.a_max_mps2
         self._program: Program | None = None
         self._connected = self._has_started = False
