@@ -138,10 +138,55 @@ def append(log: Path, content: bytes) -> None:
             file.write(b"[what was printed before is gone]\n" + end)
 
 
-MOST_MESSAGE_BYTES: Final = 1 << 24
-BROKEN: Final = "broke the channel to its process"
 ENDING_S: Final = 2.0
 """Time that a process has to end by itself."""
+
+
+class Started:
+    """A process in a group of its own, and what it prints.
+
+    Attributes:
+        output: what it prints.
+    """
+
+    def __init__(
+        self, name: str, command: Sequence[str], log: Path | None, *, is_shown: bool, **more: Any
+    ) -> None:
+        """Start a process.
+
+        Args:
+            name: what it is, for a sentence.
+            command: its arguments.
+            log: file to which what it prints is added.
+            is_shown: whether it is shown where there is no log.
+            more: arguments of `subprocess.Popen`.
+
+        Raises:
+            UserError: if it cannot be started.
+        """
+        try:
+            # Ctrl-C in a terminal is for this process, which then ends the other.
+            self._process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                **more,
+            )
+        except OSError as error:
+            raise UserError(f"{name} cannot be started: {error.strerror}") from error
+        assert self._process.stdout is not None  # noqa: S101 (piped)
+        self.output = Output(self._process.stdout, log, is_shown=is_shown)
+
+    def signal(self, number: int) -> None:
+        """Send a signal to the process and to what it started, if any is left."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, number)
+
+
+MOST_MESSAGE_BYTES: Final = 1 << 24
+BROKEN: Final = "broke the channel to its process"
 
 
 class ProcessDiedError(Exception):
@@ -152,12 +197,11 @@ class ProcessDiedError(Exception):
         self.hung = hung
 
 
-class ChildProcess:
+class ChildProcess(Started):
     """A Python process that answers messages, and ends with this process.
 
     Attributes:
         alive: whether messages can be sent.
-        output: what it prints.
     """
 
     alive = False
@@ -193,29 +237,25 @@ class ChildProcess:
         their_lifeline, self._lifeline = os.pipe()
         inherited = {"lifeline": their_lifeline, "connection": theirs.fileno()}
         try:
-            self._process = subprocess.Popen(
+            super().__init__(
+                "a process for the VUT",
                 python_command(main, {**settings, **inherited}),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
+                log,
+                is_shown=is_shown,
                 pass_fds=tuple(inherited.values()),
                 cwd=cwd,
                 env=environment,
-                # Ctrl-C in a terminal is for this process, which then ends the other.
-                start_new_session=True,
             )
-        except OSError as error:
+        except UserError:
             self._socket.close()
             os.close(self._lifeline)
             folder.cleanup()
-            raise UserError(f"cannot start a process for the VUT: {error.strerror}") from error
+            raise
         finally:
             theirs.close()
             os.close(their_lifeline)
         self.alive = True
         self._connection = Connection(os.dup(self._socket.fileno()))
-        assert self._process.stdout is not None  # noqa: S101 (piped)
-        self.output = Output(self._process.stdout, log, is_shown=is_shown)
 
     def ask(self, content: bytes, patience_s: float) -> bytes:
         """Send a message, and return the answer; see `receive`."""
@@ -266,8 +306,7 @@ class ChildProcess:
         self._connection.close()
         self._socket.close()
         os.close(self._lifeline)
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        self.signal(signal.SIGKILL)
         self._process.wait()
         self.output.close()
         self._folder.cleanup()
@@ -338,8 +377,8 @@ def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     return tuple(filter(Path.is_file, map(Path, words)))
 
 
-class Program:
-    """A running program in a process group of its own; what it prints goes to a log."""
+class Program(Started):
+    """A running program of the user's."""
 
     def __init__(
         self, arguments: list[str], port: int, log: Path | None, *, is_shown: bool = True
@@ -355,23 +394,13 @@ class Program:
         Raises:
             UserError: if it cannot be started.
         """
-        try:
-            self._process = subprocess.Popen(
-                [argument.replace("{port}", str(port)) for argument in arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, "MERGE_SUMO_PORT": str(port)},
-                start_new_session=True,
-            )
-        except OSError as error:
-            raise UserError(
-                f"the command {arguments[0]!r} cannot be started: {error.strerror}"
-            ) from error
-        assert self._process.stdout is not None, "piped"  # noqa: S101
-        self._output = Output(self._process.stdout, log, is_shown=is_shown)
-        self.process = self._process.pid
-        """Id of its process, which is that of its session."""
+        super().__init__(
+            f"the command {arguments[0]!r}",
+            [argument.replace("{port}", str(port)) for argument in arguments],
+            log,
+            is_shown=is_shown,
+            env={**os.environ, "MERGE_SUMO_PORT": str(port)},
+        )
 
     def ended(self, patience_s: float) -> str:
         """Return how it ended and the last line that it printed; "" when it still runs."""
@@ -380,7 +409,7 @@ class Program:
         except subprocess.TimeoutExpired:
             return ""
         how = f"was ended by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        line = self._output.last_line()
+        line = self.output.last_line()
         return f"the controller {how}" + (f": {line}" if line else "")
 
     def stop(self, grace_s: float) -> None:
@@ -388,15 +417,11 @@ class Program:
         try:
             self._process.wait(grace_s)
         except subprocess.TimeoutExpired:
-            self._signal(signal.SIGTERM)
+            self.signal(signal.SIGTERM)
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(ENDING_S)
         finally:
             # The group, because a program may have started others that are left.
-            self._signal(signal.SIGKILL)
+            self.signal(signal.SIGKILL)
             self._process.wait()
-            self._output.close()
-
-    def _signal(self, number: int) -> None:
-        with suppress(ProcessLookupError, PermissionError):  # none may be left
-            os.killpg(self._process.pid, number)
+            self.output.close()
