@@ -1,10 +1,11 @@
-"""The share of all starts that fail, by uniform cases that are none of the campaign's.
+"""The share of all starts that fail, by uniform cases.
 
 A search looks for failures, so the share of its cases that fail says nothing of the pool. By the
 equations of motion thousands of uniform cases take less than a second; a share of them runs in
 SUMO, too (`simulation/kinematic_simulator.py`). A controller of a user is asked step by step, and
 takes as long without SUMO as in it: its cases run as those of the campaign do, in rounds, as many
-as fit into a part of the time of the campaign.
+as fit into a part of the time of the campaign. Where further cases would take long, those of a
+campaign that drew its cases uniformly are counted.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.summary import clopper_pearson
+from merge_sumo.metrics.summary import clopper_pearson, undecided
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
@@ -92,6 +93,21 @@ class Shares(Record, frozen=True):
 SHARES: Final = StudyFile("shares.json", Shares)
 
 
+def own_shares(run: Run) -> list[LevelShare]:
+    """Return the share of the cases of a campaign that fail; one that is undecided may fail.
+
+    It holds for all starts where the campaign drew its cases uniformly.
+    """
+    unsure = undecided(run.outcomes, run.tolerated)
+    shares = []
+    for level in run.levels:
+        cases = [outcome for outcome in run.cases if outcome.case.level == level]
+        failures = sum(outcome.failed and outcome.index not in unsure for outcome in cases)
+        unknown = sum(outcome.margin is None or outcome.index in unsure for outcome in cases)
+        shares.append(LevelShare(level, len(cases), failures, unknown))
+    return shares
+
+
 def note_shares(
     run: Run,
     plan: SimulationPlan,
@@ -102,9 +118,10 @@ def note_shares(
 ) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.
 
-    Nothing is written for drivers that ask SUMO, with which it takes long (`probability`), where a
-    case ends otherwise in SUMO than by eq. (4), where one may fail in some of its runs, nor of a
-    controller whose cases mostly end as errors.
+    Further cases do not run for drivers that ask SUMO, with which it takes long (`probability`),
+    where one may fail in some of its runs, nor for a controller whose cases mostly end as errors.
+    Nothing is written where a case ends otherwise in SUMO than by eq. (4). The cases of a campaign
+    that drew them uniformly are such a measurement themselves, and are counted instead.
 
     Args:
         run: the campaign.
@@ -117,6 +134,8 @@ def note_shares(
     errors = sum(outcome.measures.end.is_error for outcome in run.outcomes)
     random = run.tolerated or run.scenario.sense.is_random
     if plan.asks_sumo or random or 2 * errors > len(run.outcomes):
+        if run.settings.sampler == "uniform" and not run.settings.stop_when_converged:
+            SHARES.write(run.folder, Shares(tuple(own_shares(run))))
         return
     by_equations = plan.needs_sumo is None
     size, budget_s = (CASES, 0.0) if by_equations else (ROUND, PART * took_s)

@@ -136,3 +136,15 @@ def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_name
     assert SHARES.read(run.folder) is None
     said = f"starts that fail are not measured: merge-sumo probability {run.folder}"
     assert any(line.endswith(said) for line in run.lines())
+
+
+def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
+    run = api.campaign(
+        "sumo:IDM", sampler="uniform", level="0", cases=10, out=tmp_path / "run", progress=False
+    )
+    failures = sum(outcome.failed for outcome in run.run.outcomes)
+    [level] = SHARES.read(run.folder).levels
+    assert level == LevelShare(level=0, cases=10, failures=failures)
+    said = f"  {level.shown} of all starts fail, by 10  "
+    assert any(said in line for line in run.lines())
+    assert not any("not measured" in line for line in run.lines())
