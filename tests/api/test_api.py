@@ -61,12 +61,6 @@ def test_the_import_costs_nothing():
     assert done.stdout.split() == ["False"]
 
 
-def test_a_verb_with_the_name_of_a_folder_is_called_twice():
-    script = "import merge_sumo as ms; print(ms.vuts() == ms.vuts() or ms.vuts())"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert done.returncode == 0, done.stderr
-
-
 def test_a_name_that_is_not_there_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nothing_like_it"):
         getattr(ms, "nothing_like" + "_it")

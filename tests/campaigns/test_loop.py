@@ -89,16 +89,17 @@ class TestRoom:
         found(sampler, cases, **how)
         return sampler.asked
 
-    def test_in_batches_is_for_one_group(self):
-        assert self.asked(5, batch=2) == [(2, 0, 0), (2, 2, 0), (1, 4, 0)]
-        assert self.asked(7, size=3, first=2) == [(2, 0, 0), (3, 2, 0), (2, 5, 0)]
-
-    def test_in_flight_is_for_n_cases(self):
-        asked = self.asked(6, in_flight=3)
-        assert asked == [(1, 0, 0), (1, 0, 1), (1, 0, 2), (1, 1, 2), (1, 2, 2), (1, 3, 2)]
-
-    def test_in_flight_of_one_is_for_one_case(self):
-        assert self.asked(3, in_flight=1) == [(1, 0, 0), (1, 1, 0), (1, 2, 0)]
+    @pytest.mark.parametrize(
+        ("how", "asked"),
+        [
+            ({"cases": 5, "batch": 2}, [(2, 0, 0), (2, 2, 0), (1, 4, 0)]),
+            ({"cases": 7, "size": 3, "first": 2}, [(2, 0, 0), (3, 2, 0), (2, 5, 0)]),
+            ({"cases": 4, "in_flight": 3}, [(1, 0, 0), (1, 0, 1), (1, 0, 2), (1, 1, 2)]),
+            ({"cases": 3, "in_flight": 1}, [(1, 0, 0), (1, 1, 0), (1, 2, 0)]),
+        ],
+    )
+    def test_is_for_a_batch_or_for_cases_in_flight(self, how, asked):
+        assert self.asked(**how) == asked
 
     def test_grows_with_what_is_known(self):
         asked = self.asked(400, in_flight=24, size=6)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import pytest
 from support.campaigning import run_campaign
 
 from merge_sumo import api
@@ -34,12 +35,9 @@ class TestTheRule:
         assert has_converged(ran)
         assert not has_converged(ran[:-1]), "the last failure is among the last cases"
 
-    def test_goes_on_where_they_added_a_ball(self):
-        assert not has_converged(outcomes(3, 40, 100, cases=150))
-
-    def test_goes_on_while_no_failure_is_known(self):
-        assert not has_converged([])
-        assert not has_converged(outcomes(cases=400))
+    @pytest.mark.parametrize("ran", [[], outcomes(cases=400), outcomes(3, 40, 100, cases=150)])
+    def test_goes_on_without_a_failure_and_where_one_was_added(self, ran):
+        assert not has_converged(ran)
 
     def test_goes_on_where_one_level_grows(self):
         ran = outcomes(3, cases=200)

@@ -102,11 +102,6 @@ def cannot_import(monkeypatch, module: str, error: ImportError) -> None:
     monkeypatch.setattr(importlib, "import_module", refuse)
 
 
-def test_the_debian_packages_are_those_that_the_wheels_need():
-    needed = ("libgl1", "libx11-6", "libxext6", "libxrender1", "libatomic1", "libexpat1")
-    assert sorted(DEBIAN_PACKAGES.split()) == sorted(needed)
-
-
 @pytest.fixture(scope="module")
 def ended(tmp_path_factory) -> tuple[Path, Said]:
     """Return where a campaign of 80 cases ran in a process of its own, and what it said."""

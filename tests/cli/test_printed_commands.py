@@ -29,7 +29,6 @@ from merge_sumo.scenario.scenario import US23
 
 Call = Callable[..., Said]
 
-ROOT = Path(__file__).resolve().parents[2]
 BAD_USE = 2
 RUN = "a run's"
 """A folder whose name needs quotes."""
@@ -148,17 +147,19 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
 
 
 @pytest.mark.parametrize(
-    "vut",
+    ("vut", "options"),
     [
-        "design1",
-        pytest.param("my_vut.py:MyVut", marks=pytest.mark.slow),
-        pytest.param("my_vut:MyVut", marks=pytest.mark.slow),
+        ("design1", ()),
+        pytest.param("my_vut.py:MyVut", ("--scenario", "us23-lane"), marks=pytest.mark.slow),
+        pytest.param("my_vut:MyVut", (), marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.usefixtures("place")
-def test_runs_of_a_controller(vut, command_line, runs):
-    found = printed(vut, command_line)
-    assert f"merge-sumo campaign --vut fsm --against {vut}" in found
+def test_runs_of_a_controller(vut, options, command_line, runs):
+    found = printed(vut, command_line, *options)
+    assert (
+        shlex.join(("merge-sumo", "campaign", "--vut", "fsm", "--against", vut, *options)) in found
+    )
     runs(found)
 
 
@@ -168,25 +169,6 @@ def test_runs_of_a_traci_client(command_line, runs):
     found = printed(TRACI, command_line)
     measure = f"merge-sumo probability {shlex.quote(RUN)} --vut {shlex.quote(TRACI)}"
     assert measure in found
-    runs(found)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("vut", ["my_vut.py:MyVut", TRACI])
-@pytest.mark.parametrize("scenario", ["us23-lane", "us23-traffic", "roundabout", "my-ramp.toml"])
-@pytest.mark.usefixtures("place")
-def test_runs_in_a_scenario(vut, scenario, command_line, runs):
-    if scenario == "my-ramp.toml":
-        net = ROOT / "sumo_net" / "us23.net.xml"
-        edges = ("--mainline", "main_in main_out", "--ramp", "ramp main_out")
-        said = command_line("scenario", "new", scenario, "--net", net, *edges)
-        assert said.code == 0, said.err
-    found = printed(vut, command_line, "--scenario", scenario)
-    searches = {one for one in found if " campaign " in one and "--resume" not in one}
-    assert len(searches) == 2
-    assert all(one.endswith(f" --scenario {scenario}") for one in searches)
-    measured = not any(" probability " in one for one in found)
-    assert measured == (vut != TRACI)
     runs(found)
 
 
