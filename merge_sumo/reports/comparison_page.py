@@ -21,15 +21,11 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
 SHOWN: Final = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
-MOST_REGIONS: Final = 20
-"""Regions of a level that are listed."""
 DRAWN: Final = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
     *(Change.STILL_CONTACT, Change.FIXED),
 )
 """Changes of which a section has both motions of each case; the template says what they mean."""
-SEEN: Final = 0.005
-"""In m, m/s and m/s2: motions that differ by less look alike."""
 PAGE: Final = ".html"
 """Ending of a page: a browser shows a file with another one as source."""
 AGAINST_PAGE: Final = f"{AGAINST}{PAGE}"
@@ -59,7 +55,8 @@ def comparison_page(compared: Comparison) -> str:
         change_in_words=change_in_words,
         steps=[(step, _maps(step), _sections(step, compared)) for step in compared.steps],
         vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
-        most=MOST_REGIONS,
+        # Regions of a level that are listed.
+        most=20,
         cut=cut,
     )
 
@@ -111,7 +108,8 @@ def _differ_s(earlier: FloatArray | None, later: FloatArray | None) -> float | N
     if earlier is None or later is None:
         return None
     rows = min(len(earlier), len(later))
-    apart = (np.abs(earlier[:rows] - later[:rows]) > SEEN).any(axis=(1, 2))
+    # In m, m/s and m/s2: motions that differ by less look alike.
+    apart = (np.abs(earlier[:rows] - later[:rows]) > 0.005).any(axis=(1, 2))
     if len(earlier) == len(later) and not apart.any():
         return None
     return round((int(apart.argmax()) if apart.any() else rows - 1) * DT_S, 1)

@@ -38,15 +38,9 @@ SIGNAL: Final = "signal_"
 """Begins the names of the columns of signals, whose names and words are a stranger's."""
 MERGED: Final = "merged"
 """Column of scenarios with an acceleration lane: 1 where the VUT has left it, else 0."""
-FORMULA: Final = ("=", "+", "-", "@")
-"""Beginnings of a formula for a spreadsheet."""
 ROAD: Final = "road.xodr"
-_EPOCH: Final = datetime(2000, 1, 1)
-MINOR_VERSION: Final = 2
-"""OpenSCENARIO 1.2."""
 CONTROLLER: Final = "EgoController"
 """Parameter that names the controller of a free VUT."""
-HEIGHT_M: Final = 1.5
 WHEEL_M: Final = 0.7
 
 FORMATS: Final = {
@@ -155,7 +149,8 @@ def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
             row[MERGED] = int(merged[step])
         for name, values in (trajectory.signals or {}).items():
             value = values[step]
-            is_formula = isinstance(value, str) and value.startswith(FORMULA)
+            # Beginnings of a formula for a spreadsheet.
+            is_formula = isinstance(value, str) and value.startswith(("=", "+", "-", "@"))
             row[f"{SIGNAL}{name}"] = f"'{value}" if is_formula else value
         yield row
 
@@ -228,9 +223,10 @@ def _scenario(
         board,
         xosc.RoadNetwork(ROAD),
         xosc.Catalog(),
-        osc_minor_version=MINOR_VERSION,
+        # OpenSCENARIO 1.2.
+        osc_minor_version=2,
         # A fixed date: the same case gives the same bytes.
-        creation_date=_EPOCH,
+        creation_date=datetime(2000, 1, 1),
     )
 
 
@@ -288,7 +284,7 @@ def _speed(xosc: Any, v_mps: float) -> Any:
 
 def _car(xosc: Any, who: str, scenario: Scenario) -> Any:
     length = scenario.vut_length_m if who == VEHICLES[VUT] else scenario.pov_length_m
-    width, height, limits = WIDTH_M, HEIGHT_M, (scenario.a_max_mps2, -scenario.a_min_mps2)
+    width, height, limits = WIDTH_M, 1.5, (scenario.a_max_mps2, -scenario.a_min_mps2)
     box = xosc.BoundingBox(width, length, height, -length / 2.0, 0.0, height / 2.0)
     front = xosc.Axle(0.5, WHEEL_M, width - 0.2, -0.2 * length, WHEEL_M / 2.0)
     rear = xosc.Axle(0.0, WHEEL_M, width - 0.2, -0.8 * length, WHEEL_M / 2.0)

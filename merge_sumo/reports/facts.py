@@ -27,9 +27,7 @@ from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import level_name
 
 PERCENT: Final = "%"
-PLACE: Final = "place of the merge, median"
 STARTS_THAT_FAIL: Final = "starts that fail"
-UNJUDGED: Final = "uniform starts without a verdict"
 STARTS: Final = "uniform starts of that"
 UNDECIDED: Final = "undecided"
 RULE: Final = "a case fails when"
@@ -42,8 +40,6 @@ PROBABLY: Final = "probability that a case fails"
 WORST: Final = "worst case"
 KIND: Final = "kind of the worst case"
 SCATTERED: Final = "scattered"
-MANY: Final = 10
-"""Failures from which on more than half as many regions are said to be scattered."""
 FAILING: Final = "margin < 0"
 """By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
 
@@ -205,8 +201,8 @@ def _shares(run: Run) -> Iterator[Fact]:
         yield Fact(STARTS_THAT_FAIL, one.shown, "", SHARES.name, key, one.level)
         yield Fact(STARTS, one.cases, "", SHARES.name, "levels: cases", one.level)
         if one.without_verdict:
-            key = "levels: without_verdict"
-            yield Fact(UNJUDGED, one.without_verdict, "", SHARES.name, key, one.level)
+            name, key = "uniform starts without a verdict", "levels: without_verdict"
+            yield Fact(name, one.without_verdict, "", SHARES.name, key, one.level)
 
 
 def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
@@ -247,7 +243,8 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
         if run.tolerated:
             yield fact(UNDECIDED, found.undecided, "draw")
         failing = found.failures + found.undecided
-        scattered = failing >= MANY and 2 * found.regions > failing
+        # Failures from which on more than half as many regions are said to be scattered.
+        scattered = failing >= 10 and 2 * found.regions > failing
         regions = SCATTERED if scattered else found.regions
         yield Fact("regions", regions, "", OUTCOMES, f"{FAILING}: starts", level)
         radius = radius_for(len(run.scenario.dimensions(level)))
@@ -264,7 +261,7 @@ def _of_lane(run: Run, level: int) -> Iterator[Fact]:
     yield Fact("merges where the lane ends", forced, "", OUTCOMES, "lane_share >= 1", level)
     yield Fact("cases that stood on the lane", stood, "", OUTCOMES, "stood_s > 0", level)
     for name, key, unit, scale in (
-        (PLACE, "lane_share", "% of the lane", 100.0),
+        ("place of the merge, median", "lane_share", "% of the lane", 100.0),
         ("time gap ahead, median", "time_gap_ahead_s", "s", 1.0),
         ("time gap behind, median", "time_gap_behind_s", "s", 1.0),
     ):

@@ -39,8 +39,6 @@ LEVEL_LOOKS: Final = {
     OWN: ("#009E73", "D"),
 }
 """Colour and marker of each level."""
-SAFE_COLOUR: Final = "#c4c9cf"
-DPI: Final = 150
 KINDS: Final = (".png", ".svg")
 STYLE: Final[Any] = {
     "axes.titlelocation": "left",
@@ -76,7 +74,7 @@ def save(figure: Figure, path: Path) -> None:
     kind = path.suffix[1:]
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
     with io.BytesIO() as picture, matplotlib.rc_context(STYLE):
-        figure.savefig(picture, format=kind, dpi=DPI, metadata=metadata)
+        figure.savefig(picture, format=kind, dpi=150, metadata=metadata)
         write_new(path, picture.getvalue(), "`figure`")
 
 
@@ -153,7 +151,7 @@ def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
     safe = _physical(panel.points[~panel.failed], level)
     size = 3.0 if len(panel.points) > 2000 else 8.0
     dots: Any = {"linewidths": 0, "rasterized": True}
-    axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color=SAFE_COLOUR, **dots)
+    axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color="#c4c9cf", **dots)
     if not more:
         balls = EllipseCollection(
             [2 * RADIUS * (x.high - x.low)],

@@ -30,8 +30,6 @@ from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
 CLASS: Final = "merge-sumo"
-FAILED: Final = "failed"
-"""Type of a failure without a severity: the VUT never reached M, and the criterion speaks of it."""
 
 JUNIT: Final = (".xml",)
 """Endings of the name of such a file."""
@@ -136,7 +134,8 @@ def _case(
         etree.SubElement(test, "skipped", message=f"undecided: {cause}")
     elif cause is not None:
         tag = "error" if measures.end.is_error else "failure"
-        kind = (measures.severity or FAILED) if outcome.is_tested else measures.end
+        # A criterion may call a case a failure in which the VUT never reached M.
+        kind = (measures.severity or "failed") if outcome.is_tested else measures.end
         _wrong(test, tag, kind, cause)
 
 

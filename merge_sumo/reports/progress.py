@@ -24,14 +24,6 @@ PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
 LINES: Final = 10
 """Maximum number of progress lines without a terminal."""
-LINE_S: Final = 1.0
-"""Minimum time between two of these lines."""
-FRESH_S: Final = 0.25
-"""Maximum age of a bar on a terminal."""
-FIRST_ANSWER: Final = 100
-"""Cases after which a campaign of more prints where failures lie so far."""
-SLOW_S: Final = 60.0
-"""Time after which every new count is printed."""
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
@@ -70,9 +62,12 @@ class _Bar:
         """
         now_s = time.monotonic()
         since, since_s = done - self.said, now_s - self.said_s
-        slow = now_s - max(self.said_s, self.start_s) >= SLOW_S
+        # Time after which every new count is printed.
+        slow = now_s - max(self.said_s, self.start_s) >= 60.0
         enough = drawn or since * LINES >= self.total or (since > 0 and slow)
-        due = enough and since_s >= (FRESH_S if drawn else LINE_S)
+        # Minimum time between two of these lines.
+        # Maximum age of a bar on a terminal.
+        due = enough and since_s >= (0.25 if drawn else 1.0)
         if due or (done >= self.total and since > 0):
             self.said, self.said_s = done, now_s
             return True
@@ -196,7 +191,8 @@ class CampaignBars(Bars):
         before = len(self._outcomes)
         self._outcomes += outcomes
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
-        if before < FIRST_ANSWER <= len(self._outcomes) < self._cases:
+        # Cases after which a campaign of more prints where failures lie so far.
+        if before < 100 <= len(self._outcomes) < self._cases:
             self._say_where()
 
     def _say_where(self) -> None:

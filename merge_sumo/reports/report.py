@@ -41,8 +41,6 @@ FIRST_S: Final = 2.0
 """Seconds after which the report of a running campaign first appears."""
 EVERY_S: Final = 5
 """Minimum time between two reports of a running campaign, in s."""
-MOST_SHARE: Final = 0.1
-"""Maximum share of the time of a campaign that its report takes while it runs."""
 
 
 def write_report(
@@ -90,7 +88,8 @@ class RunningReport:
         if start_s >= self._due_s and (self._folder / OUTCOMES).is_file():
             self._write(running=True)
             took_s = time.monotonic() - start_s
-            self._due_s = start_s + max(EVERY_S, took_s / MOST_SHARE)
+            # Maximum share of the time of a campaign that its report takes while it runs.
+            self._due_s = start_s + max(EVERY_S, took_s / 0.1)
             if not self._is_there:
                 self._due_s = math.inf
 

@@ -26,11 +26,6 @@ from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, l
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
 
-NEAR_SHARE: Final = 1.0 / 16.0
-STEPS: Final = 20
-"""Points of a curve in the chart of the search, at most."""
-MOST_BALLS: Final = 20_000
-"""Balls that are counted for these curves: of more failures they have fewer points."""
 SPEED_UNIT_MPS: Final = 0.002
 """Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
 COUNT_GRID: Final = (32, 20)
@@ -155,12 +150,14 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
 def _coordinate(c: Coordinate) -> dict[str, Any]:
     known = {"name": c.name, "unit": c.unit, "digits": c.digits, **to_plain(c.dimension)}
     # Cases are shown in full this near to where the reader is in a third coordinate.
-    return {**known, "near": NEAR_SHARE * (c.dimension.high - c.dimension.low)}
+    return {**known, "near": 1.0 / 16.0 * (c.dimension.high - c.dimension.low)}
 
 
 def _search(model: ReportModel) -> dict[str, Any]:
     """Return the coverage of each level after numbers of cases."""
-    number = min(STEPS, max(MOST_BALLS // max(len(model.worst), 1), 1))
+    # Points of a curve in the chart of the search, at most.
+    # Balls that are counted for these curves: of more failures they have fewer points.
+    number = min(20, max(20_000 // max(len(model.worst), 1), 1))
     steps = sorted({len(model.run.outcomes) * step // number for step in range(number + 1)})
     levels = []
     for level in model.levels:

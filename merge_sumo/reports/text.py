@@ -41,8 +41,6 @@ from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
-LABEL: Final = 31
-"""Minimum width of the column of measures, in characters."""
 FRAGILE: Final = 10
 """Failures that are not robust that a sentence names."""
 
@@ -459,7 +457,8 @@ def _measures(outcome: Outcome) -> Iterator[str]:
         if (value := found.value(measure.name)) is not None
         and (text := measure.label_in(scenario).replace("POV", other))
     ]
-    width = max([LABEL, *(len(text) for text, _, _ in listed)])
+    # Minimum width of the column of measures, in characters.
+    width = max([31, *(len(text) for text, _, _ in listed)])
     for text, value, unit in listed:
         yield f"  {text:<{width}} {value:10.2f} {unit}".rstrip()
     if found.clipped_steps:
