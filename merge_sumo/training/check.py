@@ -24,7 +24,6 @@ from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
 
 CHECK_CASES: Final = 300
-CHECK_SEED: Final = 20_201
 CORRIDORS: Final = 32
 
 
@@ -101,7 +100,7 @@ def check_network(
 ) -> PolicyCheck:
     """Compare a network with its best response; `opponent` is None for level 0."""
     level, scenario = 2 if name == "pov2" else 1, of_two(reward.scenario)
-    points = np.random.default_rng(CHECK_SEED).random((count, len(scenario.dimensions(level))))
+    points = np.random.default_rng(20_201).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
     role: Role = "pov" if name.startswith("pov") else "vut"

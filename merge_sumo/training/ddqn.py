@@ -142,9 +142,7 @@ def train(
     inputs = FEATURES + SVO_FEATURES * sees_svo
     online, target = make_network(inputs, s.width), make_network(inputs, s.width)
     target.load_state_dict(online.state_dict())
-    weights: list[Tensor] = list(online.parameters())
-    averages: list[Tensor] = list(target.parameters())
-    optimiser = torch.optim.Adam(weights, lr=s.learning_rate, fused=True)
+    optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
     replay = ReplayBuffer(s.transitions)
     collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)
     loss = torch.zeros(())
@@ -163,12 +161,7 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (update + 1) / 500)
             loss = _loss(online, target, replay, s.batch, rng, game.role, sees_svo=sees_svo)
-            optimiser.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(weights, s.gradient_norm)
-            optimiser.step()
-            with torch.no_grad():
-                torch._foreach_lerp_(averages, weights, s.polyak)
+            descend(optimiser, loss, online, target, s.gradient_norm, s.polyak)
             update += 1
             if on_progress and update % 1000 == 0:
                 mean_return, crash_share = collector.recent()
@@ -182,6 +175,34 @@ def train(
                     )
                 )
     return export(target, game.a_min_mps2)
+
+
+def descend(
+    optimiser: torch.optim.Adam,
+    loss: Tensor,
+    network: nn.Sequential,
+    average: nn.Sequential,
+    gradient_norm: float,
+    polyak: float,
+) -> None:
+    """Take one gradient step.
+
+    Args:
+        optimiser: of the weights of the network.
+        loss: what is to fall.
+        network: the network.
+        average: the network whose weights follow.
+        gradient_norm: the bound to which the gradient is clipped.
+        polyak: the share of the weights that the average takes over.
+    """
+    weights: list[Tensor] = list(network.parameters())
+    averages: list[Tensor] = list(average.parameters())
+    optimiser.zero_grad()
+    loss.backward()  # type: ignore[no-untyped-call]
+    nn.utils.clip_grad_norm_(weights, gradient_norm)
+    optimiser.step()
+    with torch.no_grad():
+        torch._foreach_lerp_(averages, weights, polyak)
 
 
 class _Collector:

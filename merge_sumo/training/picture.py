@@ -22,7 +22,6 @@ INK: Final = "#1c2228"
 SIZE_PX: Final = (960, 240)
 LANE_M: Final = 3.05
 """A lane is 3.2 m wide: what is left free between two lanes is the line between them."""
-CAR_WIDTH_M: Final = 2.0
 
 
 class GamePicture:
@@ -103,7 +102,7 @@ class GamePicture:
         for who, x_m, v_mps, side in cars:
             rear, front = self._place(who, x_m - self._lengths_m[who]), self._place(who, x_m)
             ends = pixels(np.array([rear, front]))
-            self._line(canvas, COLOURS[who.lower()], ends, CAR_WIDTH_M * px_per_m)
+            self._line(canvas, COLOURS[who.lower()], ends, 2.0 * px_per_m)
             text = self._font.render(f"{who} {v_mps:.1f} m/s", True, INK)
             x, y = ends.mean(axis=0)
             place = text.get_rect(center=(x, y + side * (2.4 * px_per_m + 11.0)))

@@ -27,13 +27,13 @@ from typing import Final
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import nn
 
 from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.best_response import beam_search
-from merge_sumo.training.ddqn import TrainingProgress, as_torch, export, squash
+from merge_sumo.training.ddqn import TrainingProgress, as_torch, descend, export, squash
 from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy, inputs_of
 
 BETTER: Final = 1e-3
@@ -226,8 +226,6 @@ def _fit(
     costs = (returns.max(dim=1, keepdim=True).values - returns).clamp(max=COST_CAP)
     values = squash(returns)
     last_costs = []
-    weights: list[Tensor] = list(model.parameters())
-    averages: list[Tensor] = list(average.parameters())
     for update in range(s.updates):
         done = (number * s.updates + update) / (s.rounds * s.updates)
         for group in optimiser.param_groups:
@@ -237,12 +235,7 @@ def _fit(
         chosen = torch.softmax(q / s.temperature, dim=1)
         cost = (chosen * costs[rows]).sum(dim=1).mean()
         loss = cost + s.value_share * nn.functional.smooth_l1_loss(q, values[rows])
-        optimiser.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(weights, 1.0)
-        optimiser.step()
-        with torch.no_grad():
-            torch._foreach_lerp_(averages, weights, s.polyak)
+        descend(optimiser, loss, model, average, 1.0, s.polyak)
         if update >= s.updates - 100:
             last_costs.append(float(cost.detach()))
     return float(np.mean(last_costs))
