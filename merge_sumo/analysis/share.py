@@ -62,15 +62,6 @@ class LevelShare(Record, frozen=True):
         _, high = clopper_pearson(most, self.cases, confidence)
         return low, high
 
-    def with_more(self, more: LevelShare) -> LevelShare:
-        """Return both together."""
-        return LevelShare(
-            self.level,
-            self.cases + more.cases,
-            self.failures + more.failures,
-            self.without_verdict + more.without_verdict,
-        )
-
     @property
     def shown(self) -> str:
         """The share and its interval in percent."""
@@ -142,7 +133,8 @@ def note_shares(
     # By the equations of motion where the drivers allow it, else in SUMO.
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     streams = {level: stream(run.settings.seed, level) for level in run.levels}
-    shares = {level: LevelShare(level, 0, 0) for level in run.levels}
+    # Of each level: cases, failures, cases without a verdict.
+    counts = {level: np.zeros(3, dtype=int) for level in run.levels}
     done, begun_s = 0, perf_counter()
     # Worker processes would take longer to start than the cases by the equations.
     with workers_or_here(None if by_equations else workers) as processes:
@@ -158,15 +150,15 @@ def note_shares(
                         results.append(result)
                 except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
                     return
-                failed, errors = np.sum(results, axis=0).tolist()
-                shares[level] = shares[level].with_more(LevelShare(level, size, failed, errors))
+                counts[level] += (size, *np.sum(results, axis=0))
                 done += size
                 on_part(done, total)
                 check()
             now_s = perf_counter()
             if now_s - begun_s + (now_s - round_s) > budget_s:
                 break
-    SHARES.write(run.folder, Shares(tuple(shares.values())))
+    shares = [LevelShare(level, *known.tolist()) for level, known in counts.items()]
+    SHARES.write(run.folder, Shares(tuple(shares)))
 
 
 def stream(seed: int, level: int) -> np.random.Generator:
