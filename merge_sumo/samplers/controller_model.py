@@ -72,13 +72,14 @@ class ControllerModel:
         self._motions: dict[int, FloatArray] = {}
         self._steps: dict[int, Steps] = {}
         self._cases: dict[int, list[int]] = {}
-        """By group, the cases that its members learn from; empty after new outcomes."""
-        self._trees: dict[int, tuple[list[int], Any]] = {}
-        """By member, the cases that it learned from, and its tree."""
+        """By group, the cases that its members learned from."""
+        self._trees: dict[int, Any] = {}
+        """By member."""
+        self._has_learned = False
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
         """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
-        self._cases.clear()
+        self._has_learned = False
         for outcome in outcomes:
             if not outcome.measures.end.is_error:
                 self._batch[outcome.index] = outcome.batch
@@ -89,13 +90,17 @@ class ControllerModel:
         return len(self._motions) >= FEWEST and self._rollout.can_predict(level)
 
     def predict(
-        self, points: Mapping[int, FloatArray], members: Sequence[int] | None = None
+        self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> dict[int, FloatArray]:
         """Return the gaps at M of cases by level, (M, n) each; see `Predictor`.
 
         All members and levels are one rollout: each row is a case and the member that drives in it.
         """
-        trees = [self._tree(member) for member in members or range(self.members)]
+        if not self._has_learned:
+            self._learn()
+        trees = [self._trees[number] for number in range(self.members)]
+        if member is not None:
+            trees = [trees[member]]
         counts = [len(of_level) for of_level in points.values()]
         ends = sum(counts) * np.arange(1, len(trees) + 1)
 
@@ -112,25 +117,24 @@ class ControllerModel:
         by_level = np.split(gaps, np.cumsum(counts)[:-1], axis=1)
         return dict(zip(points, by_level, strict=True))
 
-    def _tree(self, member: int) -> Any:
-        """Return the tree of a member, learned anew where its cases have changed."""
+    def _learn(self) -> None:
+        """Learn the trees of each group whose cases have changed."""
         from sklearn.tree import ExtraTreeRegressor
 
-        group = member % GROUPS
-        if group not in self._cases:
-            self._cases[group] = self._learned_by(group)
-        cases = self._cases[group]
-        if member not in self._trees or self._trees[member][0] != cases:
+        self._has_learned = True
+        for group in range(GROUPS):
+            cases = self._learned_by(group)
+            if cases == self._cases.get(group):
+                continue
+            self._cases[group] = cases
             steps = self._steps_of(cases)
             inputs = np.concatenate([inputs for inputs, _ in steps])
-            if member < GROUPS:
-                inputs = inputs[:, :-HISTORY]
             accelerations = np.concatenate([a_mps2 for _, a_mps2 in steps])
-            seed = (self._seed * self.members + member) % 2**32
-            tree = ExtraTreeRegressor(max_features=MAX_FEATURES, random_state=seed)
-            # What `predict` of the estimator checks costs more than the tree does.
-            self._trees[member] = cases, tree.fit(inputs, accelerations).tree_
-        return self._trees[member][1]
+            for member, looked_at in ((group, inputs[:, :-HISTORY]), (GROUPS + group, inputs)):
+                seed = (self._seed * self.members + member) % 2**32
+                tree = ExtraTreeRegressor(max_features=MAX_FEATURES, random_state=seed)
+                # What `predict` of the estimator checks costs more than the tree does.
+                self._trees[member] = tree.fit(looked_at, accelerations).tree_
 
     def _learned_by(self, group: int) -> list[int]:
         """Return the cases that members of a group learn from, by index."""

@@ -121,7 +121,7 @@ class CoverageSampler(Sampler):
         if not searches or self.predictor is None:
             return
         points = {level: search.screened() for level, search in searches.items()}
-        gaps = self.predictor.predict(points, [self.proposed() % self.predictor.members])
+        gaps = self.predictor.predict(points, self.proposed() % self.predictor.members)
         for level, search in searches.items():
             points[level] = search.first(points[level], gaps[level], n)
         for round_ in range(1 + ROUNDS):

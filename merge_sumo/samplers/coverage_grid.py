@@ -36,13 +36,16 @@ class CoverageGrid:
         overlap: distance from which two balls share no node.
     """
 
-    def __init__(self, dims: int, *, fine: bool = True, as_large_as_in_3d: bool = False) -> None:
-        """Prepare an uncovered grid of `dims` dimensions.
+    def __init__(self, dims: int, *, coarse: bool = False) -> None:
+        """Prepare an uncovered grid.
 
-        Above three of them a ball may also be as large as one of three, by volume.
+        Args:
+            dims: number of dimensions.
+            coarse: whether the grid is of CELL, and a ball of more than three dimensions as large,
+                by volume, as one of three.
         """
-        cell, radius = (FINE_CELL if fine else CELL).get(dims), radius_for(dims)
-        if as_large_as_in_3d and dims > 3:
+        cell, radius = (CELL if coarse else FINE_CELL).get(dims), radius_for(dims)
+        if coarse and dims > 3:
             radius = (RADIUS**3 * ball_volume(3) / ball_volume(dims)) ** (1.0 / dims)
         self._places = _places(dims, cell, radius)
         self.overlap: Final = self._places.overlap

@@ -99,7 +99,7 @@ class _Posterior:
         self._badness = badness + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
-        self._grid = CoverageGrid(queries.shape[1], fine=False, as_large_as_in_3d=True)
+        self._grid = CoverageGrid(queries.shape[1], coarse=True)
         self._grid.cover(self._grid.balls(failures), 1.0)
         self._balls = self._grid.balls(queries)
         for place in range(first, len(queries)):

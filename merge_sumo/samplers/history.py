@@ -65,11 +65,6 @@ class LevelHistory:
         return np.asarray(1.0 - self.margin, dtype=np.float64)
 
     @property
-    def share(self) -> FloatArray:
-        """Return the share of the runs of each case that failed, (N,)."""
-        return np.asarray(self.failures / self.runs, dtype=np.float64)
-
-    @property
     def has_gaps(self) -> bool:
         """Return whether the VUT gives trajectories."""
         return not np.isnan(self.gap).all()

@@ -36,8 +36,8 @@ class TwinPair:
         return self._new.can_predict(level) and self._old.can_predict(level)
 
     def predict(
-        self, points: Mapping[int, FloatArray], members: Sequence[int] | None = None
+        self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> dict[int, FloatArray]:
         """Return what stands for the gap of a regression in each case; see `Predictor`."""
-        new, old = self._new.predict(points, members), self._old.predict(points, members)
+        new, old = self._new.predict(points, member), self._old.predict(points, member)
         return {level: regression_gaps(new[level], old[level]) for level in points}

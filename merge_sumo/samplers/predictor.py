@@ -45,13 +45,13 @@ class Predictor(Protocol):
         """Return whether the outcomes so far suffice to predict cases of a level."""
 
     def predict(
-        self, points: Mapping[int, FloatArray], members: Sequence[int] | None = None
+        self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> Mapping[int, FloatArray]:
         """Return the signed gaps (`Outcome.signed_gap`) of cases, (M, n); NaN where none is.
 
         Args:
             points: cases of the unit cube by level of the POV, (n, d) each.
-            members: those that predict; None for all.
+            member: the one that predicts, so that M is 1; None for all.
         """
 
 

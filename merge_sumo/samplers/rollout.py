@@ -50,7 +50,7 @@ class ModelRollout:
         }
 
     def can_predict(self, level: int) -> bool:
-        """Return whether the POV of a level is known, and not a program of a person's own.
+        """Return whether the POV of a level is known, and not a program of the user.
 
         A rollout ends at M: none is possible where the VUT chooses the place of the merge.
         """
@@ -156,18 +156,11 @@ class ModelRollout:
             ended = x_m[VUT] >= 0.0
             if played is None:
                 ended |= x_m[cars].min(axis=0) > FAR * scenario.dx_crash_m
+            going = np.isnan(gap_m[rows])
+            ended &= going
             if ended.any():
-                # Who has not arrived goes on at its speed.
-                left_s = np.maximum(-x_m[VUT, ended], 0.0) / np.maximum(
-                    v_mps[VUT, ended], SLOWEST_MPS
-                )
-                gaps = x_m[cars][:, ended] + v_mps[cars][:, ended] * left_s
-                gaps -= np.maximum(x_m[VUT, ended], 0.0)
-                nearest = np.abs(gaps).argmin(axis=0)
-                known = rows[ended]
-                fresh = np.isnan(gap_m[known])
-                gap_m[known[fresh]] = gaps[nearest, np.arange(gaps.shape[1])][fresh]
-                going = np.isnan(gap_m[rows])
+                gap_m[rows[ended]] = _gap_at_merge_m(x_m[:, ended], v_mps[:, ended])
+                going &= ~ended
                 if not going.any():
                     break
                 if played is None and going.mean() < STILL:
@@ -200,3 +193,14 @@ class ModelRollout:
         chosen = network.values_at_once(np.array(features).T).argmax(axis=1)
         held_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
         return held_mps2
+
+
+def _gap_at_merge_m(x_m: FloatArray, v_mps: FloatArray) -> FloatArray:
+    """Return the gap, (R,), to the car nearest to the VUT at M, in states (A, R).
+
+    A VUT that has not arrived goes on at its speed.
+    """
+    left_s = np.maximum(-x_m[VUT], 0.0) / np.maximum(v_mps[VUT], SLOWEST_MPS)
+    gaps = np.delete(x_m + v_mps * left_s, VUT, axis=0) - np.maximum(x_m[VUT], 0.0)
+    nearest = np.abs(gaps).argmin(axis=0)
+    return np.asarray(gaps[nearest, np.arange(gaps.shape[1])], dtype=np.float64)

@@ -57,7 +57,6 @@ def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
     assert len(history.points) == 2
     assert history.runs.tolist() == [4, 1]
     assert history.failures.tolist() == [2, 0]
-    assert history.share.tolist() == [0.5, 0.0]
     assert history.batch.tolist() == [0, 1]
     assert history.margin[0] == pytest.approx(-0.4)
     assert (history.gap[0], history.failed[0]) == (2.0 / 6.0, failed)

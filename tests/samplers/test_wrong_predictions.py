@@ -37,9 +37,9 @@ class Confident:
         """Return that it can."""
         return True
 
-    def predict(self, points, members=None) -> dict[int, FloatArray]:
+    def predict(self, points, member=None) -> dict[int, FloatArray]:
         """Return the gaps of cases by level."""
-        numbers = np.arange(self.members) if members is None else np.array(members)
+        numbers = np.arange(self.members) if member is None else np.array([member])
         off = 0.005 * (numbers[:, None] - 4)
         return {level: band_m(of) / US23.dx_crash_m + off for level, of in points.items()}
 
