@@ -32,8 +32,8 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory

@@ -32,7 +32,7 @@ from merge_sumo.metrics.fmc import covered, fmc
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.result import Result
-from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import centre_lines
 from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit

@@ -19,9 +19,8 @@ from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.road.centre_lines import centre_lines
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.pair import TwinPair

@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from merge_sumo.files import resource
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor
 from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import read_xml
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
 
 MAINLINE_EDGES: Final = ("main_in", "main_out")
@@ -68,3 +72,24 @@ def road_for(scenario: Scenario) -> Corridor:
     road = road_of(net, *edges, scenario.room_after_m, scenario.lane_m)
     road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
     return road
+
+
+_centre_lines: dict[tuple[object, ...], CentreLines] = {}
+
+
+def centre_lines(road: Corridor) -> CentreLines:
+    """Return the centre lines of both paths of a road; they are found once in a process."""
+    key = road.sha256, road.mainline_edges, road.ramp_edges, road.lane_m
+    if key not in _centre_lines:
+        _centre_lines[key] = CentreLines.of(_line(road.mainline), _line(road.ramp))
+    return _centre_lines[key]
+
+
+def _line(path: LanePath) -> FloatArray:
+    return np.array(
+        [
+            [piece.start_m + share * piece.length_m, x, y]
+            for piece in path.pieces
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
+        ]
+    )

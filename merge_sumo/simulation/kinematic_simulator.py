@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory

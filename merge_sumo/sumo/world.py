@@ -243,14 +243,6 @@ class World:
             )
         return self._lanes[row][corridor][number], starts_m[number]
 
-    def step(self, a_mps2: FloatArray) -> None:
-        """Advance all corridors by one step of eq. (4) and read the state.
-
-        `a_mps2` has shape (A, corridors). Speeds do not fall below 0. Raises `SimulationError`.
-        """
-        self.advance()
-        self.command(a_mps2)
-
     def advance(self) -> None:
         """Let SUMO make its step; `x_m` and `v_mps` stay those before it until `command`.
 

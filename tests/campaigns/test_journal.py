@@ -23,8 +23,7 @@ from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import further_measures
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
-from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory

@@ -16,8 +16,7 @@ from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.score import Measures, Outcome
 from merge_sumo.records import decode, to_plain
-from merge_sumo.road.centre_lines import centre_lines
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.coverage import CoverageSampler

@@ -30,10 +30,12 @@ def run_all(world, pov, vut, cases):
 def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
     with World(1, scenario=US23) as world:
         world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
-        world.step(np.zeros((2, 1)))
+        world.advance()
+        world.command(np.zeros((2, 1)))
         world._set_speed("pov.0", speed_mps)
+        world.advance()
         with pytest.raises(SimulationError, match=r"0\.1.* m away from where it drives"):
-            world.step(np.zeros((2, 1)))
+            world.command(np.zeros((2, 1)))
 
 
 @pytest.mark.parametrize("half_step", ["advance", "command"])

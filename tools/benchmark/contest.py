@@ -45,7 +45,7 @@ from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import counted
 from merge_sumo.records import decode
 from merge_sumo.result import Result
-from merge_sumo.road.centre_lines import centre_lines
+from merge_sumo.road.merge import centre_lines
 from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.simulation.plan import SimulationPlan
