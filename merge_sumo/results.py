@@ -78,79 +78,74 @@ def _cell(value: object) -> str:
 
 
 class CampaignRun(Result):
-    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder."""
+    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder.
+
+    Attributes:
+        run: the campaign as the rest of the package takes it.
+        folder: the folder of the campaign.
+    """
 
     def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
-        self._run = folder if isinstance(folder, Run) else Run(Path(folder))
-        self._gates = parse_gates(gates, against=self._run.settings.against is not None)
-        _ = self._run.levels  # A folder without levels is no campaign's.
-
-    @property
-    def run(self) -> Run:
-        """The campaign as the rest of the package takes it."""
-        return self._run
-
-    @property
-    def folder(self) -> Path:
-        """The folder of the campaign."""
-        return self._run.folder
+        self.run = folder if isinstance(folder, Run) else Run(Path(folder))
+        self.folder = self.run.folder
+        self._gates = parse_gates(gates, against=self.run.settings.against is not None)
 
     @property
     def settings(self) -> dict[str, Any]:
         """What `campaign.json` holds."""
-        return self._run.record
+        return self.run.record
 
     @property
     def cases(self) -> Table:
         """All cases, in the order in which they were chosen."""
-        return Table(self._run.outcomes)
+        return Table(self.run.outcomes)
 
     @property
     def failures(self) -> Table:
         """The failing cases, the worst first."""
-        return Table(failures(self._run.cases))
+        return Table(failures(self.run.cases))
 
     @property
     def errors(self) -> Table:
         """The cases that ended in an error of the VUT or of the simulation, with the message."""
-        return Table(o for o in self._run.outcomes if o.measures.end.is_error)
+        return Table(o for o in self.run.outcomes if o.measures.end.is_error)
 
     @property
     def timeouts(self) -> Table:
         """The cases in which the VUT never merged."""
-        return Table(o for o in self._run.outcomes if o.measures.end is End.TIMEOUT)
+        return Table(o for o in self.run.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
     def repeats(self) -> list[Repeat]:
         """The cases that ran a second time, and whether they went as before."""
-        return read_repeats(self._run)
+        return read_repeats(self.run)
 
     @cached_property
     def verdict(self) -> Verdict:
         """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self._run.outcomes, self._run.tolerated)
+        return judge(self.run.outcomes, self.run.tolerated)
 
     @cached_property
     def summary(self) -> Summary:
         """Cases, failures, regions and failure mode coverage by POV level."""
-        return summarise(self._run.outcomes, self._run.levels, self._run.tolerated)
+        return summarise(self.run.outcomes, self.run.levels, self.run.tolerated)
 
     @cached_property
     def facts(self) -> list[Fact]:
         """Each fact of the campaign, with the file and the key that it is from."""
-        return facts_of(self._run, self.summary, self.verdict)
+        return facts_of(self.run, self.summary, self.verdict)
 
     @cached_property
     def against(self) -> Comparison | None:
         """What changed from the version that the campaign is against; None where it is none."""
-        return compare_against(self._run)
+        return compare_against(self.run)
 
     @property
     def regressions(self) -> Table:
         """The cases that do not pass, and pass with that version, the worst first."""
         cases = [] if self.against is None else self.against.steps[0].cases
         broke = [case.b.index for case in cases if case.change is Change.BROKE]
-        return Table(self._run.outcome(index) for index in broke)
+        return Table(self.run.outcome(index) for index in broke)
 
     @cached_property
     def gates(self) -> list[GateResult]:
@@ -159,23 +154,20 @@ class CampaignRun(Result):
         return [gate.check(self.verdict, self.summary, regressions) for gate in self._gates]
 
     @property
-    def is_good(self) -> bool:
-        """See `Result`."""
-        return self.passed
-
-    @property
     def passed(self) -> bool:
         """Whether the VUT merged in some case, and no gate is met."""
         return self.verdict.tested > 0 and not any(gate.met for gate in self.gates)
 
+    is_good = passed
+
     @property
     def converged(self) -> bool:
         """Whether the search ended before its number of cases, as little new was found."""
-        return self._run.converged
+        return self.run.converged
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
-        return self._run.trajectory(index)
+        return self.run.trajectory(index)
 
     @property
     def report_file(self) -> Path:
@@ -186,15 +178,15 @@ class CampaignRun(Result):
         """Write the HTML report and return its path."""
         from merge_sumo.reports.report import write_report
 
-        return write_report(self._run)
+        return write_report(self.run)
 
     @property
     def _doubts(self) -> list[str]:
-        return doubts(self._run.cases, self._run.criterion, self._run.settings.in_vain)
+        return doubts(self.run.cases, self.run.criterion, self.run.settings.in_vain)
 
     def to_record(self) -> dict[str, Any]:
         """Return what `merge-sumo campaign --json` prints."""
-        criterion, at_limits = self._run.criterion, mostly_clipped(self._run.cases)
+        criterion, at_limits = self.run.criterion, mostly_clipped(self.run.cases)
         return {
             **to_plain(self.summary),
             **self.verdict.to_record(),
@@ -211,7 +203,7 @@ class CampaignRun(Result):
 
     def lines(self) -> list[str]:
         """Return the headline, what else is to be known, and the path of the report."""
-        run = self._run
+        run = self.run
         facts = [fact for fact in self.facts if fact.level is None and fact.name in FACTS]
         tested, *found = headline(run, self.facts)
         optional = [
@@ -231,7 +223,7 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        earlier = printable(str(self._run.settings.against)[:NAME_CHARACTERS])
+        earlier = printable(str(self.run.settings.against)[:NAME_CHARACTERS])
         return [
             f"against {earlier}: {comparison_headline(self.against)}",
             *transitions(self.against.steps[0]),
@@ -270,14 +262,11 @@ class CaseRun(Result):
         return self.outcome.failed
 
     @property
-    def is_good(self) -> bool:
-        """See `Result`."""
-        return self.passed
-
-    @property
     def passed(self) -> bool:
         """Whether the VUT merged, and the case is not a failure."""
         return self.measures.end is End.MERGED and not self.failed
+
+    is_good = passed
 
     @property
     def cause(self) -> str:

@@ -13,7 +13,7 @@ from merge_sumo.errors import UserError, notice
 from merge_sumo.files import check_ours, files_now, replace_own
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.printable import printable
-from merge_sumo.records import Record, read_record, to_json
+from merge_sumo.records import Record, read_indexed, read_record, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.evaluate import evaluate
@@ -55,7 +55,7 @@ class StudyFile(Generic[R]):
     def read_lines(self, run: Run) -> dict[int, R]:
         """Read the lines by index; `UserError` for one that is not of a failure of the campaign."""
         failing = {outcome.index for outcome in run.outcomes if outcome.failed}
-        return run.read_lines(self.name, self.kind, failing)
+        return read_indexed(run.folder / self.name, self.kind, failing)
 
     def write_lines(self, folder: Path, lines: Iterable[R]) -> None:
         """Write lines, in the place of older ones."""

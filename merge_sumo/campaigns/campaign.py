@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.repeats import repeat
@@ -228,7 +229,8 @@ def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
     """Return the sampler of a campaign, which was told nothing."""
     twin = twin_of(settings, plan)
     predictor = twin if plan.against is None else TwinPair(twin, twin_of(settings, plan))
-    return settings.with_repeats(settings.new_sampler(predictor))
+    sampler = settings.new_sampler(predictor)
+    return sampler if settings.repeat == 1 else RepeatingSampler(sampler, settings.repeat)
 
 
 def twin_of(settings: CampaignSettings, plan: SimulationPlan) -> ControllerModel:

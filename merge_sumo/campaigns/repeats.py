@@ -27,7 +27,7 @@ from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.files import replace_own
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
-from merge_sumo.records import Record, replaced, to_json
+from merge_sumo.records import Record, read_indexed, replaced, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -166,7 +166,7 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 def read_repeats(run: Run) -> list[Repeat]:
     """Return what a folder says of cases that ran twice; `UserError` for a wrong line."""
-    known = run.read_lines(REPEATS, Repeat, range(len(run.outcomes)))
+    known = read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
     return list(known.values())
 
 

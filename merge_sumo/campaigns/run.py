@@ -10,12 +10,12 @@ against/                  the same of the earlier version, where a campaign is a
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import Annotated, Any, Final
 
 import numpy as np
 from msgspec import Meta
@@ -31,13 +31,11 @@ from merge_sumo.metrics.fmc import regions
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import counted, printable
-from merge_sumo.records import Record, RecordError, convert, decode, read_arrays, read_indexed
+from merge_sumo.records import RecordError, convert, decode, read_arrays
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
-
-T = TypeVar("T", bound=Record)
 
 SETTINGS: Final = "campaign.json"
 OUTCOMES: Final = "outcomes.jsonl"
@@ -255,19 +253,6 @@ class Run:
             return [Episode(one, self.trajectory(one.index)) for one in self.outcomes]
         none = np.empty((0, self.scenario.vehicles, 3))
         return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
-
-    def read_lines(self, name: str, kind: type[T], indices: Container[int]) -> dict[int, T]:
-        """Return the lines of a file of the folder by their index.
-
-        Args:
-            name: the file.
-            kind: what each line is.
-            indices: those that a line may have.
-
-        Raises:
-            UserError: a line is something else.
-        """
-        return read_indexed(self.folder / name, kind, indices)
 
     def earlier(self) -> Run | None:
         """Return the run of the version that this campaign is against; None where there is none.

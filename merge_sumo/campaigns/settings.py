@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.run import SETTINGS, scenario_of
 from merge_sumo.campaigns.stopping import has_converged
 from merge_sumo.config import Search, changed
@@ -141,10 +140,6 @@ class CampaignSettings(Search):
         sampler = make_sampler(self.sampler, self.pool, self.seed, predictor)
         sampler.tolerated = self.tolerated
         return sampler
-
-    def with_repeats(self, sampler: Sampler) -> Sampler:
-        """Return a sampler without outcomes, with repetitions among its cases."""
-        return sampler if self.repeat == 1 else RepeatingSampler(sampler, self.repeat)
 
     @property
     def may_vary(self) -> bool:
