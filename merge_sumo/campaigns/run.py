@@ -406,6 +406,8 @@ def batch_file(folder: Path, batch: int) -> Path:
 
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
+    if not folder.exists():
+        return UserError(f"there is no folder {folder}: name one that a campaign has written")
     if isinstance(error, FileNotFoundError | NotADirectoryError):
         return UserError(
             f"{folder} is not a campaign: there is no {error.filename}; name a folder that "
