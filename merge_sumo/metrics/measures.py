@@ -66,8 +66,7 @@ OURS: Final = (
     ),
     Measure(
         "score",
-        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR), and where a kind of "
-        "scenario has none",
+        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
         label="score P",
         digits=0,
         missing=0.0,
