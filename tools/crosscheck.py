@@ -196,7 +196,7 @@ def uniform(settings: CampaignSettings, count: int, seed: int) -> list[Case]:
 
 def failed(plan: SimulationPlan, trajectory: Trajectory) -> bool:
     """Return whether a case fails by the criterion of the campaign."""
-    return plan.criterion.verdict(trajectory, centre_lines(plan.road)).failed
+    return plan.criterion.judged(trajectory, centre_lines(plan.road)).failed
 
 
 def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tuple[float, float]:

@@ -54,8 +54,7 @@ def cli_page() -> str:
 
 def measures_page() -> str:
     """Return the measures of an episode as a table."""
-    from merge_sumo.metrics.measures import MEASURES
-    from merge_sumo.metrics.score import Measures
+    from merge_sumo.metrics.measures import MEASURES, Measures
 
     rows = ""
     for name, measure in MEASURES.items():

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
@@ -116,7 +117,7 @@ def main() -> None:
         case, folder = example.case, out / name
         trajectory = play(example)
         road = road_for(case.scenario)
-        measures = measure(trajectory, centre_lines(road))
+        measures = Measures.of(trajectory, centre_lines(road))
         outcome = Outcome(0, 0, case, measures)
         write_scenario(folder, road, outcome, trajectory)
         pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")

@@ -14,8 +14,9 @@ from merge_sumo.analysis.comparison import Change, ComparedCase, passes, short
 from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.measures import Measures, measures_in
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import Measures, Outcome, record_fields
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import Record, convert, read_toml, to_json
 from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import Scenario
@@ -72,8 +73,9 @@ class CasesFile(Run):
         if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
             raise UserError("it has a number that is not finite")
         usual = Measures(end=End.MERGED, t_end_s=0.0)
-        names = (name for of in record_fields(self.scenario)[:2] for name in of)
-        unsaid = {name: getattr(usual, name, None) for name in names} | {"batch": 0}
+        unsaid: dict[str, Any] = {"level": None, "batch": 0}
+        unsaid |= dict.fromkeys(self.scenario.case_fields)
+        unsaid |= {name: usual.value(name) for name in measures_in(self.scenario)}
         unsaid["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]
         verdict, accepted = line.pop("verdict", None), line.pop("accepted", None)
         outcome = Outcome.from_json(to_json(unsaid | line), self.scenario)

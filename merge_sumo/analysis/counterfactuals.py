@@ -289,7 +289,7 @@ def _passes(criterion: Criterion, trajectory: Trajectory, lines: CentreLines) ->
     """
     if brake_after_mps2(trajectory) > -trajectory.case.scenario.a_min_mps2:
         return False
-    return trajectory.end.is_tested and not criterion.verdict(trajectory, lines).failed
+    return trajectory.end.is_tested and not criterion.judged(trajectory, lines).failed
 
 
 class _Substitutes(Driver):

@@ -20,7 +20,7 @@ from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import CaseVerdict, Outcome
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import Record
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
@@ -242,9 +242,9 @@ def stress(study: RunStudy) -> StressResult:
     return found
 
 
-def verdict_of(episode: Episode) -> CaseVerdict:
-    """Return the verdict on a case."""
-    return episode.outcome.verdict
+def verdict_of(episode: Episode) -> Outcome:
+    """Return the outcome of a case."""
+    return episode.outcome
 
 
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
@@ -266,7 +266,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     return Rung(one.name, one.about, one.source, tuple(flips), skipped)
 
 
-def flips_of(tested: Sequence[Outcome], found: Sequence[CaseVerdict]) -> Flips:
+def flips_of(tested: Sequence[Outcome], found: Sequence[Outcome]) -> Flips:
     """Return which verdicts flip, by those of a run of the same cases."""
     pairs = list(zip(tested, found, strict=True))
     flipped = [o for o, now in pairs if now.is_tested and now.failed != o.failed]

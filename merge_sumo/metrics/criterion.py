@@ -16,18 +16,17 @@ from typing import Final
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.expression import Condition, Value, Vocabulary, parse_condition
-from merge_sumo.metrics.measures import MEASURES
-from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import (
-    FOLLOWED_UP,
-    ON_LANE,
-    CaseVerdict,
+from merge_sumo.metrics.measures import (
+    FOLLOW_UP,
+    LANE,
+    MEASURES,
     Measures,
-    Outcome,
-    margin_of,
-    measure,
-    merge_score,
+    known_measures,
+    measures_in,
 )
+from merge_sumo.metrics.merge import Severity
+from merge_sumo.metrics.paper import margin_of
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
 from merge_sumo.printable import nearest, printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, Scenario
@@ -66,8 +65,6 @@ TEXTS: Final = {
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
-OF_BODIES: Final = frozenset({"before_clearance_m"})
-"""Measures that need the centre lines of the road."""
 NO_TEXT: Final = frozenset({"merged_first", "severity"})
 """Texts that an episode may be without; they count as an empty one."""
 CLOSE: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
@@ -109,17 +106,18 @@ class Criterion:
             try_formula(self.require)
             return
         spoken = condition_of(self.words).names
-        if not scenario.follow_up_s and (named := spoken.intersection(FOLLOWED_UP)):
-            where = scenario.said("behind M")
-            raise UserError(
-                f"`fail_when` speaks of {min(named)}, which is measured {where}: say how long "
-                "with `follow_up_s` SECONDS"
-            )
-        if scenario.lane_m is None and (named := spoken.intersection(ON_LANE)):
-            raise UserError(
-                f"`fail_when` speaks of {min(named)}, and {scenario.name} has no acceleration "
-                "lane: choose a scenario with one, such as us23-lane"
-            )
+        recorded = measures_in(scenario)
+        for name in sorted(spoken - recorded.keys()):
+            if MEASURES[name].only_with == FOLLOW_UP:
+                raise UserError(
+                    f"`fail_when` speaks of {name}, which is measured "
+                    f"{scenario.said('behind M')}: say how long with `follow_up_s` SECONDS"
+                )
+            if MEASURES[name].only_with == LANE:
+                raise UserError(
+                    f"`fail_when` speaks of {name}, and {scenario.name} has no acceleration "
+                    "lane: choose a scenario with one, such as us23-lane"
+                )
 
     @property
     def is_papers(self) -> bool:
@@ -156,31 +154,18 @@ class Criterion:
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
     ) -> Outcome:
         """Return the outcome of an episode at a place in a campaign."""
-        measures = measure(trajectory, lines)
+        measures = Measures.of(trajectory, lines)
         margin = self.margin(trajectory, measures)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
     def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
         """Return the outcome of an episode of no campaign, for its verdict alone.
 
-        What takes most of the time is left out where the criterion does not speak of it: the last
-        way out, and bodies before M.
+        It takes no more measures than the criterion speaks of.
         """
-        spoken = frozenset[str]() if self.require else condition_of(self.words).names
-        seen = lines if spoken & OF_BODIES else None
-        measures = measure(
-            trajectory, seen, avoidability="last_avoidable_s" in spoken, further=spoken
-        )
+        measures = Measures(trajectory, lines)
         margin = self.margin(trajectory, measures)
         return Outcome(0, 0, trajectory.case, measures, margin=margin)
-
-    def verdict(self, trajectory: Trajectory, lines: CentreLines | None = None) -> CaseVerdict:
-        """Return the verdict on an episode, the same as that of its outcome."""
-        if self.is_papers:
-            # The score of a merge takes less time than all of its measures.
-            found = CaseVerdict(margin_of(merge_score(trajectory)), trajectory.end.is_tested)
-            return found._replace(is_tested=found.is_tested or found.failed)
-        return self.judged(trajectory, lines).verdict
 
     def is_close_call(
         self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
@@ -210,7 +195,7 @@ def condition_of(text: str) -> Condition:
 
 def vocabulary() -> Vocabulary:
     """Return what a condition may speak of: None for a number, or all that a text may be."""
-    numbers = (name for name, one in MEASURES.items() if one.missing is not None)
+    numbers = (name for name, one in known_measures().items() if one.missing is not None)
     return {**dict.fromkeys(numbers), **TEXTS}
 
 
@@ -221,10 +206,10 @@ def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[st
         missing["brake_after_mps2"] = math.inf
     if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
         missing["after_drac_mps2"] = math.inf
-    values: dict[str, Value] = {}
+    values, known = dict[str, Value](), known_measures()
     for name in vocabulary() if names is None else names:
         value = measures.value(name)
         if value is None:
-            value = missing.get(name, "" if name in NO_TEXT else MEASURES[name].missing)
+            value = missing.get(name, "" if name in NO_TEXT else known[name].missing)
         values[name] = value if isinstance(value, str) else float(value or 0.0)
     return values

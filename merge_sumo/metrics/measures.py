@@ -1,342 +1,636 @@
-"""Measures of an episode: what each is, its unit, and how it is shown.
+"""Measures of an episode. Each is one decorated function of `Measures`, or of an installed package.
 
-The fields of `Measures` are computed together, by `score.py`. A further measure has a function of
-its own, `of`: it is recorded under its name after the fields, conditions may name it, and the
-report, exports and documentation show it like any other.
+The name of the function is that in records and conditions, with the unit at its end; its docstring
+says what it is. Records, `--fail-when`, listings, reports, exports and documentation follow.
+
+    from merge_sumo.metrics.measures import Measures, measure
+
+    @measure(unit="m", missing=math.inf)
+    def closest_m(episode: Measures) -> float:
+        \"\"\"Least distance of the front bumpers.\"\"\"
+        return float(np.abs(episode.trajectory.x_pov_m - episode.trajectory.x_vut_m).min())
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from traceback import extract_tb
-from typing import Final, Literal
+from typing import Any, Final, Generic, Literal, TypeVar
+
+import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.metrics.bodies import CentreLines, closest_before_m
+from merge_sumo.metrics.merge import (
+    HARSH_MPS2,
+    STANDS_MPS,
+    Severity,
+    brake_after_mps2,
+    braked_after_mps2,
+    closest_after_m,
+    gaps_m,
+    last_avoidable_s,
+    neighbours,
+    place_of_merge_m,
+)
+from merge_sumo.metrics.paper import FAILURE_SCORE, merge_score, time_to_collision
 from merge_sumo.registry import Registry
-from merge_sumo.scenario.scenario import Scenario
-from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario, Vehicle
+from merge_sumo.scenario.trajectory import End, Trajectory, as_reason
 
-Further = tuple[tuple[str, float], ...]
-"""Values of further measures by name; one without a value is left out."""
+T = TypeVar("T")
+
+SUSTAINED_STEPS: Final = 16
+"""Steps over which braking counts as sustained: 1.6 s, as in published braking of drivers."""
+FOLLOW_UP: Final = "a follow-up"
+LANE: Final = "an acceleration lane"
+TRAFFIC: Final = "traffic"
 
 
-@dataclass(frozen=True, slots=True)
-class Measure:
-    """A measure of an episode."""
+@dataclass(frozen=True, kw_only=True)
+class Measure(Generic[T]):
+    """A measure of an episode: its function, its unit, and how it is shown.
 
-    name: str  # in records and conditions, with the unit at its end
-    about: str  # what it is, in a sentence without its full stop
-    unit: str = ""  # as a person reads it; empty for a number without one and for a text
-    label: str = ""  # name in the listing of an episode; empty where that leaves it out
-    column: str = ""  # name in the table of the report; empty where that leaves it out
-    digits: int = 1  # decimals in tables
+    Attributes:
+        of: returns the value of an episode, None where it has none; infinite is none, too.
+        unit: empty for a number without one, and for a text.
+        label: name in the listing of an episode; empty where that leaves it out.
+        column: name in the table of the report; empty where that leaves it out.
+        digits: decimals in tables.
+        missing: what a condition takes where an episode has no value; None for a measure that is
+            no number.
+        worse: at which end of its values an episode is worse, if at one.
+        only_with: what a scenario has where the measure is recorded; empty for every scenario.
+        default: value where nothing is recorded.
+    """
+
+    of: Callable[[Any], T]
+    unit: str = ""
+    label: str = ""
+    column: str = ""
+    digits: int = 1
     missing: float | None = None
-    """What a condition takes where an episode has no value: that of cars that never meet; None
-    for a measure that is no number."""
     worse: Literal["low", "high"] | None = None
-    """At which end of its values an episode is worse, if at one."""
-    of: Callable[[Trajectory, CentreLines | None], float | None] | None = None
-    """Measures an episode on a road, and returns None where that has no value; None for the
-    fields of `Measures`."""
+    only_with: str = ""
+    default: Any = None
 
-    def label_in(self, scenario: Scenario) -> str:
-        """Return its name in the listing of an episode of a scenario."""
-        return scenario.said(self.label)
+    @property
+    def name(self) -> str:
+        """The name in records and conditions."""
+        return self.of.__name__
 
-    def title_in(self, scenario: Scenario) -> str:
-        """Return name and unit, as the head of a column of a scenario shows them."""
-        name = scenario.said(self.column)
-        return f"{name} {self.unit}".replace("s2", "s²").rstrip()
+    @property
+    def about(self) -> str:
+        """The definition, in a sentence without its full stop."""
+        return " ".join((inspect.getdoc(self.of) or "").split()).removesuffix(".")
+
+    def __get__(self, measures: object, owner: object = None) -> T:
+        """Return the value in the measures of an episode."""
+        if isinstance(measures, Measures):
+            value: T = measures.value(self.name)
+            return value
+        return self  # type: ignore[return-value]
+
+    def compute(self, episode: Measures) -> Any:
+        """Return the value in an episode; `UserError` where the function fails."""
+        is_own = self.name in OURS
+        if not is_own and episode.end.is_error:
+            return None
+        try:
+            value: Any = self.of(episode)
+            if not is_own and value is not None:
+                value = float(value)
+        except Exception as error:
+            last = extract_tb(error.__traceback__)[-1]
+            raise UserError(
+                f"the measure {self.name!r} failed in {last.filename}, line {last.lineno}: "
+                f"{type(error).__name__}: {error}"
+            ) from error
+        return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-_low = partial(Measure, missing=math.inf, worse="low")
-"""Makes a measure of which low values are worse; cars that never meet have none, which is high."""
-_high = partial(Measure, missing=0.0, worse="high")
-"""Makes one of which high values are worse."""
-OURS: Final = (
-    Measure("end", "why the episode ended"),
-    Measure(
-        "severity",
-        "contact, conflict, harsh or safe (`severity.py`); None where the VUT never reached M, "
-        "and after an error",
-    ),
-    Measure(
-        "score",
-        "P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)",
-        label="score P",
-        digits=0,
-        missing=0.0,
-        worse="low",
-    ),
-    Measure(
-        "dx_m",
-        "x_POV - x_VUT, of the front bumpers",
-        unit="m",
-        label="front bumpers, x_POV - x_VUT",
-        column="Δx at M",
-        missing=math.inf,
-    ),
-    _low(
-        "bumper_gap_m",
-        "smallest gap at M between the front bumper of the car behind and the rear bumper of the "
-        "car ahead, negative where bodies overlap; None without a merge",
-        unit="m",
-        label="bumper gap at M",
-        column="bumper gap at M",
-    ),
-    _low(
-        "clearance_m",
-        "smallest gap between bumpers from M on, to the end of the follow-up; 0 or less where "
-        "bodies touch, None without a merge",
-        unit="m",
-        label="smallest gap from M on",
-        column="clearance",
-    ),
-    _low(
-        "before_clearance_m",
-        "smallest distance of bodies before M, where the lanes run together; 0 or less where they "
-        "overlap, None where the VUT never came there",
-        unit="m",
-        label="smallest clearance before M",
-        column="clearance before M",
-    ),
-    Measure("dv_mps", "v_POV - v_VUT", unit="m/s", label="v_POV - v_VUT", column="dv", missing=0.0),
-    _low(
-        "ttc_s",
-        "time to collision -dx/dv where dx dv < 0, else None (infinite)",
-        unit="s",
-        label="time to collision",
-        column="TTC",
-    ),
-    _low(
-        "pet_s",
-        "post-encroachment time: time between the two front bumpers at M (Allen et al., 1978); "
-        "where the POV has not arrived by t1, it is taken on at its speed at t1; None when it "
-        "stands",
-        unit="s",
-        label="post-encroachment time",
-        column="PET",
-    ),
-    Measure("t_end_s", "time at which the episode ended", unit="s", column="time", missing=0.0),
-    _high(
-        "drac_mps2",
-        "deceleration rate to avoid a crash that the follower needs at t1 (Cooper and Ferguson, "
-        "1976), dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None where |dx| < 6 m",
-        unit="m/s2",
-        label="deceleration to keep 6 m apart",
-    ),
-    _high(
-        "brake_after_mps2",
-        "deceleration that whoever is behind at M needs, after 0.75 s to react, not to touch a "
-        "car ahead that keeps its speed (`merge.py`); None where none is in time, and without a "
-        "merge",
+def measure(
+    worse: Literal["low", "high"] | None = None, **shown: Any
+) -> Callable[[Callable[[Any], T]], Measure[T]]:
+    """Declare a measure by its function.
+
+    Args:
+        worse: at which end of its values an episode is worse. An episode without a value counts as
+            one at the other end: cars that never meet.
+        shown: other attributes of `Measure`.
+    """
+    missing = {"low": math.inf, "high": 0.0, None: None}[worse]
+
+    def declared(function: Callable[[Any], T]) -> Measure[T]:
+        return Measure(of=function, worse=worse, **{"missing": missing, **shown})
+
+    return declared
+
+
+class Measures:
+    """Named measures of one episode, with the verdict first.
+
+    dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, and
+    are None when the VUT never arrived. In traffic they are those of the car of the mainline that
+    is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
+    bumper gap, braking after M, impact speed) is that of all cars.
+
+    A measure is computed when it is read first; `of` computes all. Recorded ones have no
+    trajectory.
+
+    Attributes:
+        trajectory: what happened.
+        lines: centre lines of the road; without them bodies are looked at from M on.
+    """
+
+    __hash__ = None  # type: ignore[assignment]
+    __slots__ = ("lines", "trajectory", "values")
+
+    def __init__(
+        self,
+        trajectory: Trajectory | None = None,
+        lines: CentreLines | None = None,
+        **values: Any,
+    ) -> None:
+        """Take an episode, or the values of measures by name."""
+        self.trajectory: Trajectory = trajectory  # type: ignore[assignment]
+        self.lines, self.values = lines, values
+
+    @classmethod
+    def of(cls, trajectory: Trajectory, lines: CentreLines | None = None) -> Measures:
+        """Return all measures of an episode."""
+        return measure_all([trajectory], lines)[0]
+
+    def value(self, name: str) -> Any:
+        """Return the value of a measure, of this package or another; None where it has none."""
+        if name not in self.values:
+            known = known_measures()[name]
+            computed = known.default if self.trajectory is None else known.compute(self)
+            self.values[name] = computed
+        return self.values[name]
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether all values are the same."""
+        if not isinstance(other, Measures):
+            return NotImplemented
+        return all(self.value(name) == other.value(name) for name in known_measures())
+
+    def __repr__(self) -> str:
+        """Return the values that there are."""
+        known = {name: value for name, value in self.values.items() if value is not None}
+        return f"Measures({', '.join(f'{name}={value!r}' for name, value in known.items())})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the values: the episode goes on its own."""
+        return self.values
+
+    def __setstate__(self, values: dict[str, Any]) -> None:
+        """Take the values."""
+        Measures.__init__(self, **values)
+
+    @property
+    def became(self) -> str:
+        """The result of the episode in a word: its severity, or its end where it has none."""
+        return self.severity or self.end.value
+
+    @property
+    def is_close(self) -> bool:
+        """Whether the front bumpers were nearer at M than the paper allows: its rule of a crash."""
+        return self.score is not None and self.score < FAILURE_SCORE
+
+    @measure()
+    def end(self) -> End:
+        """Why the episode ended."""
+        return self.trajectory.end
+
+    @measure(worse="low", label="score P", digits=0, missing=0.0)
+    def score(self) -> float | None:
+        """P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)."""
+        return merge_score(self.trajectory)
+
+    @measure(unit="m", label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
+    def dx_m(self) -> float | None:
+        """x_POV - x_VUT, of the front bumpers."""
+        return self._at_end(0)
+
+    @measure(unit="m/s", label="v_POV - v_VUT", column="dv", missing=0.0)
+    def dv_mps(self) -> float | None:
+        """v_POV - v_VUT."""
+        return self._at_end(1)
+
+    def _at_end(self, column: int) -> float | None:
+        """Return the difference of the car at M and the VUT."""
+        if not self.end.is_tested:
+            return None
+        last = self.trajectory.motion[-1]
+        return float(last[self.trajectory.nearest, column] - last[VUT, column])
+
+    @measure(worse="low", unit="s", label="time to collision", column="TTC")
+    def ttc_s(self) -> float | None:
+        """Time to collision -dx/dv where dx dv < 0, else None (infinite)."""
+        dx, dv = self.dx_m, self.dv_mps
+        return None if dx is None or dv is None else time_to_collision(dx, dv)
+
+    @measure(worse="low", unit="s", label="post-encroachment time", column="PET")
+    def pet_s(self) -> float | None:
+        """Post-encroachment time: time between the two front bumpers at M (Allen et al., 1978).
+
+        Where the POV has not arrived by t1, it is taken on at its speed at t1; None when it stands.
+        """
+        return _post_encroachment_time(self.trajectory) if self.end.is_tested else None
+
+    @measure(unit="s", column="time", missing=0.0)
+    def t_end_s(self) -> float:
+        """Time at which the episode ended."""
+        return self.trajectory.t_end_s
+
+    @measure()
+    def severity(self) -> Severity | None:
+        """Contact, conflict, harsh or safe (`merge.py`).
+
+        None where the VUT never reached M, and after an error.
+        """
+        if not self.end.is_tested:
+            return None
+        if self.clearance_m is not None and self.clearance_m <= 0.0:
+            return Severity.CONTACT
+        if self.is_close:
+            return Severity.CONFLICT
+        return Severity.HARSH if (self.after_brake_mps2 or 0.0) > HARSH_MPS2 else Severity.SAFE
+
+    @measure(worse="low", unit="m", label="bumper gap at M", column="bumper gap at M")
+    def bumper_gap_m(self) -> float | None:
+        """Smallest gap between bumpers at M.
+
+        From the front bumper of the car behind to the rear bumper of the car ahead, negative where
+        bodies overlap; None without a merge.
+        """
+        return min((car.gap_m for car in neighbours(self.trajectory)), default=None)
+
+    @measure(worse="low", unit="m", label="smallest gap from M on", column="clearance")
+    def clearance_m(self) -> float | None:
+        """Smallest gap between bumpers from M on, to the end of the follow-up.
+
+        0 or less where bodies touch, None without a merge.
+        """
+        return closest_after_m(self.trajectory)[0]
+
+    @measure(
+        worse="low", unit="m", label="smallest clearance before M", column="clearance before M"
+    )
+    def before_clearance_m(self) -> float | None:
+        """Smallest distance of bodies before M, where the lanes run together.
+
+        0 or less where they overlap, None where the VUT never came there.
+        """
+        if self.lines is None or self.end.is_error:
+            return None
+        return closest_before_m([self.trajectory], self.lines)[0]
+
+    @measure(worse="high", unit="m/s2", label="deceleration to keep 6 m apart")
+    def drac_mps2(self) -> float | None:
+        """Deceleration rate to avoid a crash that the follower needs at t1.
+
+        After Cooper and Ferguson (1976): dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None
+        where |dx| < 6 m.
+        """
+        dx, dv = self.dx_m, self.dv_mps
+        if dx is None or dv is None or self.is_close:
+            return None
+        if dx * dv >= 0:
+            return 0.0
+        gap = abs(dx) - self.trajectory.case.scenario.dx_crash_m
+        return dv * dv / (2 * gap) if gap > 0 else None
+
+    @measure(
+        worse="high",
         unit="m/s2",
         label="braking that M asks of the rear",
         column="braking asked after M",
-    ),
-    _high(
-        "impact_speed_mps",
-        "relative speed at the first contact; None without one",
-        unit="m/s",
-        label="impact speed",
-        column="impact",
-    ),
-    _high(
-        "vut_max_brake_mps2",
-        "hardest braking of the VUT, positive",
+    )
+    def brake_after_mps2(self) -> float | None:
+        """Deceleration that whoever is behind at M needs not to touch the car ahead.
+
+        It begins after 0.75 s to react, and the car ahead keeps its speed (`merge.py`);
+        None where none is in time, and without a merge.
+        """
+        return brake_after_mps2(self.trajectory) if self.end is End.MERGED else None
+
+    @measure(
+        worse="high",
         unit="m/s2",
         label="hardest braking of the VUT",
         column="VUT brakes",
-    ),
-    _high(
-        "pov_max_brake_mps2",
-        "hardest braking of the POV, positive",
+        default=0.0,
+    )
+    def vut_max_brake_mps2(self) -> float:
+        """Hardest braking of the VUT, positive."""
+        return max(0.0, -float(self.trajectory.a_vut_mps2.min()))
+
+    @measure(
+        worse="high",
         unit="m/s2",
         label="hardest braking of the POV",
         column="POV brakes",
-    ),
-    _high(
-        "pov_sustained_brake_mps2",
-        "largest mean deceleration of the POV over 1.6 s, or over an episode that is shorter; None "
-        "in records of versions without it, as the next",
+        default=0.0,
+    )
+    def pov_max_brake_mps2(self) -> float:
+        """Hardest braking of the POV, positive."""
+        return max(0.0, -float(self.trajectory.motion[:, self.trajectory.nearest, 2].min()))
+
+    @measure(
+        worse="high",
         unit="m/s2",
         label="braking of the POV over 1.6 s",
         column="POV brakes over 1.6 s",
-    ),
-    _high(
-        "pov_slowdown_mps",
-        "largest loss of speed of the POV up to t1, from the highest speed that it had before",
-        unit="m/s",
-        label="slow-down of the POV",
-        column="POV slows by",
-    ),
-    Measure("merged_first", '"VUT" or "POV": whose front bumper is ahead at M'),
-    _low(
-        "last_avoidable_s",
-        "where |dx| < 6 m at M, the last time from which the VUT, at full acceleration or full "
-        "braking by eq. (4), would have kept 6 m against the recorded motion of the POV and the "
-        "other cars (taken on at their last speed); None when there was no such time, and where "
-        "|dx| >= 6 m",
-        unit="s",
-        label="avoidable until",
-    ),
-    Measure("avoidable", "where |dx| < 6 m at M, whether there was such a time; else None"),
-    _high(
-        "clipped_steps",
-        "steps in which the VUT asked for more than its limits of acceleration",
-        digits=0,
-    ),
-    Measure("error", "what the VUT or the simulation did wrong, also behind M, else None"),
-    Measure("nearest", "name of the car that the measures are of; recorded in traffic only"),
-    _low(
-        "after_gap_m",
-        "least gap between bumpers in the follow-up, 0 or less where bodies touch; this and the "
-        "next three are None without a merge, and recorded where there is a follow-up only",
-        unit="m",
-        label="smallest bumper gap behind M",
-    ),
-    _low(
-        "after_ttc_s",
-        "lowest time to collision in it, between bumpers; None where no gap closes",
-        unit="s",
-        label="time to collision behind M",
-    ),
-    _high(
-        "after_drac_mps2",
-        "hardest braking that it needs, dv^2 / (2 gap); None where bodies touch",
-        unit="m/s2",
-        label="braking needed behind M",
-    ),
-    _high(
-        "after_brake_mps2",
-        "hardest braking in it of the cars behind the VUT, and of the VUT behind the nearest car",
-        unit="m/s2",
-        label="hardest braking behind M",
-    ),
-    Measure(
-        "x_merge_m",
-        "on an acceleration lane, where the VUT merges; this and the next six are recorded there "
-        "only, and None without a merge",
-        unit="m",
-        label="place of the merge",
-        column="merges at",
-        missing=math.inf,
-    ),
-    Measure(
-        "lane_share",
-        "place of the merge as a share of the acceleration lane, from its begin",
+    )
+    def pov_sustained_brake_mps2(self) -> float | None:
+        """Largest mean deceleration of the POV over 1.6 s, or over an episode that is shorter.
+
+        None in records of versions without it, as the next.
+        """
+        return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
+
+    @measure(worse="high", unit="m/s", label="slow-down of the POV", column="POV slows by")
+    def pov_slowdown_mps(self) -> float | None:
+        """Largest loss of speed of the POV up to t1, from the highest speed that it had before."""
+        v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]
+        return float((np.maximum.accumulate(v_mps) - v_mps).max())
+
+    @measure(worse="high", unit="m/s", label="impact speed", column="impact")
+    def impact_speed_mps(self) -> float | None:
+        """Relative speed at the first contact; None without one."""
+        return closest_after_m(self.trajectory)[1]
+
+    @measure()
+    def merged_first(self) -> Literal["VUT", "POV"] | None:
+        """Whose front bumper is ahead at M: that of the VUT or the POV."""
+        if self.dx_m is None:
+            return None
+        return "VUT" if self.dx_m < 0 else "POV"
+
+    @measure(worse="low", unit="s", label="avoidable until")
+    def last_avoidable_s(self) -> float | None:
+        """Where |dx| < 6 m at M, the last time from which the VUT could have kept 6 m.
+
+        At full acceleration or full braking by eq. (4), against the recorded motion of the
+        POV and the other
+        cars (taken on at their last speed); None when there was no such time, and where
+        |dx| >= 6 m.
+        """
+        return last_avoidable_s(self.trajectory) if self.is_close else None
+
+    @measure()
+    def avoidable(self) -> bool | None:
+        """Where |dx| < 6 m at M, whether there was such a time; else None."""
+        return self.last_avoidable_s is not None if self.is_close else None
+
+    @measure(worse="high", digits=0, default=0)
+    def clipped_steps(self) -> int:
+        """Steps in which the VUT asked for more than its limits of acceleration."""
+        return self.trajectory.clipped_steps
+
+    @measure()
+    def error(self) -> str | None:
+        """What the VUT or the simulation did wrong, also behind M, else None."""
+        return None if self.trajectory.error is None else as_reason(self.trajectory.error)
+
+    @measure(only_with=TRAFFIC, default=VEHICLES[POV])
+    def nearest(self) -> Vehicle:
+        """Name of the car that the measures are of; recorded in traffic only."""
+        return VEHICLES[self.trajectory.nearest]
+
+    @measure(worse="low", unit="m", label="smallest bumper gap behind M", only_with=FOLLOW_UP)
+    def after_gap_m(self) -> float | None:
+        """Least gap between bumpers in the follow-up, 0 or less where bodies touch.
+
+        This and the next three are None without a merge, and recorded where there is a follow-up
+        only.
+        """
+        after = self._after()
+        return None if after is None else float(after[0].min())
+
+    @measure(worse="low", unit="s", label="time to collision behind M", only_with=FOLLOW_UP)
+    def after_ttc_s(self) -> float | None:
+        """Lowest time to collision in it, between bumpers, 0 where bodies touch.
+
+        None where no gap closes.
+        """
+        after = self._after()
+        if after is None:
+            return None
+        gap_m, closing_mps = after
+        if gap_m.min() <= 0.0:
+            return 0.0
+        closes = closing_mps > 0.0
+        return float((gap_m[closes] / closing_mps[closes]).min(initial=math.inf))
+
+    @measure(worse="high", unit="m/s2", label="braking needed behind M", only_with=FOLLOW_UP)
+    def after_drac_mps2(self) -> float | None:
+        """Hardest braking that it needs, dv^2 / (2 gap); None where bodies touch."""
+        after = self._after()
+        if after is None or after[0].min() <= 0.0:
+            return None
+        gap_m, closing_mps = after
+        closes = closing_mps > 0.0
+        return float((np.square(closing_mps[closes]) / (2.0 * gap_m[closes])).max(initial=0.0))
+
+    @measure(worse="high", unit="m/s2", label="hardest braking behind M", only_with=FOLLOW_UP)
+    def after_brake_mps2(self) -> float | None:
+        """Hardest braking in it of cars behind the VUT, and of the VUT behind the nearest car."""
+        return braked_after_mps2(self.trajectory)
+
+    def _after(self) -> tuple[FloatArray, FloatArray] | None:
+        """Return bumper gaps and closing speeds in the follow-up, (T, A - 1) each."""
+        after = self.trajectory.after
+        return None if after is None else gaps_m(after, self.trajectory.case.scenario.lengths_m)
+
+    @measure(
+        unit="m", label="place of the merge", column="merges at", missing=math.inf, only_with=LANE
+    )
+    def x_merge_m(self) -> float | None:
+        """On an acceleration lane, where the VUT merges.
+
+        This and the next six are recorded there only, and None without a merge.
+        """
+        merges = self.trajectory.case.scenario.lane_m and self.end is End.MERGED
+        return place_of_merge_m(self.trajectory) if merges else None
+
+    @measure(
         label="share of the lane",
         column="share of the lane",
         digits=2,
         missing=math.inf,
-    ),
-    _low(
-        "gap_ahead_m",
-        "bumper gap at the merge to the car ahead; None without one, as the next three",
-        unit="m",
-        label="gap ahead at the merge",
-    ),
-    _low(
-        "gap_behind_m",
-        "bumper gap at the merge to the car behind",
-        unit="m",
-        label="gap behind at the merge",
-    ),
-    _low(
-        "time_gap_ahead_s",
-        "gap ahead over the speed of the VUT",
+        only_with=LANE,
+    )
+    def lane_share(self) -> float | None:
+        """Place of the merge as a share of the acceleration lane, from its begin."""
+        lane_m, x_m = self.trajectory.case.scenario.lane_m, self.x_merge_m
+        if lane_m is None or x_m is None:
+            return None
+        return (x_m - lane_m[0]) / (lane_m[1] - lane_m[0])
+
+    @measure(worse="low", unit="m", label="gap ahead at the merge", only_with=LANE)
+    def gap_ahead_m(self) -> float | None:
+        """Bumper gap at the merge to the car ahead; None without one, as the next three."""
+        return self._lane_gap(is_ahead=True)[0]
+
+    @measure(worse="low", unit="m", label="gap behind at the merge", only_with=LANE)
+    def gap_behind_m(self) -> float | None:
+        """Bumper gap at the merge to the car behind."""
+        return self._lane_gap(is_ahead=False)[0]
+
+    @measure(
+        worse="low",
         unit="s",
         label="time gap ahead at the merge",
         column="time gap ahead",
         digits=2,
-    ),
-    _low(
-        "time_gap_behind_s",
-        "gap behind over the speed of the car behind",
+        only_with=LANE,
+    )
+    def time_gap_ahead_s(self) -> float | None:
+        """Gap ahead over the speed of the VUT."""
+        return self._lane_gap(is_ahead=True)[1]
+
+    @measure(
+        worse="low",
         unit="s",
         label="time gap behind at the merge",
         column="time gap behind",
         digits=2,
-    ),
-    _high(
-        "stood_s",
-        "time for which the VUT stood on the acceleration lane",
+        only_with=LANE,
+    )
+    def time_gap_behind_s(self) -> float | None:
+        """Gap behind over the speed of the car behind."""
+        return self._lane_gap(is_ahead=False)[1]
+
+    def _lane_gap(self, *, is_ahead: bool) -> tuple[float | None, float | None]:
+        """Return the gap to the next car at a merge from a lane, in m and in s."""
+        cars = [car for car in neighbours(self.trajectory) if car.is_ahead == is_ahead]
+        if self.x_merge_m is None or not cars:
+            return None, None
+        nearest = min(cars)
+        v_mps = float(self.trajectory.v_vut_mps[-1]) if is_ahead else nearest.v_mps
+        return nearest.gap_m, nearest.gap_m / v_mps if v_mps > 0.0 else None
+
+    @measure(
+        worse="high",
         unit="s",
         label="stood on the lane",
         column="stood",
-    ),
-)
-"""The fields of `Measures`, in the order in which an episode is listed, then measures with `of`."""
+        only_with=LANE,
+        default=0.0,
+    )
+    def stood_s(self) -> float:
+        """Time for which the VUT stood on the acceleration lane."""
+        lane_m = self.trajectory.case.scenario.lane_m
+        if lane_m is None or self.end.is_error:
+            return 0.0
+        x_m, v_mps = self.trajectory.x_vut_m, self.trajectory.v_vut_mps
+        return round(DT_S * int(((x_m >= lane_m[0]) & (v_mps < STANDS_MPS)).sum()), 1)
 
-RESERVED: Final = frozenset({"index", "batch", "level", "margin", "foretold"})
+
+OURS: Final = {name: one for name, one in vars(Measures).items() if isinstance(one, Measure)}
+RESERVED: Final = frozenset({"index", "batch", "level", "draw", "margin", "foretold"})
 """Names of a record that are no measures."""
 
 
 def _is_measure(item: object) -> bool:
     return (
         isinstance(item, Measure)
-        and (item in OURS or (item.of is not None and item.missing is not None))
-        and item.name.isidentifier()
+        and (item.name in OURS or item.missing is not None)
         and item.name not in RESERVED
     )
 
 
-MEASURES: Final[Registry[Measure]] = Registry(
+MEASURES: Final[Registry[Measure[Any]]] = Registry(
     "merge_sumo.measures",
     "measure",
-    {measure.name: measure for measure in OURS},
+    OURS,
     accepts=_is_measure,
     contract=(
-        "a merge_sumo.metrics.measures.Measure with a function `of`, a number `missing`, and a "
-        f"name that is an identifier and none of {', '.join(sorted(RESERVED))}"
+        "a function with the decorator merge_sumo.metrics.measures.measure and a number `missing`, "
+        f"with a name that is none of {', '.join(sorted(RESERVED))}"
     ),
 )
 
 
 @cache
-def further_measures() -> dict[str, Measure]:
-    """Return the measures with a function of their own, by name; for a process they stay."""
-    return {name: measure for name, measure in MEASURES.items() if measure.of is not None}
+def known_measures() -> dict[str, Measure[Any]]:
+    """Return the measures by name, those of this package first; they stay for a process."""
+    return dict(MEASURES)
 
 
-def further_of(
-    trajectory: Trajectory, lines: CentreLines | None, names: Iterable[str] | None = None
-) -> Further:
-    """Measure an episode by further measures, all or those of some names.
+def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
+    """Return the measures that are recorded in a scenario, by name."""
+    there = {
+        "": True,
+        FOLLOW_UP: scenario.follow_up_s > 0.0,
+        LANE: scenario.lane_m is not None,
+        TRAFFIC: scenario.vehicles > 2,
+    }
+    return {name: one for name, one in known_measures().items() if there[one.only_with]}
+
+
+def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
+    """Return all measures of episodes of one scenario, which is faster than one by one.
 
     Args:
-        trajectory: what happened; after an error no measure has a value.
-        lines: centre lines of the road, where they are known.
-        names: of measures; others than further ones are left out.
-
-    Raises:
-        UserError: where a measure fails, or gives no number.
+        trajectories: what happened.
+        lines: centre lines of the road; without them bodies are looked at from M on.
     """
-    chosen = further_measures()
-    if names is not None:
-        chosen = {name: chosen[name] for name in names if name in chosen}
-    return with_values({name: _value(one, trajectory, lines) for name, one in chosen.items()})
+    found = [Measures(trajectory, lines) for trajectory in trajectories]
+    if lines is not None:
+        closest_m = closest_before_m(trajectories, lines)
+        for one, clearance_m in zip(found, closest_m, strict=True):
+            if not one.end.is_error:
+                one.values["before_clearance_m"] = (
+                    clearance_m if math.isfinite(clearance_m) else None
+                )
+    for one in found:
+        for name in known_measures():
+            one.value(name)
+    return found
 
 
-def with_values(measured: Mapping[str, float | None]) -> Further:
-    """Leave out the measures that have no value."""
-    return tuple((name, value) for name, value in measured.items() if value is not None)
+def sustained_brake_mps2(v_mps: FloatArray) -> float:
+    """Return the largest mean deceleration over 1.6 s of speeds, (T + 1,), or over all of them."""
+    steps = min(SUSTAINED_STEPS, len(v_mps) - 1)
+    if steps < 1:
+        return 0.0
+    return max(0.0, float((v_mps[:-steps] - v_mps[steps:]).max())) / (steps * DT_S)
 
 
-def _value(measure: Measure, trajectory: Trajectory, lines: CentreLines | None) -> float | None:
-    if trajectory.end.is_error or measure.of is None:
+def _crossing_time_s(x_m: FloatArray, v_mps: FloatArray) -> float | None:
+    """Return when a vehicle passed 0; eq. (4) moves it at constant speed within a step."""
+    step = int(np.argmax(x_m >= 0.0))
+    if x_m[step] < 0.0:
         return None
-    try:
-        value = measure.of(trajectory, lines)
-        number = None if value is None else float(value)
-    except Exception as error:
-        last = extract_tb(error.__traceback__)[-1]
-        raise UserError(
-            f"the measure {measure.name!r} failed in {last.filename}, line {last.lineno}: "
-            f"{type(error).__name__}: {error}"
-        ) from error
-    return number if number is not None and math.isfinite(number) else None
+    if step == 0:
+        return 0.0
+    return (step - 1) * DT_S + float(-x_m[step - 1] / v_mps[step - 1])
+
+
+def _post_encroachment_time(trajectory: Trajectory) -> float | None:
+    """Return PET at M, or at the place of a merge from a lane, where the VUT may have stood."""
+    x_m, v_mps = (
+        trajectory.motion[:, trajectory.nearest, 0],
+        trajectory.motion[:, trajectory.nearest, 1],
+    )
+    x_m = x_m - place_of_merge_m(trajectory)
+    t_vut: float | None = trajectory.t_end_s
+    if trajectory.case.scenario.lane_m is None:
+        t_vut = _crossing_time_s(trajectory.x_vut_m, trajectory.v_vut_mps)
+    t_pov = _crossing_time_s(x_m, v_mps)
+    if t_pov is None:
+        v_end = float(v_mps[-1])
+        if v_end <= 0.0:
+            return None
+        t_pov = trajectory.t_end_s - float(x_m[-1]) / v_end
+    assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
+    return abs(t_pov - t_vut)

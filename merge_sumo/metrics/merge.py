@@ -35,24 +35,34 @@ HARSH_MPS2: Final = 3.0
 No. 79, 5.6.4.7."""
 
 
-def neighbours(trajectory: Trajectory) -> list[tuple[float, float]]:
-    """Return the bumper gap, in m, and the closing speed, in m/s, at M for each mainline car.
+class Neighbour(NamedTuple):
+    """A car of the mainline at M.
 
-    The gap is negative where bodies overlap, the closing speed where the gap opens. Empty where the
-    VUT did not merge.
+    Attributes:
+        is_ahead: whether it is ahead of the VUT.
+        gap_m: bumper gap, negative where bodies overlap.
+        v_mps: its speed.
+        closing_mps: closing speed, negative where the gap opens.
     """
+
+    is_ahead: bool
+    gap_m: float
+    v_mps: float
+    closing_mps: float
+
+
+def neighbours(trajectory: Trajectory) -> list[Neighbour]:
+    """Return the cars of the mainline at M; none where the VUT did not merge."""
     if trajectory.end is not End.MERGED:
         return []
     scenario, last = trajectory.case.scenario, trajectory.motion[-1]
     x_vut, v_vut = last[VUT, :2].tolist()
     found = []
-    for row, (x, v, _) in enumerate(last.tolist()):
-        if row == VUT:
-            continue
+    for x, v in np.delete(last, VUT, axis=0)[:, :2].tolist():
         if x >= x_vut:
-            found.append((x - x_vut - scenario.pov_length_m, v_vut - v))
+            found.append(Neighbour(True, x - x_vut - scenario.pov_length_m, v, v_vut - v))
         else:
-            found.append((x_vut - x - scenario.vut_length_m, v - v_vut))
+            found.append(Neighbour(False, x_vut - x - scenario.vut_length_m, v, v - v_vut))
     return found
 
 
@@ -73,35 +83,6 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     return merged
 
 
-def on_lane(trajectory: Trajectory) -> dict[str, float | None]:
-    """Return the measures of a merge from an acceleration lane by name; none without a lane.
-
-    The place of the merge and its share of the lane, the bumper gaps and time gaps to the cars
-    ahead of and behind the VUT at that moment, and for how long it stood on the lane.
-    """
-    scenario, lane_m = trajectory.case.scenario, trajectory.case.scenario.lane_m
-    if lane_m is None:
-        return {}
-    before = trajectory.motion[:, VUT]
-    stands = (before[:, 0] >= lane_m[0]) & (before[:, 1] < STANDS_MPS)
-    found: dict[str, float | None] = {"stood_s": round(DT_S * int(stands.sum()), 1)}
-    if trajectory.end is not End.MERGED:
-        return found
-    x_vut, v_vut = trajectory.motion[-1, VUT, :2].tolist()
-    found |= {"x_merge_m": x_vut, "lane_share": (x_vut - lane_m[0]) / (lane_m[1] - lane_m[0])}
-    cars = np.delete(trajectory.motion[-1], VUT, axis=0)[:, :2].tolist()
-    ahead = [x - x_vut - scenario.pov_length_m for x, _ in cars if x >= x_vut]
-    behind = [(x_vut - x - scenario.vut_length_m, v) for x, v in cars if x < x_vut]
-    if ahead:
-        found["gap_ahead_m"] = min(ahead)
-        found["time_gap_ahead_s"] = min(ahead) / v_vut if v_vut > 0.0 else None
-    if behind:
-        gap_m, v_mps = min(behind)
-        found["gap_behind_m"] = gap_m
-        found["time_gap_behind_s"] = gap_m / v_mps if v_mps > 0.0 else None
-    return found
-
-
 def brake_after_mps2(trajectory: Trajectory) -> float:
     """Return the deceleration, in m/s2, that somebody needs after the merge.
 
@@ -109,11 +90,11 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
     is in time. In traffic it is the largest that any car or the VUT needs.
     """
     needed_mps2 = [0.0]
-    for gap_m, closing_mps in neighbours(trajectory):
-        room_m = gap_m - max(closing_mps, 0.0) * REACTION_S
+    for car in neighbours(trajectory):
+        room_m = car.gap_m - max(car.closing_mps, 0.0) * REACTION_S
         if room_m <= 0.0:
             return math.inf
-        needed_mps2.append(max(closing_mps, 0.0) ** 2 / (2.0 * room_m))
+        needed_mps2.append(max(car.closing_mps, 0.0) ** 2 / (2.0 * room_m))
     return max(needed_mps2)
 
 
@@ -156,27 +137,6 @@ def gaps_m(after: FloatArray, lengths_m: tuple[float, float]) -> tuple[FloatArra
     return np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
 
 
-def followed_up(trajectory: Trajectory) -> tuple[float, float, float] | None:
-    """Return the least bumper gap, the lowest time to collision and the hardest braking behind M.
-
-    In m, s and m/s2, at any step of the follow-up and with any car; None where there was none. The
-    time to collision is between bumpers, infinite where the gap never closes and 0 where bodies
-    touch; the braking is the DRAC (Cooper and Ferguson, 1976), infinite where they touch.
-    """
-    if trajectory.after is None:
-        return None
-    gap_m, closing_mps = gaps_m(trajectory.after, trajectory.case.scenario.lengths_m)
-    least_m = float(gap_m.min())
-    if least_m <= 0.0:
-        return least_m, 0.0, math.inf
-    closes = closing_mps > 0.0
-    if not closes.any():
-        return least_m, math.inf, 0.0
-    gap_m, closing_mps = gap_m[closes], closing_mps[closes]
-    hardest_mps2 = float((np.square(closing_mps) / (2.0 * gap_m)).max())
-    return least_m, float((gap_m / closing_mps).min()), hardest_mps2
-
-
 class Severity(StrEnum):
     """Classes of encounters, the most severe first; an episode is of the first that fits."""
 
@@ -199,26 +159,6 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
         del found[Severity.HARSH]
         found[Severity.CONTACT] = "bodies touch at M"
     return {severity: scenario.said(meaning) for severity, meaning in found.items()}
-
-
-def severity_of(
-    end: End, clearance_m: float, *, is_close: bool, brake_mps2: float | None
-) -> Severity | None:
-    """Return the class of an encounter; None where the VUT never reached M.
-
-    Args:
-        end: why the episode ended.
-        clearance_m: smallest clearance of bodies from M on.
-        is_close: whether the front bumpers were nearer at M than the paper allows.
-        brake_mps2: hardest braking behind M of those behind; None without a follow-up.
-    """
-    if not end.is_tested:
-        return None
-    if clearance_m <= 0.0:
-        return Severity.CONTACT
-    if is_close:
-        return Severity.CONFLICT
-    return Severity.HARSH if (brake_mps2 or 0.0) > HARSH_MPS2 else Severity.SAFE
 
 
 def check_from(from_s: float | None) -> None:

@@ -12,9 +12,9 @@ import numpy as np
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.metrics.fmc import fmc, radius_for
-from merge_sumo.metrics.measures import Measure
+from merge_sumo.metrics.measures import Measure, measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
-from merge_sumo.metrics.score import Outcome, measures_in
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import RunsOfCase, shortened
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
@@ -40,7 +40,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     """Return the data of a page as JSON has it."""
     scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
     speeds, offsets = packed(model.motion)
-    columns = [m for m in measures_in(scenario) if m.column]
+    columns = [m for m in measures_in(scenario).values() if m.column]
     said = causes(model.run, model.shown)
     rows = [
         _row(model, o, offsets.get(o.index, 0), columns) | {"cause": said[o.index]}
@@ -59,7 +59,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "coordinates": [_coordinate(c) for c in model.coordinates],
         "severities": list(Severity),
         "measures": [
-            {"name": m.name, "title": m.title_in(scenario), "digits": m.digits}
+            {"name": m.name, "title": _title(m, scenario), "digits": m.digits}
             for m in columns
             if any(row[m.name] is not None for row in rows)
         ],
@@ -85,7 +85,14 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     }
 
 
-def _row(model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure]) -> dict[str, Any]:
+def _title(measure: Measure[Any], scenario: Scenario) -> str:
+    """Return name and unit of a measure, as the head of a column."""
+    return f"{scenario.said(measure.column)} {measure.unit}".replace("s2", "s²").rstrip()
+
+
+def _row(
+    model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure[Any]]
+) -> dict[str, Any]:
     """Return a case by column; it has no rows where its motion is not known."""
     motion, measures = model.motion.get(o.index), o.measures
     avoidance, course = model.avoidance.get(o.index), model.diagnoses.get(o.index)

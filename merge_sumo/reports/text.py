@@ -31,9 +31,10 @@ from merge_sumo.campaigns.again import again, command
 from merge_sumo.metrics.cause import cause, met
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.plausibility import behind
-from merge_sumo.metrics.score import Outcome, measures_in
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either
 from merge_sumo.result import lines_of
@@ -453,9 +454,9 @@ def _measures(outcome: Outcome) -> Iterator[str]:
         yield f"  of the {other}, which is nearest to the VUT at the end:"
     listed = [
         (text, value, measure.unit)
-        for measure in measures_in(scenario)
+        for measure in measures_in(scenario).values()
         if (value := found.value(measure.name)) is not None
-        and (text := measure.label_in(scenario).replace("POV", other))
+        and (text := scenario.said(measure.label).replace("POV", other))
     ]
     # Minimum width of the column of measures, in characters.
     width = max([31, *(len(text) for text, _, _ in listed)])

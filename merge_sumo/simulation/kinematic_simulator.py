@@ -101,7 +101,7 @@ class KinematicSimulator(Simulator):
     def _compare(self, kinematic: Trajectory, sumo: Trajectory) -> None:
         """Raise `UserError` where a case ended otherwise in SUMO."""
         lines = centre_lines(self._plan.road)
-        verdicts = [self._plan.criterion.verdict(one, lines) for one in (kinematic, sumo)]
+        verdicts = [self._plan.criterion.judged(one, lines) for one in (kinematic, sumo)]
         ours, theirs = kinematic.whole, sumo.whole
         if (
             kinematic.end is sumo.end

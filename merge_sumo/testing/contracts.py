@@ -21,7 +21,7 @@ from merge_sumo import api
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import load
 from merge_sumo.files import ScratchFolder
-from merge_sumo.metrics.measures import Measure
+from merge_sumo.metrics.measures import Measure, Measures
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
 from merge_sumo.scenario.case import Case, Pool
@@ -55,14 +55,13 @@ class MeasureContract:
         pool: cases of the episodes.
     """
 
-    measure: Measure
+    measure: Measure[Any]
     pool: Pool = Pool(levels=(0,), scenario=US23)
 
     def values(self) -> list[float | None]:
         """Return the values of some episodes."""
-        assert self.measure.of is not None
         cases = self.pool.cases(np.random.default_rng(0).random((10, 2)), self.pool.levels[0])
-        return [self.measure.of(episode(case), None) for case in cases]
+        return [self.measure.of(Measures(episode(case))) for case in cases]
 
     def test_says_what_it_is(self) -> None:
         assert self.measure.name.isidentifier()
@@ -79,11 +78,10 @@ class MeasureContract:
 
     def test_leaves_the_episode_alone(self) -> None:
         """Other measures look at it, too."""
-        assert self.measure.of is not None
         (case,) = self.pool.cases(np.full((1, 2), 0.5), self.pool.levels[0])
         trajectory = episode(case)
         before = trajectory.motion.copy()
-        self.measure.of(trajectory, None)
+        self.measure.of(Measures(trajectory))
         assert np.array_equal(before, trajectory.motion)
 
 

@@ -12,7 +12,7 @@ from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.metrics.score import is_close
+from merge_sumo.metrics.paper import is_close
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario

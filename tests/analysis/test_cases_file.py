@@ -20,6 +20,7 @@ import merge_sumo as ms
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import ComparedCase, passes
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.cases_toml import write_cases
 from merge_sumo.reports.text import comparison_headline
@@ -140,7 +141,9 @@ def test_a_new_error_or_contact_is_worse(file):
 
     def change(before, **measured):
         return record.change_of(
-            ComparedCase(before, replace(before, measures=replace(before.measures, **measured)))
+            ComparedCase(
+                before, replace(before, measures=Measures(**before.measures.values | measured))
+            )
         )
 
     assert change(safe, severity=Severity.CONTACT) == "worse but passing"

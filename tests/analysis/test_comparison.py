@@ -27,7 +27,8 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Measures, Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import RunsOfCase
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
@@ -103,10 +104,10 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
     for index, (x, v, became) in enumerate(points):
         case = from_unit(np.array([[x, v]]), level, scenario=US23)[0]
         trajectory = drive(case, "answered nan" if became == "errs" else None)
-        measures = measure(trajectory)
+        measures = Measures.of(trajectory)
         if became != "errs":
             score = -560.0 if became == "fails" else -100.0 - index
-            measures = replace(measures, end=End.MERGED, score=score)
+            measures = Measures(**measures.values | {"end": End.MERGED, "score": score})
         ran.append(Episode(Outcome(index, 0, case, measures), trajectory))
     journal.append(ran)
     return Run(folder)

@@ -132,7 +132,7 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
         by_name = plan_for(name, scenario=road, criterion=plan.criterion)
         results = simulate(by_name.with_engine("kinematic"), [o.case for o in failing])
         for names, result in zip(passing, results, strict=True):
-            verdict = result.outcome.verdict
+            verdict = result.outcome
             can_brake = brake_after_mps2(result.trajectory) <= 4.0
             if can_brake and verdict.is_tested and not verdict.failed:
                 names.append(name)

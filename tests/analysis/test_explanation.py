@@ -46,7 +46,7 @@ def uniform(vut, folder, cases, **keywords: Any):
 
 def passes(plan, case):
     (episode,) = simulate(plan, [case])
-    verdict = episode.outcome.verdict
+    verdict = episode.outcome
     return verdict.is_tested and not verdict.failed
 
 

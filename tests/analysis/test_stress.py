@@ -12,11 +12,13 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, StressResult, flips_of
-from merge_sumo.metrics.score import CaseVerdict
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
+from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.kinematic_world import EquationWorld
 
 FAIL_WHEN = "bumper_gap_m < 15"
@@ -97,11 +99,9 @@ def replaced(found, **changes):
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
-    fails, passes, ends = (
-        CaseVerdict(-0.9, True),
-        CaseVerdict(0.1, True),
-        CaseVerdict(0.1, False),
-    )
+    fails, passes = failed, passed
+    stands = Measures(end=End.TIMEOUT, score=-400.0)
+    ends = Outcome(0, 0, failed.case, stands)
     both = [failed, passed]
     assert flips_of(both, [fails, passes]) == Flips()
     assert flips_of(both, [passes, fails]) == Flips((failed.index,), (passed.index,))

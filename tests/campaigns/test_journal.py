@@ -8,21 +8,22 @@ import json
 import math
 import os
 import resource
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.handmade import FOLLOWED_UP
 
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.measures import further_measures
+from merge_sumo.metrics.measures import OURS, Measures
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import FOLLOWED_UP, ON_LANE, Measures, Outcome, measure
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
@@ -53,11 +54,8 @@ def cases(draw) -> Case:
     )
 
 
-MAYBE = [
-    name
-    for name, kind in get_type_hints(Measures).items()
-    if kind == float | None and name not in (*FOLLOWED_UP, *ON_LANE)
-]
+EVERYWHERE = [name for name, one in OURS.items() if not one.only_with]
+MAYBE = [n for n in EVERYWHERE if get_type_hints(OURS[n].of)["return"] == float | None]
 any_measures = st.builds(
     Measures,
     **dict.fromkeys(MAYBE, maybe),
@@ -90,7 +88,7 @@ def episode(index: int, batch: int = 0, steps: int = 60) -> Episode:
     motion[:, :, 0] = np.linspace(-180.0, -1.0, steps + 1)[:, None]
     motion[-1, :, 0] = rng.uniform(0.0, 2.0, 2)
     trajectory = Trajectory(case, motion, End.MERGED)
-    return Episode(Outcome(index, batch, case, measure(trajectory)), trajectory)
+    return Episode(Outcome(index, batch, case, Measures.of(trajectory)), trajectory)
 
 
 def lines_of(count: int) -> list[bytes]:
@@ -115,7 +113,7 @@ class TestARecord:
         assert to_line(again) == line, "repr tells floats apart that == does not: -0.0 and 0.0"
 
     def test_has_the_fields_of_the_specification_in_their_order(self):
-        names = [name for name in episode(0).outcome.to_record() if name not in further_measures()]
+        names = [n for n in episode(0).outcome.to_record() if n in (*SPEC_FIELDS, *OURS)]
         assert names[: len(SPEC_FIELDS)] == SPEC_FIELDS
         assert names[-len(FOLLOWED_UP) :] == list(FOLLOWED_UP)
 
@@ -260,7 +258,7 @@ class TestARun:
         assert len(run.outcomes) == 60
         lines = centre_lines(road_for(US23))
         for outcome in run.outcomes:
-            assert measure(run.trajectory(outcome.index), lines) == outcome.measures
+            assert Measures.of(run.trajectory(outcome.index), lines) == outcome.measures
 
     def test_that_was_interrupted_between_trajectories_and_outcomes_is_read(self, folder):
         outcomes = folder / "outcomes.jsonl"
@@ -301,6 +299,4 @@ class TestARun:
 
 def test_every_measure_is_in_the_record():
     record = episode(0).outcome.to_record()
-    # In traffic, where there is a follow-up, and on an acceleration lane.
-    elsewhere = {"nearest", "further", *FOLLOWED_UP, *ON_LANE}
-    assert {field.name for field in fields(Measures)} - elsewhere <= set(record)
+    assert set(EVERYWHERE) <= set(record)

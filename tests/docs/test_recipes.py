@@ -28,10 +28,10 @@ RECIPES = {
     "a measure": Recipe(
         more={
             "metrics/measures.py": {
-                "OURS: Final = (": "def _last_m(trajectory: Trajectory, _lines: object) -> float:\n"
-                "    return float(trajectory.motion[-1, 1, 0])\n\n\n",
-                '    Measure("end", ': '    Measure("last_m", "of the VUT at last", unit="m", '
-                "missing=0.0, of=_last_m),\n",
+                "    @measure()\n    def end(": '    @measure(unit="m", missing=0.0)\n'
+                "    def last_m(self) -> float:\n"
+                '        """Position of the VUT at the end."""\n'
+                "        return float(self.trajectory.x_vut_m[-1])\n\n",
             }
         }
     ),

@@ -25,7 +25,7 @@ from merge_sumo.drivers.policies import (
     policies_of,
     read_manifest,
 )
-from merge_sumo.metrics.score import measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.povs import PovLibrary, Povs
@@ -55,7 +55,7 @@ def played(vut, cases, corridors=32):
     with World(corridors, scenario=US23) as world:
         driver = load(vut).open(corridors)
         trajectories = Rollout(world, PovLibrary(corridors, POVS), driver, cases).run()
-    return [measure(t) for t in trajectories], trajectories
+    return [Measures.of(t) for t in trajectories], trajectories
 
 
 @pytest.mark.parametrize("folder", [policies_of(US23), policies_in(HUMAN)], ids=["paper", HUMAN])
@@ -146,6 +146,6 @@ class TestTheLibraryOfPeople:
         cases = uniform_cases(level, 300, seed=4)
         with World(32, scenario=US23) as world:
             pov, vut = PovLibrary(32, self.POVS), load("design2").open(32)
-            found = [measure(t) for t in Rollout(world, pov, vut, cases).run()]
+            found = [Measures.of(t) for t in Rollout(world, pov, vut, cases).run()]
         hardest = max(m.pov_max_brake_mps2 for m in found)
         assert 1.5 <= hardest <= 2.0

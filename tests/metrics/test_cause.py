@@ -9,7 +9,8 @@ import pytest
 from metrics.test_diagnosis import BRAKES, COASTS, EASES, KEEP, LEVEL0, meeting, phases
 
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 LATE = phases((7.5, 1.0), (0.5, -4.0))
@@ -18,7 +19,7 @@ OPEN = "The last way out, full braking or full acceleration of the VUT, closes a
 
 
 def said(trajectory: Trajectory, others: str = "", **changes: Any) -> str:
-    measures = replace(measure(trajectory), **changes)
+    measures = Measures(**Measures.of(trajectory).values | changes)
     return cause(Outcome(0, 0, trajectory.case, measures), trajectory, others)
 
 
@@ -60,7 +61,7 @@ def test_of_another_case_is_the_motion_alone():
 
 def test_without_the_motion_is_how_they_arrived():
     trajectory = meeting(BRAKES, COASTS, gap_m=-30.0)
-    outcome = Outcome(0, 0, trajectory.case, measure(trajectory))
+    outcome = Outcome(0, 0, trajectory.case, Measures.of(trajectory))
     arrived = "the VUT reaches M at 8 s, its front bumper 30.0 m ahead of that of the POV."
     assert cause(outcome, None) == f"Safe: {arrived}"
 

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import (
     by_case,
     clopper_pearson,

@@ -18,7 +18,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
 from merge_sumo.metrics.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -50,7 +51,7 @@ def margin(text, **values):
 
 def of(expression, trajectory):
     """Return the margin of an episode under a criterion."""
-    return Criterion(expression).margin(trajectory, measure(trajectory))
+    return Criterion(expression).margin(trajectory, Measures.of(trajectory))
 
 
 def nearest(trajectory, lines):
@@ -161,7 +162,7 @@ class TestMeasures:
 
     def test_within_6_m_no_braking_would_do(self):
         crash = ending(0.0)
-        assert measure(crash).drac_mps2 is None
+        assert Measures.of(crash).drac_mps2 is None
         assert of("drac_mps2 > 1000", crash) == -MOST_MARGIN
         assert of("last_avoidable_s < -9", crash) == -MOST_MARGIN
 
@@ -181,10 +182,10 @@ class TestMeasures:
         assert of("brake_after_mps2 > 8", ending(-12.0, v_pov=36.0)) == -MOST_MARGIN
 
     def test_severity_by_hand(self):
-        assert measure(ending(4.9, v_pov=40.0)).severity == "contact"
-        assert measure(ending(5.1, v_pov=40.0)).severity == "conflict"
-        assert measure(ending(6.0, v_pov=40.0)).severity == "safe"
-        assert measure(ending(0.0, end=End.TIMEOUT)).severity is None
+        assert Measures.of(ending(4.9, v_pov=40.0)).severity == "contact"
+        assert Measures.of(ending(5.1, v_pov=40.0)).severity == "conflict"
+        assert Measures.of(ending(6.0, v_pov=40.0)).severity == "safe"
+        assert Measures.of(ending(0.0, end=End.TIMEOUT)).severity is None
         assert of('severity == "contact"', ending(0.0)) == -1.0
         assert of('severity != "contact"', ending(0.0, end=End.TIMEOUT)) == -1.0
 
@@ -269,8 +270,8 @@ class TestBodiesBeforeM:
 
     def test_before_m_are_a_measure_of_their_own(self):
         hit = beside(0.0)
-        assert Criterion("contact").margin(hit, measure(hit)) == MOST_MARGIN
-        touching = measure(hit, lines(1.0))
+        assert Criterion("contact").margin(hit, Measures.of(hit)) == MOST_MARGIN
+        touching = Measures.of(hit, lines(1.0))
         assert Criterion("contact").margin(hit, touching) == MOST_MARGIN
         overlap = Criterion("before_clearance_m < 0")
         assert overlap.margin(hit, touching) == pytest.approx(-0.8)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
@@ -45,7 +46,7 @@ def meeting(a_pov: np.ndarray, a_vut: np.ndarray, gap_m: float = 1.0) -> Traject
 
 
 def diagnosed(trajectory: Trajectory) -> Diagnosis:
-    return diagnose(trajectory, measure(trajectory))
+    return diagnose(trajectory, Measures.of(trajectory))
 
 
 def kind(trajectory: Trajectory) -> Kind | None:
@@ -88,7 +89,7 @@ class TestWhichVehicleBrakes:
             scenario=named_scenario("us23-traffic"),
         )
         met = Trajectory(case, motion, End.MERGED)
-        assert measure(met).nearest == "behind"
+        assert Measures.of(met).nearest == "behind"
         assert diagnosed(met).pov_brakes_s == 3.0
         assert kind(met) is Kind.POV_BRAKES
 
@@ -121,7 +122,7 @@ def outcome(index: int, x: float, v: float, failed: bool, level: int = 1) -> Out
     motion = np.array(
         [[[gap - v * DT_S, v, 0.0], [-1.8, 18.0, 0.0]], [[gap, v, 0.0], [0.0, 18.0, 0.0]]]
     )
-    return Outcome(index, 0, case, measure(Trajectory(case, motion, End.MERGED)))
+    return Outcome(index, 0, case, Measures.of(Trajectory(case, motion, End.MERGED)))
 
 
 def over_the_pool(fails, level: int = 1) -> list[Outcome]:

@@ -10,6 +10,7 @@ import pytest
 
 from merge_sumo.campaigns.run import Run
 from merge_sumo.metrics.criterion import Criterion, condition_of, values_of
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.scenario.scenario import DT_S
 
@@ -35,7 +36,7 @@ class TestAfterTheRun:
     def test_accelerations_that_are_clipped_are_told(self, run, share, is_headline):
         rows = [round(o.measures.t_end_s / DT_S) for o in run.outcomes]
         at_limit = [
-            replace(o, measures=replace(o.measures, clipped_steps=int(share * n)))
+            replace(o, measures=Measures(**o.measures.values | {"clipped_steps": int(share * n)}))
             for o, n in zip(run.outcomes, rows, strict=True)
         ]
         clipped = sum(o.measures.clipped_steps for o in at_limit)
@@ -48,7 +49,8 @@ class TestAfterTheRun:
     def test_errors_behind_m_are_told(self, run):
         first, second, *others = run.outcomes
         wrong = [
-            replace(o, measures=replace(o.measures, error="answered nan")) for o in (first, second)
+            replace(o, measures=Measures(**o.measures.values | {"error": "answered nan"}))
+            for o in (first, second)
         ]
         assert doubts([*wrong, *others], Criterion(), {}) == [
             f"in 2 cases an error ends the follow-up, the first in case {first.index}: answered nan"

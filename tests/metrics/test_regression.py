@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from support.handmade import cases_of, drive
 
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.regression import FARTHEST, margins, regression, regression_gaps
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.score import Outcome
 
 NAN = float("nan")
 
@@ -17,9 +18,16 @@ NAN = float("nan")
 def outcome(dx_m: float | None, margin: float | None = None) -> Outcome:
     """Return an outcome with this signed gap; its score is that of a failure within 6 m."""
     case = cases_of(0, 2)[0]
-    measures = replace(measure(drive(case)), dx_m=dx_m)
+    measures = Measures.of(drive(case)).values
     failing = dx_m is not None and abs(dx_m) < 6.0
-    return Outcome(0, 0, case, replace(measures, score=-1e6 if failing else -1.0), None, margin)
+    return Outcome(
+        0,
+        0,
+        case,
+        Measures(**measures | {"dx_m": dx_m, "score": -1e6 if failing else -1.0}),
+        None,
+        margin,
+    )
 
 
 def test_margins_are_those_that_gaps_stand_for():
@@ -59,7 +67,7 @@ def test_takes_the_margins_of_another_criterion_as_they_are():
 @pytest.mark.parametrize("which", ["new", "old"])
 def test_has_no_verdict_without_one_on_both(which):
     passing, silent = outcome(30.0), outcome(30.0)
-    silent = replace(silent, measures=measure(drive(silent.case, "answered nan")), margin=None)
+    silent = replace(silent, measures=Measures.of(drive(silent.case, "answered nan")), margin=None)
     pair = (silent, passing) if which == "new" else (passing, silent)
     found = regression(*pair)
     assert found.margin is None

@@ -12,15 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_sumo.metrics.score import (
-    FAILURE_SCORE,
-    Outcome,
-    is_close,
-    margin_of,
-    measure,
-    sustained_brake_mps2,
-    time_to_collision,
-)
+from merge_sumo.metrics.measures import Measures, sustained_brake_mps2
+from merge_sumo.metrics.paper import FAILURE_SCORE, is_close, margin_of, time_to_collision
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -52,24 +46,24 @@ def eq4(x_pov, v_pov, a_pov, x_vut, v_vut, a_vut):
 
 class TestScore:
     def test_a_wide_smooth_merge_costs_almost_nothing(self):
-        assert measure(ending(200.0)).score == pytest.approx(0.0, abs=0.01)
+        assert Measures.of(ending(200.0)).score == pytest.approx(0.0, abs=0.01)
 
     def test_the_safety_part_by_hand(self):
         # |dx| = 21 m: exp(-1) of 8/9 of 450; POV ahead and faster, so no TTC.
-        assert measure(ending(21.0)).score == pytest.approx(-400.0 * math.exp(-1.0))
+        assert Measures.of(ending(21.0)).score == pytest.approx(-400.0 * math.exp(-1.0))
         # POV 21 m behind and 6 m/s faster: TTC 3.5 s costs half of 50.
-        score = measure(ending(-21.0, v_pov=32.0)).score
+        score = Measures.of(ending(-21.0, v_pov=32.0)).score
         assert score == pytest.approx(-400.0 * math.exp(-1.0) - 25.0)
 
     def test_a_collision_costs_more_the_deeper_it_is(self):
         # -110 for the crash, -450 (1 + overlap / 6).
-        assert measure(ending(3.0)).score == pytest.approx(-110.0 - 450.0 * 1.5)
-        assert measure(ending(0.0)).score == pytest.approx(-110.0 - 900.0)
+        assert Measures.of(ending(3.0)).score == pytest.approx(-110.0 - 450.0 * 1.5)
+        assert Measures.of(ending(0.0)).score == pytest.approx(-110.0 - 900.0)
 
     def test_six_metres_are_no_collision_and_a_hair_less_is_one(self):
         touching = [math.nextafter(6.0, 0.0), -math.nextafter(6.0, 0.0)]
-        assert measure(ending(6.0)).end is End.MERGED
-        assert all(measure(self.at(dx)).is_close for dx in touching)
+        assert Measures.of(ending(6.0)).end is End.MERGED
+        assert all(Measures.of(self.at(dx)).is_close for dx in touching)
 
     @staticmethod
     def at(dx):
@@ -79,15 +73,15 @@ class TestScore:
 
     def test_the_task_part_by_hand(self):
         # Final speed 14.6 m/s: 10 below the highway's; the rest of the task is done.
-        score = measure(ending(300.0, v_pov=14.6, v_vut=14.6)).score
+        score = Measures.of(ending(300.0, v_pov=14.6, v_vut=14.6)).score
         assert score == pytest.approx(-45.0 / 4 * 10 / 24.6, abs=0.01)
         # Braking by 4 m/s2 throughout, but for the last row.
-        score = measure(ending(300.0, v_pov=26.0, a_vut=-4.0)).score
+        score = Measures.of(ending(300.0, v_pov=26.0, a_vut=-4.0)).score
         assert score == pytest.approx(-45.0 / 4 * 10 / 11, abs=0.01)
 
     def test_a_timeout_is_no_failure_and_has_no_gap(self):
         trajectory = eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)
-        measures = measure(trajectory)
+        measures = Measures.of(trajectory)
         assert measures.end is End.TIMEOUT
         gaps = (measures.dx_m, measures.ttc_s, measures.pet_s, measures.merged_first)
         assert gaps == (None, None, None, None)
@@ -102,7 +96,7 @@ class TestScore:
     )
     def test_below_minus_500_exactly_when_there_is_a_collision(self, dx, v_pov, v_vut, a_vut):
         trajectory = ending(dx, v_pov, v_vut, a_vut=a_vut)
-        measures = measure(trajectory)
+        measures = Measures.of(trajectory)
         last = trajectory.motion[-1]
         assert measures.score <= 0.0
         assert (measures.score < FAILURE_SCORE) == (abs(last[POV, 0] - last[VUT, 0]) < 6.0)
@@ -116,7 +110,7 @@ class TestScore:
     def test_no_verdict_on_what_did_not_run_properly(self):
         for end in (End.VUT_ERROR, End.SIM_ERROR):
             trajectory = Trajectory(CASE, ending(0.0).motion, end, "why")
-            measures = measure(trajectory)
+            measures = Measures.of(trajectory)
             assert measures.score is None
             assert measures.end is end
             assert measures.error == "why"
@@ -134,32 +128,32 @@ class TestMeasures:
     def test_pet_of_a_pov_15_m_behind_at_30_mps_is_half_a_second(self):
         trajectory = ending(-16.0, v_pov=30.0, v_vut=26.0)
         # The POV is 15 m before M when the VUT is 1 m past it: 1/26 s earlier it was there.
-        assert measure(trajectory).pet_s == pytest.approx(0.5 + 1 / 26)
+        assert Measures.of(trajectory).pet_s == pytest.approx(0.5 + 1 / 26)
 
     def test_pet_of_a_pov_that_has_passed(self):
         trajectory = ending(29.0, v_pov=30.0, v_vut=26.0)
-        assert measure(trajectory).pet_s == pytest.approx(1.0 - 1 / 26)
+        assert Measures.of(trajectory).pet_s == pytest.approx(1.0 - 1 / 26)
 
     def test_a_pov_that_stands_has_no_pet(self):
-        assert measure(ending(-30.0, v_pov=0.0)).pet_s is None
+        assert Measures.of(ending(-30.0, v_pov=0.0)).pet_s is None
 
     def test_drac_by_hand(self):
         # POV 26 m behind and 4 m/s faster: 16 / (2 * 20).
-        assert measure(ending(-26.0)).drac_mps2 == pytest.approx(0.4)
-        assert measure(ending(26.0)).drac_mps2 == 0.0
-        assert measure(ending(2.0)).drac_mps2 is None
+        assert Measures.of(ending(-26.0)).drac_mps2 == pytest.approx(0.4)
+        assert Measures.of(ending(26.0)).drac_mps2 == 0.0
+        assert Measures.of(ending(2.0)).drac_mps2 is None
 
     def test_who_merged_first_and_impact_speed(self):
-        assert measure(ending(-30.0)).merged_first == "VUT"
-        assert measure(ending(30.0)).merged_first == "POV"
-        assert measure(ending(-30.0)).impact_speed_mps is None
-        assert measure(ending(-3.0)).impact_speed_mps == pytest.approx(4.0)
+        assert Measures.of(ending(-30.0)).merged_first == "VUT"
+        assert Measures.of(ending(30.0)).merged_first == "POV"
+        assert Measures.of(ending(-30.0)).impact_speed_mps is None
+        assert Measures.of(ending(-3.0)).impact_speed_mps == pytest.approx(4.0)
 
     def test_hardest_braking_is_positive_and_of_each_vehicle(self):
-        measures = measure(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, -2.5))
+        measures = Measures.of(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, -2.5))
         assert measures.pov_max_brake_mps2 == pytest.approx(1.5)
         assert measures.vut_max_brake_mps2 == pytest.approx(2.5)
-        assert measure(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 1.0)).vut_max_brake_mps2 == 0.0
+        assert Measures.of(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 1.0)).vut_max_brake_mps2 == 0.0
 
     def test_sustained_braking_is_the_hardest_mean_over_1_6_s(self):
         # 3 m/s2 for half a second among 1 m/s2: (1.5 + 1.1) m/s in 1.6 s.
@@ -167,23 +161,23 @@ class TestMeasures:
         assert sustained_brake_mps2(v_mps) == pytest.approx(2.6 / 1.6)
         assert sustained_brake_mps2(v_mps[20:26]) == pytest.approx(3.0), "shorter than 1.6 s"
         assert sustained_brake_mps2(v_mps[:1]) == sustained_brake_mps2(v_mps[::-1]) == 0.0
-        measures = measure(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0))
+        measures = Measures.of(eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0))
         assert measures.pov_sustained_brake_mps2 == pytest.approx(1.5)
 
     def test_slow_down_is_from_the_highest_speed_before(self):
         # 1.5 m/s2 for the 2.5 s and more that the VUT takes for 50 m at 20 m/s.
         trajectory = eq4(-300.0, 30.0, -1.5, -50.0, 20.0, 0.0)
         slowdown_mps = 1.5 * trajectory.t_end_s
-        assert measure(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps)
-        assert measure(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 0.0)).pov_slowdown_mps == 0.0
+        assert Measures.of(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps)
+        assert Measures.of(eq4(-300.0, 30.0, 1.0, -50.0, 20.0, 0.0)).pov_slowdown_mps == 0.0
         # Recovering at the end takes nothing back; what was gained before is lost, too.
         v_mps = trajectory.motion[:, POV, 1]
         v_mps[3], v_mps[-1] = 40.0, 29.0
-        assert measure(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps - 0.15 + 10.0)
+        assert Measures.of(trajectory).pov_slowdown_mps == pytest.approx(slowdown_mps - 0.15 + 10.0)
 
     def test_a_collision_on_a_long_ramp_was_avoidable_by_waiting_until_late(self):
         # Both constant at 20 m/s, side by side, 100 m before M. Waiting: a stop takes 50 m.
-        measures = measure(eq4(-100.0, 20.0, 0.0, -100.0, 20.0, 0.0))
+        measures = Measures.of(eq4(-100.0, 20.0, 0.0, -100.0, 20.0, 0.0))
         assert measures.is_close
         assert measures.avoidable is True
         # Brake by 4 m/s2 for t seconds over 20 t - 2 t^2 = remaining; 6 m behind takes
@@ -193,20 +187,20 @@ class TestMeasures:
     def test_the_last_way_out_is_a_time_of_the_record(self):
         """Not 6.6000000000000005, as 66 times 0.1 is."""
         for start_m in range(-200, -50):
-            found = measure(eq4(start_m, 20.0, 0.0, start_m, 20.0, 0.0)).last_avoidable_s
+            found = Measures.of(eq4(start_m, 20.0, 0.0, start_m, 20.0, 0.0)).last_avoidable_s
             assert repr(found) == f"{found:.1f}"
 
     def test_a_collision_right_at_the_start_was_not_avoidable(self):
-        measures = measure(eq4(-4.0, 20.0, 0.0, -4.0, 20.0, 0.0))
+        measures = Measures.of(eq4(-4.0, 20.0, 0.0, -4.0, 20.0, 0.0))
         assert measures.is_close
         assert measures.avoidable is False
         assert measures.last_avoidable_s is None
 
     def test_without_a_collision_nothing_is_said_about_avoiding_it(self):
-        assert measure(ending(30.0)).avoidable is None
+        assert Measures.of(ending(30.0)).avoidable is None
 
 
 def test_outcomes_round_trip_through_their_record():
     for trajectory in (ending(3.0), ending(30.0), eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)):
-        outcome = Outcome(7, 2, CASE, measure(trajectory))
+        outcome = Outcome(7, 2, CASE, Measures.of(trajectory))
         assert Outcome.from_json(json.dumps(outcome.to_record()), scenario=US23) == outcome

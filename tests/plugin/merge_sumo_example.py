@@ -9,13 +9,11 @@ import numpy as np
 from merge_sumo.controllers.controller import Controller, Seen
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import CentreLines
-from merge_sumo.metrics.measures import Measure
+from merge_sumo.metrics.measures import Measures, measure
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import POV, VUT
-from merge_sumo.scenario.trajectory import Trajectory
 
 
 class MiddleSampler(LevelwiseSampler):
@@ -32,22 +30,11 @@ class MiddleSampler(LevelwiseSampler):
         return rng.beta(2.0, 2.0, size=(n, history.dims))
 
 
-def closest_m(trajectory: Trajectory, _lines: CentreLines | None) -> float:
-    """Return the least distance of the front bumpers of VUT and POV, in m along the lanes."""
-    x_m = trajectory.motion[:, :, 0]
+@measure(worse="low", unit="m", label="closest approach", column="closest", missing=math.inf)
+def closest_m(episode: Measures) -> float:
+    """Least distance of the front bumpers of VUT and POV up to M."""
+    x_m = episode.trajectory.motion[:, :, 0]
     return float(np.abs(x_m[:, POV] - x_m[:, VUT]).min())
-
-
-CLOSEST = Measure(
-    name="closest_m",
-    about="least distance of the front bumpers of VUT and POV up to M",
-    unit="m",
-    label="closest approach",
-    column="closest",
-    missing=math.inf,
-    worse="low",
-    of=closest_m,
-)
 
 
 class ConstantController(Controller):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from merge_sumo_example import CLOSEST, MiddleSampler
+from merge_sumo_example import MiddleSampler, closest_m
 
 from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.testing import MeasureContract, SamplerContract, VutContract
@@ -18,7 +18,7 @@ class TestMiddleSampler(SamplerContract):
 
 
 class TestClosest(MeasureContract):
-    measure = CLOSEST
+    measure = closest_m
 
 
 @installed

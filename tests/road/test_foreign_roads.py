@@ -20,7 +20,8 @@ from support.handmade import write_run
 
 from merge_sumo import api
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import default_net_path, road_of
@@ -57,7 +58,9 @@ STANDS_THEN_GOES = np.array([(2.0, -4.0 if step < 120 else 2.0) for step in rang
 
 
 def write(folder: Path, road, trajectory: Trajectory) -> Path:
-    write_scenario(folder, road, Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory)
+    write_scenario(
+        folder, road, Outcome(0, 0, trajectory.case, Measures.of(trajectory)), trajectory
+    )
     return folder
 
 

@@ -7,8 +7,9 @@ import math
 import numpy as np
 import pytest
 
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.predictor import (
     disagreement,
     failure_probability,

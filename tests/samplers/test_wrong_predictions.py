@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from merge_sumo.metrics.score import Measures, Outcome
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import US23

@@ -13,7 +13,7 @@ from support.merges import SMALLER
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.score import measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.road.merge import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
 from merge_sumo.scenario.case import Case, Pool, to_unit
@@ -113,7 +113,7 @@ class TestACase:
     def test_is_judged_by_its_scenario(self):
         motion = np.array([[[x, 20.0, 0.0] for x in row] for row in ((-10.0, -2.0), (-5.0, 0.0))])
         verdicts = [
-            measure(Trajectory(case, motion, End.MERGED)).is_close
+            Measures.of(Trajectory(case, motion, End.MERGED)).is_close
             for case in (
                 Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
                 Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),

@@ -5,12 +5,12 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from metrics.test_score import CASE, ending
+from support.handmade import FOLLOWED_UP
 from support.plans import plan_for
 
 from merge_sumo.controllers.kinds import load
@@ -18,8 +18,8 @@ from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.merge import followed_up
-from merge_sumo.metrics.score import FOLLOWED_UP, Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
@@ -36,22 +36,25 @@ def followed(*states):
     return replace(merged, case=replace(CASE, scenario=FOLLOWED), after=after)
 
 
+def after(episode):
+    """Return gap, time to collision and needed braking in the follow-up."""
+    return [Measures.of(episode).value(name) for name in FOLLOWED_UP[:3]]
+
+
 class TestMeasures:
     def test_by_hand(self):
         # The VUT is 15 m behind the POV's rear and 5 m/s faster, then 10 m and 4 m/s.
         episode = followed((20.0, 20.0, 0.0, 25.0), (22.0, 20.0, 7.0, 24.0))
-        assert followed_up(episode) == pytest.approx((10.0, 2.5, max(25.0 / 30.0, 16.0 / 20.0)))
+        assert after(episode) == pytest.approx([10.0, 2.5, max(25.0 / 30.0, 16.0 / 20.0)])
 
     def test_of_a_gap_that_opens(self):
         # The POV is behind, 5 m between bumpers, and slower.
-        assert followed_up(followed((-10.0, 20.0, 0.0, 25.0))) == (5.0, math.inf, 0.0)
-        measures = measure(followed((-10.0, 20.0, 0.0, 25.0)))
+        measures = Measures.of(followed((-10.0, 20.0, 0.0, 25.0)))
         assert [getattr(measures, name) for name in FOLLOWED_UP] == [5.0, None, 0.0, 0.0]
 
     def test_of_bodies_that_touch(self):
         episode = followed((-10.0, 30.0, 0.0, 20.0), (-4.0, 30.0, 0.5, 20.0))
-        assert followed_up(episode) == (-0.5, 0.0, math.inf)
-        measures = measure(episode)
+        measures = Measures.of(episode)
         assert (measures.after_gap_m, measures.after_ttc_s) == (-0.5, 0.0)
         assert measures.after_drac_mps2 is None
         for met in ("after_drac_mps2 > 99", "after_ttc_s < 0.1", "contact", "unsafe"):
@@ -63,7 +66,7 @@ class TestMeasures:
         assert list(record)[-5:] == [*FOLLOWED_UP, "margin"]
         assert Outcome.from_json(json.dumps(record), FOLLOWED) == outcome
         assert not set(FOLLOWED_UP) & set(
-            Outcome(0, 0, replace(CASE, scenario=AT_M), measure(ending(9.0))).to_record()
+            Outcome(0, 0, replace(CASE, scenario=AT_M), Measures.of(ending(9.0))).to_record()
         )
 
     def test_that_nobody_takes_are_refused(self):
@@ -85,7 +88,7 @@ class TestSeverity:
     def test_is_harsh_where_a_car_behind_did_brake(self, braking, severity):
         episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))
         episode.after[0, :, 2] = braking, -4.0  # the VUT, ahead of it, may brake as it likes
-        measures = measure(replace(episode, motion=episode.after[:1]))
+        measures = Measures.of(replace(episode, motion=episode.after[:1]))
         assert (measures.severity, measures.after_brake_mps2) == (severity, -braking)
 
 
@@ -96,7 +99,7 @@ class TestDrivingOn:
             on = behind[index]
             assert np.array_equal(on.motion, merged.motion)
             assert (on.end, on.clipped_steps) == (merged.end, merged.clipped_steps)
-            assert measure(on).score == measure(merged).score
+            assert Measures.of(on).score == Measures.of(merged).score
             assert merged.after is None
 
     def test_is_the_motion_of_both_by_eq_4(self):
@@ -124,6 +127,8 @@ class TestDrivingOn:
             assert "ZeroDivisionError" in trajectory.error
             assert trajectory.after[-1, VUT, 0] >= 10.0
             assert len(trajectory.after) < 10
-            assert measure(trajectory).score == measure(replace(trajectory, error=None)).score
+            assert (
+                Measures.of(trajectory).score == Measures.of(replace(trajectory, error=None)).score
+            )
             words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
             assert words.endswith("Behind M an error ends the follow-up.")

@@ -41,7 +41,7 @@ def assert_alike(sumo: list[Episode], kinematic: list[Episode]) -> None:
         np.testing.assert_allclose(
             one.trajectory.motion, other.trajectory.motion, rtol=0.0, atol=1e-9
         )
-        verdict, ours = one.outcome.verdict, other.outcome.verdict
+        verdict, ours = one.outcome, other.outcome
         assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
         assert verdict.margin == pytest.approx(ours.margin, abs=1e-9)
 

@@ -11,7 +11,7 @@ from support.plans import plan_for
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
 from merge_sumo.drivers.lane import Merging
-from merge_sumo.metrics.score import measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
@@ -121,7 +121,7 @@ class TestAnEpisode:
         return Trajectory(case, motion, End.MERGED, after=motion[1:])
 
     def test_is_measured_at_the_place_of_the_merge(self):
-        measures = measure(self.merged(40.0, 30.0, 30.0, 20.0))
+        measures = Measures.of(self.merged(40.0, 30.0, 30.0, 20.0))
         assert measures.x_merge_m == 30.0
         assert measures.lane_share == 0.5
         assert (measures.gap_ahead_m, measures.time_gap_ahead_s) == (5.0, 0.25)
@@ -134,12 +134,12 @@ class TestAnEpisode:
         motion[:, VUT, 0] = 30.0
         motion[:, POV, 0] = -27.0 + 3.0 * np.arange(31)  # passes the VUT after 1.9 s
         motion[:, POV, 1] = 30.0
-        measures = measure(Trajectory(case, motion, End.MERGED, after=motion[-1:]))
+        measures = Measures.of(Trajectory(case, motion, End.MERGED, after=motion[-1:]))
         assert measures.stood_s == 3.1
         assert measures.pet_s == pytest.approx(1.1)
 
     def test_is_measured_with_a_car_behind(self):
-        measures = measure(self.merged(10.0, 30.0, 30.0, 20.0))
+        measures = Measures.of(self.merged(10.0, 30.0, 30.0, 20.0))
         assert (measures.gap_behind_m, measures.time_gap_behind_s) == (15.0, 0.5)
         assert measures.gap_ahead_m is None
         assert measures.pet_s == pytest.approx(20.0 / 30.0)

@@ -162,7 +162,7 @@ def test_an_episode_is_that_of_the_definition(name, level, tmp_path):
     cases: list[Case] = from_unit(points, level, scenario=ROAD)
     results = evaluate.simulate(plan_for(spec, scenario=ROAD, criterion=Criterion("unsafe")), cases)
     for case, result in zip(cases, results, strict=True):
-        verdict = result.outcome.verdict
+        verdict = result.outcome
         assert isinstance(case, Case)
         place, least_m, braking = simulate(case, VUTS[name]())
         measures = result.outcome.measures

@@ -20,7 +20,7 @@ from merge_sumo.api import open_run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.metrics.score import measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import LEVELS, OWN, US23
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -146,7 +146,7 @@ class TestWhatItDoesWrong:
                 assert trajectory.end is End.SIM_ERROR
                 assert trajectory.error.startswith("the POV: ")
                 assert how.reason in trajectory.error
-                assert measure(trajectory).score is None
+                assert Measures.of(trajectory).score is None
             else:
                 assert trajectory.error is None
 

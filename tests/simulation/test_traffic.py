@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.handmade import FOLLOWED_UP
 from support.plans import plan_for
 
 from merge_sumo.controllers.controller import seen_in
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
-from merge_sumo.metrics.score import FOLLOWED_UP, measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -88,11 +89,14 @@ class TestCarsOfTheMainline:
             assert np.array_equal(one.motion, other.motion[:, :2])
             assert one.end == other.end
             # A car far behind may still have to brake a little.
-            found = measure(other)
-            assert found.brake_after_mps2 == pytest.approx(measure(one).brake_after_mps2, abs=0.2)
+            found = Measures.of(other)
+            assert found.brake_after_mps2 == pytest.approx(
+                Measures.of(one).brake_after_mps2, abs=0.2
+            )
             of_all = ("brake_after_mps2", *FOLLOWED_UP)
-            same = {name: getattr(measure(one), name) for name in of_all}
-            assert replace(found, **same) == measure(one)
+            expected = Measures.of(one)
+            same = {name: expected.value(name) for name in of_all}
+            assert Measures(**found.values | same) == expected
 
     def test_brake_behind_one_that_brakes_and_never_touch_it(self):
         following, rng = Following(50), np.random.default_rng(0)
@@ -146,6 +150,6 @@ class TestTheVerdict:
     @pytest.mark.parametrize(("row", "name"), [(POV, "pov"), (AHEAD, "ahead"), (BEHIND, "behind")])
     def test_is_a_failure_where_any_car_is_too_near(self, row, name):
         gaps = {POV: 40.0, AHEAD: 90.0, BEHIND: -50.0}
-        measures = measure(ending({**gaps, row: 4.0}, {row: 27.0}))
+        measures = Measures.of(ending({**gaps, row: 4.0}, {row: 27.0}))
         assert measures.is_close
         assert (measures.dx_m, measures.dv_mps, measures.nearest) == (4.0, 2.0, name)

@@ -21,7 +21,8 @@ from support.foreign_nets import LANE_M, lane_corridor_of
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
@@ -79,7 +80,7 @@ def at_level_0(x_pov0_m: float, v_pov0_mps: float, v_vut0_mps: float = 18.0) -> 
 
 def write(folder: Path, trajectory: Trajectory) -> Path:
     write_scenario(
-        folder, road_of(), Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
+        folder, road_of(), Outcome(0, 0, trajectory.case, Measures.of(trajectory)), trajectory
     )
     return folder
 
@@ -206,7 +207,7 @@ class TestAMergeFromALane:
 
     def written(self, folder: Path, road: Corridor, trajectory: Trajectory) -> Path:
         write_scenario(
-            folder, road, Outcome(0, 0, trajectory.case, measure(trajectory)), trajectory
+            folder, road, Outcome(0, 0, trajectory.case, Measures.of(trajectory)), trajectory
         )
         return folder
 

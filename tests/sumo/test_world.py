@@ -9,7 +9,7 @@ import pytest
 from support.plans import POVS
 
 from merge_sumo.drivers.level0 import Level0Vut
-from merge_sumo.metrics.score import measure
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -57,5 +57,5 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
     assert len(broken) == 4
     assert all("the simulation broke" in t.error for t in broken)
     assert all(len(t.motion) > 0 for t in broken)
-    assert all(measure(t).score is None for t in broken)
+    assert all(Measures.of(t).score is None for t in broken)
     assert sum(t.end is End.MERGED for t in trajectories) == 26

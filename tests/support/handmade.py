@@ -12,13 +12,16 @@ import numpy as np
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run
 from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome, measure
+from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures
+from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.plan import versions
 
 BATCH = 20
+FOLLOWED_UP = [name for name, one in OURS.items() if one.only_with == FOLLOW_UP]
+"""Measures of the follow-up."""
 
 
 def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Trajectory:
@@ -98,6 +101,6 @@ def write_run(
         ran = []
         for index, case in enumerate(cases[first : first + BATCH], start=first):
             trajectory = drive(case, errors.get(index), timeout=index in timeouts)
-            ran.append(Episode(Outcome(index, batch, case, measure(trajectory)), trajectory))
+            ran.append(Episode(Outcome(index, batch, case, Measures.of(trajectory)), trajectory))
         journal.append(ran)
     return Run(folder)

@@ -1,0 +1,89 @@
+"""The score P of an episode (Wang et al., section V-A).
+
+P = MU_CRASH I_crash + MU_SAFETY P_safety + MU_TASK P_task is never positive, and P < -500 exactly
+when the front bumpers are within 6 m as the VUT reaches M, which the paper calls a crash; bodies
+need not touch then (`severity.py`). A surrogate must be able to learn P, so it falls smoothly over
+tens of metres towards that limit, jumps little there, and goes on falling beyond it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from merge_sumo.scenario.scenario import VUT
+from merge_sumo.scenario.trajectory import End, Trajectory
+
+FAILURE_SCORE: Final = -500.0
+"""lambda: a case fails by the paper's criterion when its score is below."""
+
+# The bounds that make "P < -500" and the paper's crash the same: without one P_safety and
+# P_task are at least -1, so P >= -495; with one P_safety is at most -1, so P <= -560.
+MU_CRASH: Final = -110.0
+MU_SAFETY: Final = 450.0
+MU_TASK: Final = 45.0
+GAP_SCALE_M: Final = 15.0
+"""Length over which P_safety decays with the gap; tens of metres, so that a surrogate sees it."""
+TTC_SHARE: Final = 1.0 / 9.0
+"""Part of P_safety that a short time to collision can cost; the gap has the rest."""
+
+
+def margin_of(score: float | None) -> float | None:
+    """Return the margin of a score P: how far it is above lambda, in units of that."""
+    return None if score is None else (score - FAILURE_SCORE) / abs(FAILURE_SCORE)
+
+
+def is_close(trajectory: Trajectory) -> bool:
+    """Return whether the VUT arrived at M with |dx| < 6 m: the paper's rule of a crash."""
+    x_m, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
+    near = bool(abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m)
+    return trajectory.end is End.MERGED and near
+
+
+def merge_score(trajectory: Trajectory) -> float | None:
+    """Return the score P of a merge; None after an error."""
+    if trajectory.end.is_error:
+        return None
+    dx = ttc = None
+    if trajectory.end.is_tested:
+        pov, vut = trajectory.motion[-1, [trajectory.nearest, VUT], :2].tolist()
+        dx = pov[0] - vut[0]
+        ttc = time_to_collision(dx, pov[1] - vut[1])
+    return _score(trajectory, dx, ttc, close=is_close(trajectory))
+
+
+def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
+    """Return TTC = -dx/dv in seconds where the gap closes (dx dv < 0), else None (section VI-C)."""
+    return -dx_m / dv_mps if dx_m * dv_mps < 0 else None
+
+
+def _score(trajectory: Trajectory, dx: float | None, ttc: float | None, *, close: bool) -> float:
+    p_safety = 0.0
+    if dx is not None:
+        scenario = trajectory.case.scenario
+        overlap = scenario.dx_crash_m - abs(dx)
+        if close:
+            p_safety = -1.0 - overlap / scenario.dx_crash_m
+        else:
+            short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / scenario.ttc_min_s)
+            near = math.exp(overlap / GAP_SCALE_M)
+            p_safety = -(1.0 - TTC_SHARE) * near - TTC_SHARE * short_ttc
+    crash = MU_CRASH if close else 0.0
+    return crash + MU_SAFETY * p_safety + MU_TASK * _task(trajectory)
+
+
+def _task(trajectory: Trajectory) -> float:
+    """Return P_task in [-1, 0]: a slow ramp, a final speed off the highway's, harshness, no end."""
+    v_vut, scenario = trajectory.v_vut_mps, trajectory.case.scenario
+    v_end = float(v_vut[-1])
+    steps = len(v_vut)
+    # The sums are a third of the time of `mean`, and the same to the last bit.
+    slow = float(np.add.reduce(np.maximum(scenario.v_min_mps - v_vut, 0.0)) / steps)
+    slow /= scenario.v_min_mps
+    off_range = max(scenario.v_hw_min_mps - v_end, v_end - scenario.v_hw_max_mps, 0.0)
+    off_range = min(off_range / scenario.v_hw_min_mps, 1.0)
+    hardest = max(-scenario.a_min_mps2, scenario.a_max_mps2)
+    harsh = float(np.add.reduce(np.square(trajectory.a_vut_mps2)) / steps) / hardest**2
+    return -(slow + off_range + harsh + (trajectory.end is End.TIMEOUT)) / 4.0
