@@ -476,8 +476,10 @@ def _remove_remains(above: str) -> None:
     """Remove the folders of ours whose process is gone, once in a process."""
     with suppress(OSError):
         for folder in Path(above).glob(f"{PREFIX}????????"):
+            found = folder.lstat()
             # A young one may not have its lock yet.
-            if time.time() - folder.lstat().st_mtime < YOUNG_S:
+            young = time.time() - found.st_mtime < YOUNG_S
+            if young or found.st_uid != os.geteuid():
                 continue
             lock = _locked(folder)
             if lock is not None:

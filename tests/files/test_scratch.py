@@ -74,3 +74,12 @@ def test_nothing_else_is_removed(temporary, tmp_path_factory):
         pass
     assert sorted(temporary.iterdir()) == before
     assert (elsewhere / "kept").is_file()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="root gives a folder to another user")
+def test_what_another_user_left_stays(temporary):
+    theirs = temporary / f"{PREFIX}abcd1234"
+    theirs.mkdir()
+    os.chown(theirs, 65534, 65534)
+    with ScratchFolder():
+        assert theirs.is_dir()
