@@ -29,7 +29,7 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.campaign import FIRST_BATCH, twin_of
+from merge_sumo.campaigns.campaign import FIRST_BATCH, controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -37,7 +37,7 @@ from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
-from merge_sumo.samplers.pair import TwinPair
+from merge_sumo.samplers.pair import ControllerModelPair
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.simulation.evaluate import evaluate
@@ -113,8 +113,10 @@ class Versions:
     def against(self, cases: int, seed: int) -> FloatArray:
         """Return the regressions that a campaign against the old version finds, (k, d)."""
         settings = self.pair.settings(cases, seed)
-        twins = TwinPair(twin_of(settings, self.new), twin_of(settings, self.old))
-        sampler = make_sampler(settings.sampler, settings.pool, seed, twins)
+        models = ControllerModelPair(
+            controller_model_of(settings, self.new), controller_model_of(settings, self.old)
+        )
+        sampler = make_sampler(settings.sampler, settings.pool, seed, models)
         young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
         groups: Groups = []
         SearchLoop(sampler, self.new, cases, first=young).run(groups.extend)
@@ -131,8 +133,8 @@ class Versions:
         The failures of the old version's campaign are none, so that campaign need not run.
         """
         settings = replace(self.pair.settings(cases, seed), against=None)
-        twin = twin_of(settings, self.new)
-        sampler = make_sampler(settings.sampler, settings.pool, seed, twin)
+        model = controller_model_of(settings, self.new)
+        sampler = make_sampler(settings.sampler, settings.pool, seed, model)
         groups: Groups = []
         SearchLoop(sampler, replace(self.new, against=None), cases).run(groups.extend)
         ran = chain.from_iterable(groups)

@@ -97,8 +97,8 @@ def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
     found = []
     for task in tasks:
         pool, lines = Pool(levels=task.levels, scenario=plan.scenario), centre_lines(plan.road)
-        twin = ControllerModel(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
-        sampler, ran = make_sampler(task.name, pool, task.seed, twin), SamplerRun([], [])
+        model = ControllerModel(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
+        sampler, ran = make_sampler(task.name, pool, task.seed, model), SamplerRun([], [])
         batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
         groups: Groups = []
         SearchLoop(sampler, plan, task.cases, batch=batch).run(groups.extend)

@@ -25,7 +25,7 @@ from merge_sumo.metrics.prediction import Prediction
 from merge_sumo.metrics.regression import regression
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.pair import TwinPair
+from merge_sumo.samplers.pair import ControllerModelPair
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.simulation.evaluate import submit_cases
 from merge_sumo.simulation.plan import SimulationPlan
@@ -214,7 +214,7 @@ def tell(sampler: Sampler, episodes: Sequence[Episode]) -> None:
     earlier = [episode.earlier for episode in episodes if episode.earlier is not None]
     outcomes = [episode.outcome for episode in episodes]
     if earlier:
-        if isinstance(sampler.predictor, TwinPair):
+        if isinstance(sampler.predictor, ControllerModelPair):
             sampler.predictor.tell_old([one.outcome for one in earlier], motions_of(earlier))
         pairs = zip(outcomes, earlier, strict=True)
         outcomes = [regression(new, old.outcome, old.outcome.prediction) for new, old in pairs]

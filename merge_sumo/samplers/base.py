@@ -38,7 +38,7 @@ class Sampler(ABC):
     learns: ClassVar[bool] = True
     """Whether proposals depend on the outcomes, and not only on their number."""
     uses_predictions: ClassVar[bool] = False
-    """Whether proposals depend on predictions of a twin of the VUT."""
+    """Whether proposals depend on predictions of a model of the controller."""
     overlaps: ClassVar[bool] = False
     """Whether it is asked while cases run, and counts these (`pend`)."""
     tolerated: float = 0.0

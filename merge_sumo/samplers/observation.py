@@ -1,4 +1,4 @@
-"""What a controller can know when it decides: the inputs of the twin."""
+"""What a controller can know when it decides: the inputs of the model of the controller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The twins of two versions of a VUT: together they predict where the versions differ."""
+"""The models of two versions of a VUT: together they predict where the versions differ."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray
 
 
-class TwinPair:
+class ControllerModelPair:
     """Predicts what stands for the gap of a regression; see `Predictor` and `regression`.
 
-    Each member of the new version's twin is paired with the member of the old version's twin that
+    Each member of the new version's model is paired with the member of the old version's model that
     learned from the same cases.
     """
 
     members = ControllerModel.members
 
     def __init__(self, new: ControllerModel, old: ControllerModel) -> None:
-        """Take a twin of each version."""
+        """Take a model of each version."""
         self._new, self._old = new, old
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
@@ -32,7 +32,7 @@ class TwinPair:
         self._old.tell(outcomes, motions)
 
     def can_predict(self, level: int) -> bool:
-        """Return whether both twins can predict cases of a level."""
+        """Return whether both models can predict cases of a level."""
         return self._new.can_predict(level) and self._old.can_predict(level)
 
     def predict(

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from merge_sumo.campaigns.campaign import twin_of
+from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.failure_probability import learn_chance
 from merge_sumo.samplers.history import bounded
-from merge_sumo.samplers.pair import TwinPair
+from merge_sumo.samplers.pair import ControllerModelPair
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import evaluate
@@ -62,13 +62,15 @@ def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m, fail
 def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
     settings, plan, points, outcomes, motions = searched(limit_m, fail_when, 160)
     _, old_plan, _, old, old_motions = searched(limit_m, fail_when, 160, "design1")
-    twin = twin_of(settings, plan)
-    pair = TwinPair(twin_of(settings, plan), twin_of(settings, old_plan))
-    twin.tell(outcomes[:80], motions)
+    model = controller_model_of(settings, plan)
+    pair = ControllerModelPair(
+        controller_model_of(settings, plan), controller_model_of(settings, old_plan)
+    )
+    model.tell(outcomes[:80], motions)
     pair.tell(outcomes[:80], motions)
     pair.tell_old(old[:80], old_motions)
     regressions = [regression(*versions) for versions in zip(outcomes, old, strict=True)]
-    for predictor, ran in ((twin, outcomes), (pair, regressions)):
+    for predictor, ran in ((model, outcomes), (pair, regressions)):
         gaps = predictor.predict({0: points[80:]})[0]
         said = np.abs(np.median(gaps, axis=0)) < 1.0
         failed = np.array([outcome.failed for outcome in ran[80:]])

@@ -48,7 +48,7 @@ class Entrant:
         about: what it does, in a line.
         colour: of its curves, #RRGGBB.
         sha256: of the file that defines the class.
-        predicts: whether it is given the twin of the VUT, and so sees motions.
+        predicts: whether it is given the model of the controller, and so sees motions.
         fault: why it does not enter, in a sentence; None where it does.
     """
 

@@ -1,4 +1,4 @@
-"""The twin of the VUT: it plays as SUMO does, learns, and is believed by its record."""
+"""The model of the controller: it plays as SUMO does, learns, and is believed by its record."""
 
 from __future__ import annotations
 
