@@ -186,4 +186,4 @@ class TestSettings:
         with pytest.raises(UserError, match="`at` sense_delay_s=NUMBER is missing"):
             ms.run("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
         with pytest.raises(UserError, match="`at` sense_delay_s=NUMBER is none of"):
-            ms.run("design2", {"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)
+            ms.run("design2", at={"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)

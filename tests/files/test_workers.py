@@ -167,7 +167,7 @@ class TestLocalProcesses:
             "        os.kill(os.getpid(), 9)\n"
         )
         tests = Path(__file__).parents[1]
-        folders = [str(tests / name) for name in (".", "support", "system")]
+        folders = [str(tests / name) for name in (".", "files")]
         parent = subprocess.run(
             [sys.executable, str(script), *folders], capture_output=True, text=True, check=False
         )
