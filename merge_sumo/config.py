@@ -83,7 +83,8 @@ class ScenarioChanges:
     """Changes of a scenario."""
 
     follow_up_s: float | None = None
-    """Seconds for which all drive on after the merge; 0 ends an episode there. By default 3."""
+    """Seconds for which all drive on after the merge; 0 ends an episode there. By default 3,
+    and 5 on an acceleration lane."""
     sense: AnySensing | None = None
     """How the VUT senses other cars: delay_s, noise_x_m, noise_v_mps, dropout, range_m,
     occluded_until_m, as NAME=NUMBER,...; a range, as delay_s=0..0.5, is tested as a whole."""
@@ -208,8 +209,9 @@ class CampaignOptions(Levels, Junit, Execution, Search, Test):
     """
 
     against: AnyVut | None = None
-    """An earlier version of the VUT, of any kind but traci: each case runs with both, and the
-    sampler looks for those that the VUT alone fails."""
+    """An earlier version of the VUT, of any kind but a client that connects by itself (traci or
+    traci:PORT): each case runs with both, and the sampler looks for those that the VUT alone
+    fails."""
     gates: Iterable[str] = ()
     """Exit with 1 if there are failures, errors, timeouts, "fmc>X": an FMC above X at some level,
     or, with --against, regressions. May be given several times."""
