@@ -74,12 +74,12 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def campaign_in(scenario: Scenario, **options: str | None) -> str:
+def campaign_in(scenario: Scenario, **controllers: str | None) -> str:
     """Return the command of a campaign in a scenario; empty where that is of a file elsewhere."""
     name = spoken_name(scenario)
     if name is None:
         return ""
-    return command("campaign", **options, scenario=None if name == US23.name else name)
+    return command("campaign", **controllers, scenario=None if name == US23.name else name)
 
 
 def _named(verb: str, record: Mapping[str, Any]) -> dict[str, str]:

@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 from lxml import html
 from support.calling import Said
-from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
 from merge_sumo import testing
@@ -278,12 +277,3 @@ class TestACommand:
         assert page.endswith(" --out changes-2.html")
         assert command_line(*shlex.split(page)[1:], "-q")[0] != BAD_USE
         assert (place / "changes.html").read_text() == "mine"
-
-
-def test_a_search_with_the_new_version_keeps_the_rule_and_the_levels(command_line, tmp_path):
-    settings = campaign_settings(
-        vut="design2", levels=(0, 1), cases=4, sampler="uniform", fail_when="ttc_s < 1.5"
-    )
-    run = run_campaign(settings, tmp_path / "run")
-    said = command_line("rerun", run.folder, "--vut", "design2?gap_m=12").out
-    assert "--against design2 --level 0,1 --fail-when 'ttc_s < 1.5'` searches there" in said
