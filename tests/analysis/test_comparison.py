@@ -53,7 +53,7 @@ def outcome(became: str, index: int = 0) -> Outcome:
         end=End.MERGED,
         score=-600.0 if failed else -20.0,
         t_end_s=8.0,
-        severity=word,  # type: ignore[arg-type]
+        severity=word,
     )
     return Outcome(index, 0, CASE, found)
 
