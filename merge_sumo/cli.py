@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -389,6 +390,10 @@ def execute(words: Sequence[str]) -> int:
             return app(words) or 0
     except CycloptsError as error:
         raise UserError(str(error)) from error
+    except SystemExit as ended:
+        if isinstance(ended.__context__, BrokenPipeError):  # the reader of the help has gone
+            raise Stopped(signal.SIGPIPE) from None
+        raise
 
 
 def main() -> None:

@@ -170,10 +170,12 @@ class ExplanationResult(Result):
     Attributes:
         run: the campaign.
         found: what was found.
+        vut: the VUT that drove in the changed cases.
     """
 
     run: Run
     found: Explanation
+    vut: str
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
@@ -230,7 +232,7 @@ def explain(
     with workers_or_here(study.workers) as opened:
         found = _explained(study.run, _Neighbours(study.plan, outcome, ranges, opened))
     study.on_cases(1)
-    return ExplanationResult(study.run, found)
+    return ExplanationResult(study.run, found, study.settings.vut)
 
 
 def _explained(run: Run, neighbours: _Neighbours) -> Explanation:

@@ -29,7 +29,7 @@ from merge_sumo.files import free
 from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.printable import counted
-from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
+from merge_sumo.scenario.scenario import LEVELS, OWN, AnyLevels, level_name, names_of_levels
 from merge_sumo.simulation.evaluate import evaluate, open_simulators
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers, workers_or_here
@@ -95,7 +95,14 @@ def _source(study: RunStudy) -> str:
     settings, before = study.settings, study.run.settings.vut
     earlier = None if before == settings.vut or waits_for_client(before) else before
     drivers = {"vut": settings.vut, "against": earlier, "pov": settings.pov}
-    search = campaign_in(settings.scenario, **drivers)
+    some_levels = OWN not in settings.levels and settings.levels != LEVELS
+    own_rule = settings.fail_when != settings.scenario.criterion
+    search = campaign_in(
+        settings.scenario,
+        **drivers,
+        level=",".join(map(str, settings.levels)) if some_levels else None,
+        fail_when=settings.fail_when if own_rule else None,
+    )
     return (
         f"the cases come from the search of {study.run.vut} as it was recorded, so what the "
         "version of now alone fails may lie elsewhere"

@@ -40,9 +40,9 @@ def again(
         folder: the folder of the campaign.
         record: what its `campaign.json` says.
         arguments: what follows the folder.
-        options: what else is stated, by keyword.
+        options: what else is stated, by keyword; a controller takes the place of the recorded one.
     """
-    return command(verb, folder, *arguments, **options, **_named(verb, record))
+    return command(verb, folder, *arguments, **(options | _named(verb, record) | options))
 
 
 def call_again(verb: str, folder: Path, record: Mapping[str, Any], **options: Argument) -> str:
@@ -74,12 +74,12 @@ def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def campaign_in(scenario: Scenario, **controllers: str | None) -> str:
+def campaign_in(scenario: Scenario, **options: str | None) -> str:
     """Return the command of a campaign in a scenario; empty where that is of a file elsewhere."""
     name = spoken_name(scenario)
     if name is None:
         return ""
-    return command("campaign", **controllers, scenario=None if name == US23.name else name)
+    return command("campaign", **options, scenario=None if name == US23.name else name)
 
 
 def _named(verb: str, record: Mapping[str, Any]) -> dict[str, str]:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Final
+from typing import Any, Final
 
 from merge_sumo.analysis.comparison import (
     LISTED,
@@ -36,7 +36,7 @@ from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.plausibility import behind
 from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import judge
-from merge_sumo.printable import counted, either
+from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
@@ -374,11 +374,18 @@ def explanation(result: ExplanationResult) -> list[str]:
     outcome = run.outcome(found.index)
     level = level_name(outcome.case.level)
     lines = [f"case {outcome.index}, POV level {level}: {described(outcome.case)}"]
-    for sentence in (*causes(run, [outcome]).values(), *changes(found, outcome.case)):
+    for sentence in causes(run, [outcome]).values():
+        lines.append(f"  {sentence}")
+    options: dict[str, Any] = {}
+    if result.vut != run.settings.vut:
+        options["vut"] = result.vut
+        lines.append(f"  so far {printable(run.settings.vut)}; with {printable(result.vut)}:")
+    for sentence in changes(found, outcome.case):
         lines.append(f"  {sentence}")
     if found.nearest_start is not None:
         name, value = found.nearest_start
-        again_here = again("run", run.folder, run.record, outcome.index, at={name: value})
+        options["at"] = {name: value}
+        again_here = again("run", run.folder, run.record, outcome.index, **options)
         lines.append(f"look at it: {again_here}")
     return [*lines, f"in the report: {command('report', run.folder)}"]
 

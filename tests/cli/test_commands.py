@@ -141,3 +141,12 @@ def on_a_terminal(command: str, folder: Path) -> tuple[str, int]:
             os.kill(process.pid, signal.SIGINT)
     os.close(ours)
     return shown.decode(errors="replace"), process.wait(timeout=600)
+
+
+def test_help_whose_reader_has_gone_ends_as_other_programs_do():
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--help"]
+    done = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from lxml import html
 from support.calling import Said
+from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
 from merge_sumo import testing
@@ -102,6 +103,8 @@ def runs(command_line: Call) -> Callable[[set[str]], None]:
                 words = [word for word in shlex.split(part) if word != "--gui"]
                 assert words.pop(0) == "merge-sumo", part
                 few = [] if "--resume" in words else FEW.get(words[0], [])
+                if "--level" in words:
+                    few = few[:2]
                 said = command_line(*words, *few)
                 assert said.code != BAD_USE, (part, said.err)
                 Path("changes.html").unlink(missing_ok=True)  # each was printed without it
@@ -157,9 +160,9 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
 @pytest.mark.usefixtures("place")
 def test_runs_of_a_controller(vut, options, command_line, runs):
     found = printed(vut, command_line, *options)
-    assert (
-        shlex.join(("merge-sumo", "campaign", "--vut", "fsm", "--against", vut, *options)) in found
-    )
+    rule = ("--level", "0", "--fail-when", "t_end_s > 0")
+    search = ("merge-sumo", "campaign", "--vut", "fsm", "--against", vut, *rule, *options)
+    assert shlex.join(search) in found
     runs(found)
 
 
@@ -194,7 +197,7 @@ def test_runs_of_an_object_of_a_notebook(place):
     calls = {one for one in found if one.startswith("ms.")}
     assert len(calls) >= 5
     assert not any("here:" in one for one in found)
-    more = {"probability": ", cases=8)", "campaign": ", level=0, cases=4)"}
+    more = {"probability": ", cases=8)", "campaign": ", cases=4)"}
     for text in sorted(calls):
         for part in text.split("; "):
             verb = part.split("(")[0].removeprefix("ms.")
@@ -277,3 +280,16 @@ class TestACommand:
         assert page.endswith(" --out changes-2.html")
         assert command_line(*shlex.split(page)[1:], "-q")[0] != BAD_USE
         assert (place / "changes.html").read_text() == "mine"
+
+
+def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):
+    settings = campaign_settings(
+        vut="design1", levels=(0,), cases=4, sampler="uniform", fail_when="dx_m > 0"
+    )
+    run = run_campaign(settings, tmp_path / "run")
+    said = command_line("explain", run.folder, "--vut", "design1?gap_m=30")
+    assert said.code == 0, said.err
+    assert "  so far design1; with design1?gap_m=30:\n" in said.out
+    (line,) = (text for text in said.out.splitlines() if text.startswith("look at it: "))
+    assert " --vut 'design1?gap_m=30'" in line
+    assert "so far" not in command_line("explain", run.folder).out
