@@ -80,7 +80,7 @@ from merge_sumo.files import (
 )
 from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.merge import check_from
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import parse_gates
 from merge_sumo.printable import printable, quoted
 from merge_sumo.records import check_toml_size, to_plain

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     from merge_sumo.controllers.in_memory import AnyVut
-    from merge_sumo.metrics.score import Outcome
+    from merge_sumo.metrics.outcome import Outcome
     from merge_sumo.scenario.imperfection import Actuation, Sensing
     from merge_sumo.scenario.scenario import AnyLevels, Scenario
 

@@ -15,10 +15,9 @@ from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.config import AnyRun
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.plausibility import doubts, in_vain, mostly_clipped
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import (
     MESSAGE_CHARACTERS,
     GateResult,

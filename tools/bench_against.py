@@ -33,8 +33,8 @@ from merge_sumo.campaigns.campaign import FIRST_BATCH, controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.pair import ControllerModelPair

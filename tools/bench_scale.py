@@ -53,9 +53,8 @@ from merge_sumo.campaigns.loop import SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import fmc, regions
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.reports.report import write_report
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool, from_unit, to_unit

@@ -18,7 +18,7 @@ from bench_record import add_record_option, append_record
 
 import merge_sumo as ms
 from merge_sumo.campaigns.stopping import coverage_by_level, has_converged
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 
 VUTS = (
     *("design1", "design2", "gap", "level0", "sumo:IDM"),

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario

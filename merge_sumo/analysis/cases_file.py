@@ -16,7 +16,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.measures import Measures, measures_in
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record, convert, read_toml, to_json
 from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import Scenario

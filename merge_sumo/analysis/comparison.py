@@ -30,10 +30,9 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import fmc, radius_for, regions
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.summary import (
     LevelSummary,
     RunsOfCase,

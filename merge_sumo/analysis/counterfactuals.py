@@ -35,7 +35,7 @@ from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.merge import brake_after_mps2
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import either
 from merge_sumo.records import Record
 from merge_sumo.road.merge import centre_lines

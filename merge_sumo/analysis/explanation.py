@@ -26,8 +26,7 @@ from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.controllers.parameters import Range, values_of
 from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record, replaced, to_plain
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case, coordinates

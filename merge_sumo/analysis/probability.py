@@ -39,7 +39,7 @@ from merge_sumo.analysis.run_study import RunStudy, StudyFile, check_least
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record, to_json
 from merge_sumo.result import Result

@@ -23,7 +23,7 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.result import Result
 from merge_sumo.samplers.gpr import predicted_margin

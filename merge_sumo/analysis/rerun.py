@@ -26,8 +26,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import waits_for_client
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import LEVELS, OWN, AnyLevels, level_name, names_of_levels
 from merge_sumo.simulation.evaluate import evaluate, open_simulators

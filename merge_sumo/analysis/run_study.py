@@ -11,7 +11,7 @@ from merge_sumo.campaigns.run import FILES, Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import check_ours, files_now, replace_own
-from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.printable import printable
 from merge_sumo.records import Record, read_indexed, read_record, to_json
 from merge_sumo.scenario.case import Case

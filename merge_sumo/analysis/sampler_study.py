@@ -29,7 +29,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.in_memory import is_here
 from merge_sumo.errors import UserError, notice
 from merge_sumo.metrics.fmc import covered, fmc
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.result import Result
 from merge_sumo.road.merge import centre_lines

@@ -21,7 +21,7 @@ from merge_sumo.analysis.run_study import StudyFile
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.metrics.summary import clopper_pearson, undecided
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool

@@ -19,8 +19,7 @@ from msgspec import Meta
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case

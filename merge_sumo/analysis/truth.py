@@ -27,8 +27,8 @@ from merge_sumo.files import (
     sha256_of,
 )
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import fmc, growth_bound, has_neighbour, regions
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.records import decode, read_arrays
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import FloatArray, Pool

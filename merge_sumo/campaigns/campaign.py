@@ -18,8 +18,7 @@ from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings,
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.samplers.base import Sampler

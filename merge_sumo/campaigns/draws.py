@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from math import ceil
 
-from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.scenario.case import Case, FloatArray
 

@@ -30,8 +30,7 @@ from merge_sumo.campaigns.run import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, replace_own, sync_folder, write_folder
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import to_json
 from merge_sumo.scenario.signals import to_record
 

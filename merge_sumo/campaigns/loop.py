@@ -20,10 +20,8 @@ from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Final
 
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.outcome import Episode, Outcome, Prediction
 from merge_sumo.metrics.regression import regression
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.pair import ControllerModelPair
 from merge_sumo.scenario.case import Case, FloatArray

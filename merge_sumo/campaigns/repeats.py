@@ -25,8 +25,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.files import replace_own
-from merge_sumo.metrics.episode import Episode
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record, read_indexed, replaced, to_json
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle

@@ -26,9 +26,8 @@ from merge_sumo.config import Search
 from merge_sumo.errors import UserError
 from merge_sumo.files import regular
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.fmc import regions
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import RecordError, convert, decode, read_arrays

@@ -17,7 +17,7 @@ from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain

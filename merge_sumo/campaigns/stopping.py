@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import failing_cases
 from merge_sumo.scenario.case import to_unit
 

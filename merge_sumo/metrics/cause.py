@@ -21,7 +21,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
 from merge_sumo.scenario.case import Case, Coordinate, FloatArray, coordinates
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario

@@ -25,8 +25,8 @@ from merge_sumo.metrics.measures import (
     measures_in,
 )
 from merge_sumo.metrics.merge import Severity
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.paper import margin_of
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
 from merge_sumo.printable import nearest, printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, Scenario

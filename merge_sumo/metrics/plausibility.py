@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from merge_sumo.metrics.criterion import CRITERIA, Criterion, condition_of, values_of
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
 from merge_sumo.printable import counted, printable
 from merge_sumo.scenario.scenario import DT_S

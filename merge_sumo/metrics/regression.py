@@ -12,8 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.metrics.prediction import NO_GAP, Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import NO_GAP, Outcome, Prediction
 from merge_sumo.scenario.case import FloatArray
 
 FARTHEST: Final = NO_GAP - 1.0

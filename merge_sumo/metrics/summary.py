@@ -26,7 +26,7 @@ from scipy.special import betainc
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.fmc import fmc, regions
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import counted, printable
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.scenario import US23, level_name

@@ -20,7 +20,7 @@ from merge_sumo.files import check_new, make_folder, write_new
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import condition_of
 from merge_sumo.metrics.fmc import radius_for
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import judge, one_per_case
 from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value

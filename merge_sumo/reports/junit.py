@@ -21,7 +21,7 @@ from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
 from merge_sumo.metrics.cause import failure_boxes
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import judge, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT

@@ -26,7 +26,7 @@ from merge_sumo.files import GENERATOR, check_ours, replace_own
 from merge_sumo.metrics.cause import BRAKED_MPS
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import Summary
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline

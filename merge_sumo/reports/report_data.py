@@ -14,7 +14,7 @@ from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.measures import Measure, measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import RunsOfCase, shortened
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS

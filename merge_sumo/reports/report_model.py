@@ -20,8 +20,8 @@ from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import Summary, Trouble, by_case, judge, summarise, undecided
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.corridor import Corridor

@@ -33,8 +33,8 @@ from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import behind
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of

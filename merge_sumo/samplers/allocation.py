@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 
 
 def even_shares(proposed: Mapping[int, int], n: int) -> dict[int, int]:

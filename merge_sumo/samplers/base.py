@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
-from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.metrics.summary import by_case
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.history import LevelHistory, bounded

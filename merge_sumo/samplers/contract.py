@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.observation import HISTORY, Inputs, Observation
 from merge_sumo.samplers.rollout import ModelRollout
 from merge_sumo.scenario.case import FloatArray, Pool

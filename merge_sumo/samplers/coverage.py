@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.metrics.prediction import Prediction
+from merge_sumo.metrics.outcome import Prediction
 from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import ROUNDS, LevelSearch

@@ -28,7 +28,7 @@ from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit, ndtr
 
 from merge_sumo.metrics.fmc import radius_for
-from merge_sumo.metrics.prediction import NO_GAP
+from merge_sumo.metrics.outcome import NO_GAP
 from merge_sumo.samplers.gaussian_process import GaussianProcess
 from merge_sumo.samplers.history import LevelHistory, most_informative
 from merge_sumo.scenario.case import FloatArray

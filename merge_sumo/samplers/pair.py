@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.regression import regression_gaps
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray
 

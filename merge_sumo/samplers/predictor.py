@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
-from merge_sumo.metrics.prediction import NO_GAP
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import NO_GAP, Outcome
 from merge_sumo.scenario.case import FloatArray
 
 WIDTHS: Final = ((0.01, 0.35), (0.1, 0.35), (0.35, 0.25))

@@ -16,9 +16,8 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import hashed
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import measure_all
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.trajectory import End, Trajectory

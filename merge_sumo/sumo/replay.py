@@ -22,7 +22,7 @@ from merge_sumo.errors import UserError, notice
 from merge_sumo.interrupt import stopping_in_order
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record, convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.corridor import Corridor

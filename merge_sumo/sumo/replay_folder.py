@@ -21,7 +21,7 @@ from lxml import etree
 from merge_sumo.files import write_folder
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import merged_rows
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
 from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor

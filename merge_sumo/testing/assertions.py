@@ -8,7 +8,7 @@ from merge_sumo.api import verb
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import failures
 from merge_sumo.config import NoFailures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import printable
 from merge_sumo.results import CampaignRun
 from merge_sumo.scenario.case import described

@@ -26,9 +26,8 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.summary import RunsOfCase
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows

@@ -22,7 +22,7 @@ from merge_sumo.analysis.sampler_study import (
 from merge_sumo.analysis.truth import Truth, ground_truth, read_truth
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End

@@ -13,7 +13,7 @@ import pytest
 import merge_sumo as ms
 from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, StressResult, flips_of
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.imperfection import Actuation

@@ -16,7 +16,7 @@ from merge_sumo import api
 from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import by_case, failing_cases
 from merge_sumo.printable import counted
 from merge_sumo.samplers.registry import make_sampler

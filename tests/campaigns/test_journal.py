@@ -20,10 +20,9 @@ from support.handmade import FOLLOWED_UP
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_settings
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import OURS, Measures
 from merge_sumo.metrics.merge import Severity
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23

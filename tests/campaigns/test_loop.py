@@ -18,7 +18,7 @@ from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION
-from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool

@@ -13,7 +13,7 @@ from merge_sumo.campaigns import stopping
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.stopping import WINDOW, has_converged
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End

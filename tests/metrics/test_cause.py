@@ -10,7 +10,7 @@ from metrics.test_diagnosis import BRAKES, COASTS, EASES, KEEP, LEVEL0, meeting,
 
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 LATE = phases((7.5, 1.0), (0.5, -4.0))

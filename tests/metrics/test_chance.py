@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import (
     by_case,
     clopper_pearson,

@@ -19,7 +19,7 @@ from merge_sumo.metrics.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
 from merge_sumo.metrics.expression import MOST_CHARACTERS, MOST_MARGIN, parse_condition
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 

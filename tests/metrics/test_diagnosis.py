@@ -9,7 +9,7 @@ import pytest
 
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT

@@ -9,8 +9,8 @@ import pytest
 from support.handmade import cases_of, drive
 
 from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.regression import FARTHEST, margins, regression, regression_gaps
-from merge_sumo.metrics.score import Outcome
 
 NAN = float("nan")
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from merge_sumo.metrics.measures import Measures, sustained_brake_mps2
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.paper import FAILURE_SCORE, is_close, margin_of, time_to_collision
-from merge_sumo.metrics.score import Outcome
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory

@@ -21,7 +21,7 @@ from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report_model import ReportModel

@@ -21,7 +21,7 @@ from support.handmade import write_run
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.merge import default_net_path, road_of

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.allocation import even_shares, last_failure_share, whole_shares
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23

@@ -14,8 +14,7 @@ from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario

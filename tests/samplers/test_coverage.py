@@ -15,7 +15,7 @@ from support.histories import history_of
 
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import (
     NEAREST,

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.samplers.predictor import (
     disagreement,
     failure_probability,

@@ -10,7 +10,7 @@ import pytest
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import US23

@@ -19,7 +19,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End

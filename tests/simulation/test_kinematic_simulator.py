@@ -14,7 +14,7 @@ from merge_sumo.drivers.levelk import MANY_ROWS, features
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.episode import Episode
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario

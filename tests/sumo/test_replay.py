@@ -22,7 +22,7 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario

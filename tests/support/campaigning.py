@@ -10,7 +10,7 @@ from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.scenario import US23
 
 

@@ -11,9 +11,8 @@ import numpy as np
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.run import Run
-from merge_sumo.metrics.episode import Episode
 from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory

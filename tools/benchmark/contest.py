@@ -41,7 +41,7 @@ from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, regular, replace_own
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import counted
 from merge_sumo.records import decode
 from merge_sumo.result import Result

@@ -22,8 +22,7 @@ from merge_sumo.controllers.deadline import Deadline, DeadlineExceeded, text_of
 from merge_sumo.controllers.python import module_of_file
 from merge_sumo.errors import UserError
 from merge_sumo.files import sha256_of
-from merge_sumo.metrics.prediction import Prediction
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.contract import SamplerContract
 from merge_sumo.samplers.registry import SAMPLERS

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from merge_sumo.metrics.score import Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray, Pool

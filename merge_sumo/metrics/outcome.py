@@ -1,0 +1,225 @@
+"""The outcome of a case: what was predicted of it, its measures, its margin and its record."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Annotated, Any, Self, get_type_hints
+
+import numpy as np
+from msgspec import Meta
+
+from merge_sumo.errors import UserError
+from merge_sumo.files import Files
+from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures, measures_in
+from merge_sumo.metrics.paper import margin_of
+from merge_sumo.records import Record, convert, decode, record_type, to_plain
+from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.scenario import Scenario
+from merge_sumo.scenario.trajectory import Trajectory
+
+NO_GAP = 100.0 / 3.0
+"""Gap of a VUT that never arrives, in units of the limit: another car goes first, far away."""
+_DIGITS = 4
+"""Decimals of a prediction, in memory as on disk: a resumed campaign decides by the same values."""
+
+
+Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class Prediction(Record, frozen=True):
+    """What was predicted of a case before it ran: gaps at M and the failure probability.
+
+    Attributes:
+        dx_m: signed gaps at M, (E, G), in m: G rollouts of each of E members of the ensemble that
+            models the controller; None where the VUT never arrived.
+        p_twin: failure probability by these gaps.
+        p_surrogate: failure probability by the surrogate of the outcomes.
+        p_fail: failure probability by both.
+    """
+
+    dx_m: tuple[tuple[float | None, ...], ...]
+    p_twin: Chance
+    p_surrogate: Chance
+    p_fail: Chance
+
+    @classmethod
+    def of(cls, dx_m: FloatArray, p_twin: float, p_surrogate: float, p_fail: float) -> Self:
+        """Return a rounded prediction.
+
+        Args:
+            dx_m: signed gaps at M, (E, G), in m; NaN where the VUT never arrived.
+            p_twin: failure probability by the gaps.
+            p_surrogate: failure probability by the surrogate.
+            p_fail: failure probability by both.
+        """
+        gaps = []
+        for row in np.round(dx_m, _DIGITS).tolist():
+            gaps.append(tuple(None if math.isnan(gap) else gap for gap in row))
+        chances = (round(float(p), _DIGITS) for p in (p_twin, p_surrogate, p_fail))
+        return cls(tuple(gaps), *chances)
+
+    @property
+    def gaps_m(self) -> FloatArray:
+        """The gaps, (E, G), in m; NaN where the VUT never arrived."""
+        return np.array(self.dx_m, dtype=np.float64)
+
+    def __post_init__(self) -> None:
+        """Check that every member has the same number of gaps.
+
+        Raises:
+            UserError: a member has none, or another number than the first.
+        """
+        counts = {len(row) for row in self.dx_m}
+        if len(counts) != 1 or 0 in counts:
+            raise UserError("dx_m must have the same number of gaps, 1 or more, for every member")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """The result of a case: its measures and its margin.
+
+    Attributes:
+        index: place of the case in its campaign.
+        batch: batch in which the case ran.
+        case: the case.
+        measures: the measures of its episode.
+        prediction: the prediction before it ran, if there was one.
+        margin: distance from failing under the criterion of the campaign, without a unit; below 0
+            for a failure. By default that of the score P. None after an error.
+
+    Example:
+        >>> outcome = ms.run(vut="design2", level=1, x_pov0_m=-290, v_pov0_mps=30).outcome
+        >>> outcome.failed, outcome.margin, outcome.measures.ttc_s
+    """
+
+    index: int
+    batch: int
+    case: Case
+    measures: Measures
+    prediction: Prediction | None = None
+    margin: float | None = None
+
+    def __post_init__(self) -> None:
+        """Take the margin of the score by default."""
+        if self.margin is None:
+            object.__setattr__(self, "margin", margin_of(self.measures.score))
+
+    @property
+    def failed(self) -> bool:
+        """Whether the case is a failure of the VUT: its margin is below 0."""
+        return self.margin is not None and self.margin < 0.0
+
+    @property
+    def is_by_score(self) -> bool:
+        """Whether the margin is that of the score."""
+        return self.margin == margin_of(self.measures.score)
+
+    @property
+    def is_tested(self) -> bool:
+        """Whether the VUT reached the merge point or failed; other cases are not judged."""
+        return self.measures.end.is_tested or self.failed
+
+    @property
+    def signed_gap(self) -> float | None:
+        """The gap at M in units of the scenario's limit; a case fails within -1 to 1.
+
+        Under another criterion than the paper's, the margin m is expressed as such a gap: 1 + m for
+        m >= 0, and 1 / (1 - m) for m < 0. Negative where the VUT goes first. None after an error,
+        and without a gap under the paper's criterion.
+        """
+        dx_m, margin = self.measures.dx_m, self.margin
+        if margin is None or self.is_by_score:
+            return None if dx_m is None else dx_m / self.case.scenario.dx_crash_m
+        gap = 1.0 + margin if margin >= 0.0 else 1.0 / (1.0 - margin)
+        return -gap if dx_m is not None and dx_m < 0.0 else gap
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the line of `outcomes.jsonl`: flat, with units in the names."""
+        scenario = self.case.scenario
+        record: dict[str, Any] = {"index": self.index, "batch": self.batch}
+        for name in ("level", *scenario.case_fields):
+            record[name] = getattr(self.case, name)
+        if self.case.draw:
+            record["draw"] = self.case.draw
+        for name in measures_in(scenario):
+            record[name] = self.measures.value(name)
+        if not self.is_by_score:
+            record["margin"] = self.margin
+        if self.prediction is not None:
+            record["foretold"] = to_plain(self.prediction)
+        return record
+
+    @classmethod
+    def from_json(cls, line: bytes | str, scenario: Scenario) -> Outcome:
+        """Return the outcome of a line of `outcomes.jsonl`.
+
+        Args:
+            line: the line.
+            scenario: scenario of the campaign.
+
+        Raises:
+            UserError: the line is not such a record.
+        """
+        known = convert(decode(line), record_of(scenario))
+        coordinates = {name: getattr(known, name) for name in ("level", *scenario.case_fields)}
+        case = Case(**coordinates, draw=known.draw, scenario=scenario)
+        measures = Measures(**{name: getattr(known, name) for name in measures_in(scenario)})
+        return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
+
+
+@lru_cache
+def record_of(scenario: Scenario) -> Any:
+    """Return the type of the lines of `outcomes.jsonl` in a scenario."""
+    types = {"index": int, "batch": int, **get_type_hints(Case)}
+    required = [(name, types[name]) for name in ("index", "batch", "level", *scenario.case_fields)]
+    optional: list[tuple[str, Any, Any]] = []
+    for name, one in measures_in(scenario).items():
+        if name in OURS and one.only_with != FOLLOW_UP:
+            required.append((name, get_type_hints(one.of)["return"]))
+        else:
+            optional.append((name, float | None, None))
+    optional += [
+        ("draw", int, 0),
+        ("margin", float | None, None),
+        ("foretold", Prediction | None, None),
+    ]
+    return record_type("outcome", [*required, *optional])
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A simulated case: its outcome and its trajectory.
+
+    Attributes:
+        outcome: the outcome.
+        trajectory: the motion of all vehicles.
+        files: hashes of the user's files that the VUT has loaded, by path.
+        pov_files: hashes of those that the user's POV has loaded.
+        again: whether the case was retried after the death of a process.
+        in_sumo: whether SUMO ran the case, whichever engine the plan has.
+        earlier: the same case with the earlier version, in a campaign against one.
+    """
+
+    outcome: Outcome
+    trajectory: Trajectory
+    files: Files = field(default_factory=dict)
+    pov_files: Files = field(default_factory=dict)
+    again: bool = False
+    in_sumo: bool = True
+    earlier: Episode | None = None
+
+    def at(self, index: int, batch: int, prediction: Prediction | None = None) -> Episode:
+        """Return the episode at a place in a campaign.
+
+        Args:
+            index: place of the case.
+            batch: its batch.
+            prediction: its prediction; with two versions it is recorded with the earlier one.
+        """
+        earlier = self.earlier
+        if earlier is not None:
+            earlier, prediction = earlier.at(index, batch, prediction), None
+        outcome = replace(self.outcome, index=index, batch=batch, prediction=prediction)
+        return replace(self, outcome=outcome, earlier=earlier)
