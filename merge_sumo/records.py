@@ -152,8 +152,8 @@ def check_fields(value: Any) -> None:
             raise RecordError(_not_a_value(name, known, hint, str(error))) from error
 
 
-def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int, T]:
-    """Return the lines of a JSON-lines file by their `index`; nothing without the file.
+def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> list[T]:
+    """Return the lines of a JSON-lines file of cases; nothing without the file.
 
     Args:
         path: the file.
@@ -161,25 +161,28 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> dict[int
         indices: those that a line may have.
 
     Raises:
-        RecordError: a line is not of that kind, or has another index or that of an earlier line.
+        RecordError: a line is not of that kind, or has another index, or is of the
+            case and the VUT of an earlier line.
     """
     try:
         lines = regular(path).read_bytes().splitlines()
     except FileNotFoundError:
-        return {}
+        return []
     except OSError as error:
         raise RecordError(f"{path} cannot be read: {error.strerror}") from error
-    values: dict[int, T] = {}
+    values: dict[Any, T] = {}
     for number, line in enumerate(lines, start=1):
         try:
             value: Any = convert(decode(line, dict[str, Any]), kind)
-            if value.index not in indices or value.index in values:
+            # A case may have a line for each VUT.
+            key = value.index, getattr(value, "vut", None)
+            if value.index not in indices or key in values:
                 raise RecordError(f"it is of case {value.index}, of which no such line can be")
         except UserError as error:
             line_of = f"line {number} of {path}"
             raise RecordError(f"{line_of} is not as it was written: {error}") from error
-        values[value.index] = value
-    return values
+        values[key] = value
+    return list(values.values())
 
 
 def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:

@@ -103,8 +103,8 @@ AVOIDANCE: Final = StudyFile("avoidance.jsonl", Avoidance)
 
 def causes(run: Run, outcomes: Sequence[Outcome]) -> dict[int, str]:
     """Return by index the causes of cases of a campaign, with the drivers that would help."""
-    known, motions = AVOIDANCE.read_lines(run), run.trajectories(o.index for o in outcomes)
-    clauses = {index: found.clause for index, found in known.items()}
+    motions = run.trajectories(outcome.index for outcome in outcomes)
+    clauses = {one.index: one.clause for one in AVOIDANCE.read_lines(run)}
     return {o.index: cause(o, motions.get(o.index), clauses.get(o.index, "")) for o in outcomes}
 
 

@@ -52,8 +52,8 @@ class StudyFile(Generic[R]):
         """Write the record, in the place of an older one."""
         replace_own(folder / self.name, to_json(record, indent=1), self._mark)
 
-    def read_lines(self, run: Run) -> dict[int, R]:
-        """Read the lines by index; `UserError` for one that is not of a failure of the campaign."""
+    def read_lines(self, run: Run) -> list[R]:
+        """Read the lines; `UserError` for one that is not of a failure of the campaign."""
         failing = {outcome.index for outcome in run.outcomes if outcome.failed}
         return read_indexed(run.folder / self.name, self.kind, failing)
 

@@ -165,8 +165,7 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 def read_repeats(run: Run) -> list[Repeat]:
     """Return what a folder says of cases that ran twice; `UserError` for a wrong line."""
-    known = read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
-    return list(known.values())
+    return read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
 
 
 def unrepeatable(found: Iterable[Repeat]) -> str | None:

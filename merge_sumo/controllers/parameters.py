@@ -61,7 +61,8 @@ def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, 
         if name in values:
             raise UserError(f"`params` {name} is given twice: give each parameter once")
         if name not in known and controller.vut_type is not None:
-            named = quoted(str(controller.spec.with_values({name: each.low})))
+            middle = round((each.low + each.high) / 2.0, each.digits)
+            named = quoted(str(controller.spec.with_values({name: middle})))
             raise UserError(
                 f"`params` {name}: its value today is not known; name it, as in `vut` {named}"
             )

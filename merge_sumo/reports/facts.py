@@ -314,7 +314,7 @@ def _motion(run: Run, unsure: set[int]) -> Iterator[Fact]:
 
 
 def _avoided(run: Run, unsure: set[int]) -> Iterator[Fact]:
-    known = [one for index, one in AVOIDANCE.read_lines(run).items() if index not in unsure]
+    known = [one for one in AVOIDANCE.read_lines(run) if one.index not in unsure]
     if not known:
         return
     if len(known) < sum(outcome.failed for outcome in run.cases) - len(unsure):

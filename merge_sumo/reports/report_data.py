@@ -16,6 +16,7 @@ from merge_sumo.metrics.measures import Measure, measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import RunsOfCase, shortened
+from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
@@ -139,18 +140,23 @@ def _runs(of: RunsOfCase | None) -> dict[str, Any] | None:
 
 def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
     """Return by index the words on a failure, and its axes with a title each."""
-    found = {}
-    for index, known in model.explanations.items():
-        outcome = model.run.outcome(index)
-        titles = [
-            *(name_and_unit(outcome.case, axis.name) for axis in known.start),
-            *((f"vut: {axis.name}", "") for axis in known.parameters),
-        ]
-        axes = zip(titles, (*known.start, *known.parameters), strict=True)
-        found[index] = {
-            "words": list(changes(known, outcome.case)),
-            "axes": [{**to_plain(axis), "name": name, "unit": unit} for (name, unit), axis in axes],
-        }
+    found: dict[int, dict[str, Any]] = {}
+    for known in model.explanations:
+        case = model.run.outcome(known.index).case
+        words = list(changes(known, case))
+        axes = []
+        for axis in known.start:
+            name, unit = name_and_unit(case, axis.name)
+            axes.append({**to_plain(axis), "name": name, "unit": unit})
+        for axis in known.parameters:
+            axes.append({**to_plain(axis), "name": f"vut: {axis.name}", "unit": ""})
+        if known.vut is not None:
+            vut = printable(known.vut)
+            words = [f"with {vut}: {sentence}" for sentence in words]
+            axes = [{**axis, "name": f"{vut}: {axis['name']}"} for axis in axes]
+        of_case = found.setdefault(known.index, {"words": [], "axes": []})
+        of_case["words"] += words
+        of_case["axes"] += axes
     return found
 
 

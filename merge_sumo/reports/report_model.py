@@ -102,7 +102,7 @@ class ReportModel:
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
         self.stress = STRESS.read(run.folder)
-        self.avoidance = AVOIDANCE.read_lines(run)
+        self.avoidance = {one.index: one for one in AVOIDANCE.read_lines(run)}
         self.explanations = EXPLANATIONS.read_lines(run)
         self.against = compare_against(run)
         self._choose_cases()

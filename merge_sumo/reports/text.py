@@ -377,9 +377,9 @@ def explanation(result: ExplanationResult) -> list[str]:
     for sentence in causes(run, [outcome]).values():
         lines.append(f"  {sentence}")
     options: dict[str, Any] = {}
-    if result.vut != run.settings.vut:
-        options["vut"] = result.vut
-        lines.append(f"  so far {printable(run.settings.vut)}; with {printable(result.vut)}:")
+    if found.vut is not None:
+        options["vut"] = found.vut
+        lines.append(f"  so far {printable(run.settings.vut)}; with {printable(found.vut)}:")
     for sentence in changes(found, outcome.case):
         lines.append(f"  {sentence}")
     if found.nearest_start is not None:

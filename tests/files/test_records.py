@@ -102,9 +102,9 @@ def test_any_value_is_a_record_or_a_sentence(record):
 
 def test_lines_are_read_by_their_index(tmp_path):
     path = tmp_path / "cars.jsonl"
-    assert read_indexed(path, Car, range(3)) == {}
+    assert read_indexed(path, Car, range(3)) == []
     path.write_text('{"index": 2}\n{"index": 0, "colour": "blue"}\n')
-    assert read_indexed(path, Car, range(3)) == {2: Car(2), 0: Car(0, colour=Colour.BLUE)}
+    assert read_indexed(path, Car, range(3)) == [Car(2), Car(0, colour=Colour.BLUE)]
     for line in ('{"index": 2}', '{"index": 3}', "{", '{"index": 1, "more": 1}'):
         path.write_text('{"index": 2}\n' + line)
         with pytest.raises(UserError, match=r"line 2 of .*cars\.jsonl"):
