@@ -4,39 +4,36 @@ from __future__ import annotations
 
 from contextlib import chdir, suppress
 from functools import cached_property
-from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
-from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.controllers.spec import ControllerOptions, ControllerSpec, FileKind
 from merge_sumo.errors import UserError
-from merge_sumo.files import check_code
 from merge_sumo.printable import either
 from merge_sumo.scenario.scenario import DT_S
 
-INPUTS: Final = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
-OUTPUT: Final = "acceleration_mps2"
-REACHED: Final = "v_mps"
-"""An output in the place of the acceleration: the speed that the vehicle has after the step."""
-MERGE: Final = "merge"
-SEED: Final = "seed"
-"""What a unit need not have: an output, whether to merge, and an input or a parameter."""
-NAMES: Final = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
-_FLOATS: Final = ("Real", "Float64", "Float32")
-_INTEGERS: Final = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
+INPUTS = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
+OUTPUT = "acceleration_mps2"
+REACHED = "v_mps"
+"""An output that replaces the acceleration: the speed of the vehicle after the step."""
+MERGE = "merge"
+SEED = "seed"
+"""Optional variables: an output, whether to merge, and an input or a parameter."""
+FLOATS = ("Real", "Float64", "Float32")
+INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
 
 
-class FmuKind(ControllerKind):
+class FmuKind(FileKind):
     """A unit: `fmu:FILE?x_vut_m=NAME&...`.
 
-    An input that the unit does not have is not set, if at least one is there and none of the
-    missing ones was named; an output must be there, the speed reached or else the acceleration. A
-    spec that names the acceleration alone has it read. Whether to merge and the seed may be there.
+    An input that the unit does not have is not set, if at least one is there and the spec names
+    none of the missing ones. An output must be there, the speed reached or else the acceleration;
+    a spec that names the acceleration alone selects it.
 
     Attributes:
         version: first digit of the version of FMI.
-        inputs: indices in the state and references, by type: a unit takes those of a type at once.
+        inputs: index in the state and variable of each input.
         output: variable of the acceleration, or of the speed reached.
         reaches: whether the output is the speed reached.
         wish: variable of whether to merge, if there is one.
@@ -47,44 +44,40 @@ class FmuKind(ControllerKind):
     what = "an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables"
     example = '--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"'
     no_parameters = "the options of an FMU are the names of its variables"
-    hosted, asks_sumo = True, False
+    library = "fmpy"
+    names = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Read the description of the unit; `UserError` for one that cannot drive."""
         super().__init__(spec, options)
-        self._names, path = dict(spec.parameters), Path(spec.argument)
-        if unknown := set(self._names) - set(NAMES):
-            raise UserError(
-                f"{spec}: there is no variable {unknown.pop()!r} to name: choose from "
-                f"{', '.join(NAMES)}"
-            )
-        check_code(path)
-        self.code, self._instances = (path,), 0
-        self._description: Any = _description(path)
-        self.version = str(self._description.fmiVersion)[0]
-        once = str(self._description.coSimulation.canBeInstantiatedOnlyOncePerProcess)
-        self.max_corridors = 1 if once == "True" else None
+        path = self.path
+        try:
+            self._description = self.api.read_model_description(str(path))
+        except Exception as error:  # of many classes: XML, zip, FMPy's own
+            raise UserError(f"{path} is not a readable FMU: {str(error)[:200]}") from error
+        simulation, version = self._description.coSimulation, str(self._description.fmiVersion)
+        if simulation is None or version[0] not in "23":
+            raise UserError(f"{path}: export it as an FMU for co-simulation by FMI 2.0 or 3.0")
+        self.version, self._instances = version[0], 0
+        if str(simulation.canBeInstantiatedOnlyOncePerProcess) == "True":
+            self.max_corridors = 1
         self._variables = {each.name: each for each in self._description.modelVariables}
-        self.inputs: dict[str, tuple[list[int], list[int]]] = {}
+        self.inputs: list[tuple[int, Any]] = []
         for index, key in enumerate(INPUTS):
-            if key not in self._names and key not in self._variables:
-                continue
-            variable = self._checked(key)
-            indices, references = self.inputs.setdefault(variable.type, ([], []))
-            indices.append(index)
-            references.append(variable.valueReference)
+            if key in self.chosen or key in self._variables:
+                self.inputs.append((index, self._variable(key)))
         if not self.inputs:
             raise UserError(
                 f"{path} has none of the inputs {', '.join(INPUTS)}: name its own, as in "
                 f"fmu:{path}?v_vut_mps=NAME"
             )
         reached = None
-        if REACHED in self._names or OUTPUT not in self._names:
-            reached = self._optional(REACHED, ("output",), _FLOATS)
+        if REACHED in self.chosen or OUTPUT not in self.chosen:
+            reached = self._optional(REACHED, ("output",), FLOATS)
         self.reaches = reached is not None
-        self.output = reached or self._checked(OUTPUT)
-        self.wish = self._optional(MERGE, ("output",), (*_FLOATS, "Boolean"))
-        self.seed = self._optional(SEED, ("input", "parameter"), (*_FLOATS, *_INTEGERS))
+        self.output = reached or self._variable(OUTPUT)
+        self.wish = self._optional(MERGE, ("output",), (*FLOATS, "Boolean"))
+        self.seed = self._optional(SEED, ("input", "parameter"), (*FLOATS, *INTEGERS))
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
@@ -99,63 +92,48 @@ class FmuKind(ControllerKind):
             from fmpy.fmi3 import FMU3Slave as Slave
         # FMPy goes to the folder of the binary and, when that cannot be loaded, stays there.
         with chdir("."):
-            made: Any = Slave(
+            instance: Any = Slave(
                 guid=self._description.guid,
                 unzipDirectory=self._folder.name,
                 modelIdentifier=self._description.coSimulation.modelIdentifier,
                 instanceName=f"vut{self._instances}",
             )
-        made.instantiate()
-        return made
+        instance.instantiate()
+        return instance
 
     @cached_property
     def _folder(self) -> TemporaryDirectory[str]:
         """The unpacked unit, which is removed with this object."""
-        import fmpy
-
         folder = TemporaryDirectory(prefix="merge-sumo-fmu-", ignore_cleanup_errors=True)
-        fmpy.extract(str(self.code[0]), folder.name)
+        self.api.extract(str(self.path), folder.name)
         return folder
 
     def _optional(self, key: str, causalities: tuple[str, ...], types: tuple[str, ...]) -> Any:
-        """Return a variable that is named, or there by its own name; None for neither."""
-        own = getattr(self._variables.get(key), "causality", None)
-        return self._checked(key, types) if key in self._names or own in causalities else None
+        """Return a variable that the spec names, or that has the name `key`; None for neither.
 
-    def _checked(self, key: str, types: tuple[str, ...] = _FLOATS) -> Any:
-        """Return a variable that is of one of some types; `UserError` when it is not."""
-        name, path = self._names.get(key, key), self.code[0]
+        Args:
+            key: our name of the variable.
+            causalities: causalities that it may have where the spec does not name it.
+            types: types that it may have.
+        """
+        own = getattr(self._variables.get(key), "causality", None)
+        if key in self.chosen or own in causalities:
+            return self._variable(key, types)
+        return None
+
+    def _variable(self, key: str, types: tuple[str, ...] = FLOATS) -> Any:
+        """Return the variable of one of our names; `UserError` where it is not of some types."""
+        name = self.chosen.get(key, key)
         variable = self._variables.get(name)
         if variable is None:
             names = ", ".join(sorted(self._variables)[:12])
-            raise UserError(f"{path} has no variable {name!r}; it has {names}")
-        if variable.type not in types:
+            raise UserError(f"{self.path} has no variable {name!r}; it has {names}")
+        if variable.type not in types or variable.dimensions:
+            kind = "an array" if variable.dimensions else f"a {variable.type}"
             raise UserError(
-                f"the variable {name!r} of {path} is a {variable.type}: it must be a "
-                f"{either(types)}"
+                f"the variable {name!r} of {self.path} is {kind}: it must be a {either(types)}"
             )
-        if variable.dimensions:
-            raise UserError(f"the variable {name!r} of {path} is an array: name a number")
         return variable
-
-
-def _description(path: Path) -> Any:
-    """Return the description of a unit for co-simulation."""
-    try:
-        import fmpy
-    except ImportError as error:
-        raise UserError("an FMU needs FMPy: run `pip install 'merge-sumo[fmu]'`") from error
-    if not path.is_file():
-        raise UserError(f"there is no FMU {path}")
-    try:
-        description = fmpy.read_model_description(str(path))
-    except Exception as error:  # of many classes: XML, zip, FMPy's own
-        raise UserError(f"{path} is no readable FMU: {str(error)[:200]}") from error
-    if description.coSimulation is None:
-        raise UserError(f"{path} has no co-simulation: export it as an FMU for co-simulation")
-    if str(description.fmiVersion)[0] not in "23":
-        raise UserError(f"{path} is of FMI {description.fmiVersion}: export it as FMI 2.0 or 3.0")
-    return description
 
 
 class FmuController(Controller):
@@ -163,41 +141,42 @@ class FmuController(Controller):
 
     def __init__(self, unit: FmuKind) -> None:
         """Make an instance; `UserError` when that cannot be."""
-        self._unit, self._ran = unit, False
+        self._unit, self._has_run = unit, False
         try:
             self._instance = unit.instance()
         except Exception as error:  # of FMPy or of the loader of the binary
-            raise UserError(f"the FMU cannot be made: {error}") from error
+            raise UserError(f"the FMU cannot be instantiated: {error}") from error
 
     def reset(self, start: Start) -> None:
         """Initialise the instance at t = 0 with the state at the start."""
         instance = self._instance
-        if self._ran:
+        if self._has_run:
             instance.reset()
-        self._ran = True
+        self._has_run = True
         if self._unit.version == "2":
             instance.setupExperiment(startTime=0.0)
             instance.enterInitializationMode()
         else:
             instance.enterInitializationMode(startTime=0.0)
-        self._set(start.seen)
-        if (taken := self._unit.seed) is not None:
+        self._set_state(start.seen)
+        variable = self._unit.seed
+        if variable is not None:
             # A signed integer of 32 bits has no room for all seeds.
-            seed = float(start.seed) if taken.type in _FLOATS else start.seed % 2**31
-            getattr(instance, f"set{taken.type}")([taken.valueReference], [seed])
+            is_float = variable.type in FLOATS
+            self._set(variable, float(start.seed) if is_float else start.seed % 2**31)
         instance.exitInitializationMode()
 
     def act(self, seen: Seen) -> float | tuple[float, bool]:
         """Return the outputs after a step with the state held."""
         unit = self._unit
-        self._set(seen)
+        self._set_state(seen)
         self._instance.doStep(seen.t_s, DT_S)
-        acceleration = self._value(unit.output)
+        acceleration_mps2 = self._value(unit.output)
         if unit.reaches:
-            acceleration = (acceleration - seen.v_vut_mps) / DT_S
+            acceleration_mps2 = (acceleration_mps2 - seen.v_vut_mps) / DT_S
         if unit.wish is None:
-            return acceleration
-        return acceleration, as_merge(self._value(unit.wish))
+            return acceleration_mps2
+        return acceleration_mps2, as_merge(self._value(unit.wish))
 
     def close(self) -> None:
         """Free the instance."""
@@ -205,10 +184,13 @@ class FmuController(Controller):
             self._instance.terminate()
         self._instance.freeInstance()
 
-    def _set(self, seen: Seen) -> None:
-        for kind, (indices, references) in self._unit.inputs.items():
-            set_all = getattr(self._instance, f"set{kind}")
-            set_all(references, [seen[1 + index] for index in indices])
+    def _set_state(self, seen: Seen) -> None:
+        for index, variable in self._unit.inputs:
+            self._set(variable, seen[1 + index])
+
+    def _set(self, variable: Any, value: float) -> None:
+        """Set a variable, which FMPy does by its type."""
+        getattr(self._instance, f"set{variable.type}")([variable.valueReference], [value])
 
     def _value(self, variable: Any) -> float:
         """Return the value of a variable, which FMPy reads by its type."""

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from numbers import Real
 from pathlib import Path
 from typing import Any, ClassVar, Final, Self
@@ -20,7 +21,7 @@ import msgspec
 from merge_sumo.controllers.controller import Controller, ControllerArray
 from merge_sumo.drivers.base import Driver
 from merge_sumo.errors import UserError
-from merge_sumo.files import Files, hashed
+from merge_sumo.files import Files, check_code, hashed
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
 from merge_sumo.workers import workers_or_cores
@@ -244,6 +245,39 @@ class ControllerKind:
             return dict(self.settable)
         with closing(self.open(1)) as driver:
             return dict(driver.parameters())
+
+
+class FileKind(ControllerKind):
+    """A model in a file, which a library runs in the process of the controller: KIND:FILE.
+
+    Attributes:
+        library: the module of the library, which the extra of the kind's name installs.
+        names: the parameters that a spec may have.
+        api: the library.
+        path: the file.
+        chosen: the parameters of the spec.
+    """
+
+    library: ClassVar[str]
+    names: ClassVar[tuple[str, ...]]
+    hosted, asks_sumo = True, False
+
+    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+        """Import the library and check the file; `UserError` where either cannot be used."""
+        super().__init__(spec, options)
+        self.path, self.chosen = Path(spec.argument), dict(spec.parameters)
+        for name in self.chosen:
+            if name not in self.names:
+                raise spec.has_no(name, self.names)
+        try:
+            self.api: Any = import_module(self.library)
+        except ImportError as error:
+            extra = f"pip install 'merge-sumo[{spec.kind}]'"
+            raise UserError(f"{spec} needs {self.library}: run `{extra}`") from error
+        if not self.path.is_file():
+            raise UserError(f"{spec}: there is no such file")
+        check_code(self.path)
+        self.code = (self.path,)
 
 
 def _loaded(

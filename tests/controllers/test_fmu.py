@@ -111,13 +111,13 @@ def test_what_is_no_such_unit_is_refused_in_a_sentence(unit, tmp_path):
         described = described.replace(f"<Float64 {head}/>", array)
         archive.writestr("modelDescription.xml", described)
     for spec, said in {
-        tmp_path / "nothing.fmu": "there is no FMU",
-        tmp_path / "text.fmu": "is no readable FMU",
-        tmp_path / "array.fmu": "is an array: name a number",
+        tmp_path / "nothing.fmu": "there is no such file",
+        tmp_path / "text.fmu": "is not a readable FMU",
+        tmp_path / "array.fmu": "is an array: it must be a Real",
         other: "has none of the inputs",
         f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",
         f"{good}?v_vut_mps=wrong": "has no variable 'wrong'",
-        f"{good}?speed=v": "there is no variable 'speed' to name",
+        f"{good}?speed=v": "it has no parameter 'speed': choose from acceleration_mps2",
         f"{good}?merge=nothing": "has no variable 'nothing'",
     }.items():
         with pytest.raises(UserError, match=r"fmu|FMU") as refused:

@@ -90,18 +90,18 @@ def test_what_is_no_such_network_is_refused_in_a_sentence(tmp_path):
     network(tmp_path / "truth.onnx", answer=[0.0], last="IsNaN")
     good = network(tmp_path / "good.onnx", answer=[0.0])
     for spec, said in {
-        tmp_path / "nothing.onnx": "there is no ONNX file",
-        tmp_path / "text.onnx": "is no ONNX network that can be run",
+        tmp_path / "nothing.onnx": "there is no such file",
+        tmp_path / "text.onnx": "is not a usable ONNX network",
         tmp_path / "wide.onnx": "a VUT has one of floats",
         tmp_path / "three.onnx": "gives 3 numbers",
-        tmp_path / "word.onnx": "has the input seed tensor(int32) [1]: it is one number",
-        tmp_path / "pair.onnx": "has the input seed tensor(int64) [2]: it is one number",
-        tmp_path / "flat.onnx": "cannot be run with an input (1, 4)",
-        tmp_path / "index.onnx": "gives answer tensor(int64), and a VUT gives floats: the index of",
-        tmp_path / "truth.onnx": "gives answer tensor(bool), and a VUT gives floats",
+        tmp_path / "word.onnx": "has the input seed tensor(int32) [1]: it must be one number",
+        tmp_path / "pair.onnx": "has the input seed tensor(int64) [2]: it must be one number",
+        tmp_path / "flat.onnx": "does not run with an input (1, 4)",
+        tmp_path / "index.onnx": "gives int64, and a VUT gives floats: the index of",
+        tmp_path / "truth.onnx": "gives bool, and a VUT gives floats",
         f"{good}?decision_period_s=0": "decision_period_s is '0'",
         f"{good}?decision_period_s=often": "decision_period_s is 'often'",
-        f"{good}?period=1": "there is no option 'period'",
+        f"{good}?period=1": "it has no parameter 'period': choose from decision_period_s",
     }.items():
         with pytest.raises(UserError, match=r"onnx|ONNX") as refused:
             in_process(f"onnx:{spec}")
