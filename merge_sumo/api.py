@@ -116,6 +116,9 @@ if TYPE_CHECKING:
 
 __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch", "dated"]
 
+FEW_CASES = 1000
+"""Cases of built-in drivers that one process runs before others have started and share them."""
+
 P = ParamSpec("P")
 C = TypeVar("C")
 R = TypeVar("R")
@@ -573,8 +576,11 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
+    requested = where.workers
+    if requested is None and settings.cases <= FEW_CASES and not settings.may_vary:
+        requested = 1
     try:
-        workers = open_workers(plan.workers(where.workers))
+        workers = open_workers(plan.workers(requested))
         with workers, bars, RunningReport(folder) as report:
             begun_s = perf_counter()
             done = run_campaign(

@@ -131,8 +131,9 @@ class Execution:
     """Where it runs."""
 
     workers: int | str | None = 1
-    """Processes that run cases, auto for one a core, or a Dask scheduler, tcp://HOST:PORT; the
-    outcomes are the same. By default auto for a command, and 1 in Python."""
+    """Processes that run cases, auto for one a core (one in all for a campaign of up to 1,000 cases
+    of built-in drivers), or a Dask scheduler, tcp://HOST:PORT; the outcomes are the same. By
+    default auto for a command, and 1 in Python."""
     progress: bool | None = None
     """Show progress; by default in a notebook and on a terminal."""
 

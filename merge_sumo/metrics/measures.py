@@ -140,7 +140,7 @@ class Measures:
     is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
     bumper gap, braking after M, impact speed) is that of all cars.
 
-    A measure is computed when it is read first; `of` computes all. Recorded ones have no
+    A measure is computed when it is read first, or by `compute_all`. Recorded ones have no
     trajectory.
 
     Attributes:
@@ -164,7 +164,14 @@ class Measures:
     @classmethod
     def of(cls, trajectory: Trajectory, lines: CentreLines | None = None) -> Measures:
         """Return all measures of an episode."""
-        return measure_all([trajectory], lines)[0]
+        (measures,) = measures_of([trajectory], lines)
+        measures.compute_all()
+        return measures
+
+    def compute_all(self) -> None:
+        """Compute the measures that were not read yet."""
+        for name in known_measures():
+            self.value(name)
 
     def value(self, name: str) -> Any:
         """Return the value of a measure, of this package or another; None where it has none."""
@@ -577,25 +584,21 @@ def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
     return {name: one for name, one in known_measures().items() if there[one.only_with]}
 
 
-def measure_all(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
-    """Return all measures of episodes of one scenario, which is faster than one by one.
+def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
+    """Return the measures of episodes of one scenario; those of bodies are computed together.
 
     Args:
         trajectories: what happened.
         lines: centre lines of the road; without them bodies are looked at from M on.
     """
-    found = [Measures(trajectory, lines) for trajectory in trajectories]
+    measures = [Measures(trajectory, lines) for trajectory in trajectories]
     if lines is not None:
         closest_m = closest_before_m(trajectories, lines)
-        for one, clearance_m in zip(found, closest_m, strict=True):
-            if not one.end.is_error:
-                one.values["before_clearance_m"] = (
-                    clearance_m if math.isfinite(clearance_m) else None
-                )
-    for one in found:
-        for name in known_measures():
-            one.value(name)
-    return found
+        for of_episode, clearance_m in zip(measures, closest_m, strict=True):
+            if not of_episode.end.is_error:
+                is_near = math.isfinite(clearance_m)
+                of_episode.values["before_clearance_m"] = clearance_m if is_near else None
+    return measures
 
 
 def sustained_brake_mps2(v_mps: FloatArray) -> float:

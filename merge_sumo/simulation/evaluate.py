@@ -16,7 +16,7 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import hashed
-from merge_sumo.metrics.measures import measure_all
+from merge_sumo.metrics.measures import measures_of
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case
@@ -56,7 +56,10 @@ def simulate(
         return both if keep is None else list(map(keep, both))
     with opened_simulator(plan) as simulator:
         trajectories = simulator.run(cases)
-        outcomes = _measured(plan, trajectories)
+        outcomes = _outcomes(plan, trajectories)
+        if keep is None:
+            for outcome in outcomes:
+                outcome.measures.compute_all()
         files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
         episodes = []
         for place, (outcome, trajectory) in enumerate(zip(outcomes, trajectories, strict=True)):
@@ -77,7 +80,7 @@ def lost(plan: SimulationPlan, case: Case) -> Episode:
     start = [[(x, v, 0.0) for x, v in case.starts()]]
     error = "its worker process died twice"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, error)
-    (outcome,) = _measured(plan, [trajectory])
+    (outcome,) = _outcomes(plan, [trajectory])
     episode = Episode(outcome, trajectory)
     return episode if plan.against is None else replace(episode, earlier=episode)
 
@@ -182,9 +185,9 @@ def _key(plan: SimulationPlan) -> tuple[object, ...]:
     return plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors, plan.substeps
 
 
-def _measured(plan: SimulationPlan, trajectories: Sequence[Trajectory]) -> list[Outcome]:
-    """Return the outcomes of trajectories."""
-    measured = measure_all(trajectories, centre_lines(plan.road))
+def _outcomes(plan: SimulationPlan, trajectories: Sequence[Trajectory]) -> list[Outcome]:
+    """Return the outcomes of trajectories; only the measures that judge them are computed."""
+    measured = measures_of(trajectories, centre_lines(plan.road))
     outcomes = []
     for place, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
         margin = plan.criterion.margin(trajectory, measures)
