@@ -37,7 +37,7 @@ from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.outcome import Episode
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.candidates import spread_out
-from merge_sumo.samplers.pair import ControllerModelPair
+from merge_sumo.samplers.controller_model import ControllerModelPair
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.simulation.evaluate import evaluate

@@ -22,8 +22,7 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.controller_model import ControllerModel
-from merge_sumo.samplers.pair import ControllerModelPair
+from merge_sumo.samplers.controller_model import ControllerModel, ControllerModelPair
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences

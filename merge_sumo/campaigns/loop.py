@@ -23,7 +23,7 @@ from typing import Final
 from merge_sumo.metrics.outcome import Episode, Outcome, Prediction
 from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.pair import ControllerModelPair
+from merge_sumo.samplers.controller_model import ControllerModelPair
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.simulation.evaluate import submit_cases
 from merge_sumo.simulation.plan import SimulationPlan

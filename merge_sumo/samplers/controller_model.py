@@ -1,50 +1,319 @@
-"""A model of the controller: an ensemble of trees that has learned what the VUT does.
+"""A model of the controller, which predicts the gaps of cases before they run.
 
-A controller is smooth here and jumps there, and what it decides by is not known: extremely
-randomised trees (Geurts et al., 2006) take both. Half of the members look at the present state
-alone, the others also at what was before. Each member has not seen every GROUPS-th case, so that
-members disagree where few cases tell.
+An ensemble of trees learns the accelerations of the VUT, and rolls cases out against the POVs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.drivers.following import car_met, keep_safe
+from merge_sumo.drivers.levelk import (
+    DECISION_STEPS,
+    QNetwork,
+    actions_mps2,
+    feature_columns,
+    prospects,
+)
+from merge_sumo.drivers.policies import load_network
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.merge import REACTION_S
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.samplers.observation import HISTORY, Inputs, Observation
-from merge_sumo.samplers.rollout import ModelRollout
-from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.scenario.scenario import VUT
-from merge_sumo.simulation.povs import Povs
+from merge_sumo.metrics.regression import regression_gaps
+from merge_sumo.scenario.case import Case, FloatArray, Pool
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
+from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.simulation.povs import POLICIES, Povs
 
-GROUPS: Final = 4
-"""Members that look at the same inputs."""
-MAX_FEATURES: Final = 0.5
-"""Share of the inputs among which each node of a tree chooses."""
-FEWEST: Final = 4
-"""Fewest cases to learn from."""
-AT_ONCE: Final = 100
-"""Cases up to which all members learn from every batch; later they take turns."""
-LEARNED: Final = 500
-"""Most cases that a member learns from: half of them the last ones, half spread before."""
-KEPT: Final = 4 * LEARNED
-"""Cases whose inputs are kept, which take four times the memory of the motion."""
+# Members of the ensemble with the same inputs.
+GROUPS = 4
+# Steps, 0.3, 0.6 and 1 s, after which a slow controller may react to a state.
+LAGS = (3, 6, 10)
+# Accelerations before the last one that are inputs.
+EARLIER = 4
+# Inputs of the past, at the end of each row.
+PAST_INPUTS = 4 + EARLIER + 4 * len(LAGS)
+# Distance of all other cars after the merge point, in units of the limit, from which a case cannot
+# fail.
+FAR = 5.0
 
-Steps = tuple[Inputs, FloatArray]
-"""Inputs of the VUT in the steps of a case, (T, inputs), and its accelerations, (T,), in m/s2."""
+Inputs = NDArray[np.float32]
+Drive = Callable[[Inputs], FloatArray]
+"""Gives accelerations of the VUT, (R,), for inputs, (R, inputs)."""
+
+
+class Observation:
+    """The inputs of the model in R episodes that advance together.
+
+    The first inputs are the state, the last acceleration, and the predictions that follow from
+    them. The last ones, `PAST_INPUTS`, describe the past: a controller with a delay or a memory
+    decides by it, too.
+
+    Example:
+        observation = Observation(US23, rows=1)
+        inputs = observation.step(x_m, v_mps, a_last_mps2)
+    """
+
+    def __init__(self, scenario: Scenario, rows: int) -> None:
+        """Begin `rows` episodes of a scenario."""
+        self._scenario = scenario
+        self._step = 0
+        self._past: deque[Inputs] = deque(maxlen=1 + max(LAGS))
+        self._since_jump = np.zeros(rows)
+        self._lowest = np.zeros(rows)
+        self._highest = np.zeros(rows)
+
+    def keep(self, rows: NDArray[np.bool_]) -> None:
+        """Drop all episodes but those where `rows`, (R,), is true."""
+        for lag, state in enumerate(self._past):
+            self._past[lag] = state[:, rows]
+        self._since_jump = self._since_jump[rows]
+        self._lowest = self._lowest[rows]
+        self._highest = self._highest[rows]
+
+    def step(self, x_m: FloatArray, v_mps: FloatArray, a_last_mps2: FloatArray) -> Inputs:
+        """Take the next states and return the inputs.
+
+        Args:
+            x_m: positions, (A, R).
+            v_mps: speeds, (A, R).
+            a_last_mps2: last accelerations of the VUT, (R,).
+
+        Returns:
+            (R, inputs).
+        """
+        scenario = self._scenario
+        x_pov, v_pov, x_vut, v_vut = x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT]
+        traffic = []
+        if len(x_m) > 2:
+            conflicting = car_met(x_m, v_mps, scenario.level0_a_mps2, scenario.level0_v_mps)
+            rows = np.arange(len(conflicting))
+            x_pov, v_pov = x_m[conflicting, rows], v_mps[conflicting, rows]
+            traffic.append(conflicting)
+            for car in (POV, AHEAD, BEHIND):
+                traffic += [x_m[car] - x_vut, v_mps[car]]
+        times_s, gaps_m, v_level0, v_full = prospects(x_pov, v_pov, x_vut, v_vut, scenario)
+        inputs = [a_last_mps2, x_pov - x_vut, v_pov - v_vut, x_pov, v_pov, x_vut, v_vut, *times_s]
+        for gap_m in gaps_m:
+            # Small gaps decide; larger ones are compressed beyond 80 m.
+            inputs.append(gap_m / (1.0 + np.abs(gap_m) / 80.0))
+        inputs += [v_level0, v_full, *traffic]
+
+        # Distance, closing speed, gap on the level-0 profile, speed and acceleration.
+        remembered = np.array([inputs[row] for row in (1, 2, 10, 6, 0)], dtype=np.float32)
+        past = self._past
+        while len(past) < max(LAGS):
+            past.append(remembered)
+        # A change of the acceleration within a step that is a new decision.
+        jumped = np.abs(remembered[4] - past[0][4]) > 0.25
+        past.appendleft(remembered)
+        self._since_jump = np.where(jumped, 0.0, self._since_jump + 1.0)
+        self._lowest = np.minimum(self._lowest, a_last_mps2)
+        self._highest = np.maximum(self._highest, a_last_mps2)
+        step = np.full_like(a_last_mps2, self._step)
+        inputs += [step, self._since_jump, self._lowest, self._highest]
+        for lag in range(1, 1 + EARLIER):
+            inputs.append(past[lag][4])
+        for lag in LAGS:
+            inputs += [*past[lag][:4]]
+        self._step += 1
+        return np.array(inputs, dtype=np.float32).T
+
+
+class ModelRollout:
+    """Rolls cases of a pool out by eq. (4), without SUMO, against the POVs of the levels.
+
+    Example:
+        ModelRollout(pool, povs).play({0: points}, [lambda inputs: np.zeros(len(inputs))])
+    """
+
+    def __init__(
+        self,
+        pool: Pool,
+        povs: Povs,
+        criterion: Criterion = PAPER_CRITERION,
+        lines: CentreLines | None = None,
+    ) -> None:
+        """Load the networks of the POVs.
+
+        Args:
+            pool: the cases.
+            povs: the drivers of the POV.
+            criterion: condition of a failure.
+            lines: centre lines of the road.
+        """
+        self._pool, self._scenario = pool, pool.scenario
+        self._criterion, self._lines = criterion, lines
+        self._networks: dict[int, QNetwork] = {}
+        for level in set(povs.levels) & set(POLICIES):
+            self._networks[level] = load_network(POLICIES[level], povs.policies)
+
+    def can_predict(self, level: int) -> bool:
+        """Return whether the POV of a level is known, and not a program of the user.
+
+        A rollout ends at M: none is possible where the VUT chooses the place of the merge.
+        """
+        known = level == 0 or level in self._networks
+        return known and self._scenario.lane_m is None
+
+    def play(self, points: Mapping[int, FloatArray], drives: Sequence[Drive]) -> FloatArray:
+        """Roll each case out with each controller; all advance together, as arrays.
+
+        Args:
+            points: cases of the unit cube by level, (n, d) each; N of all levels.
+            drives: the controllers.
+
+        Returns:
+            Signed gaps (`Outcome.signed_gap`), (controllers, N); NaN where the VUT never arrives.
+        """
+        cases: list[Case] = []
+        for level, of_level in points.items():
+            cases += self._pool.cases(of_level, level)
+        shape, cases = (len(drives), len(cases)), cases * len(drives)
+        if self._criterion.is_papers:
+            gaps_m, _ = self._play(cases, drives)
+            return gaps_m.reshape(shape) / self._scenario.dx_crash_m
+        steps = self._scenario.max_steps
+        motion = np.zeros((steps + 1, self._scenario.vehicles, 3, len(cases)))
+        gaps_m, last = self._play(cases, drives, motion)
+        gaps = np.empty(len(cases))
+        for row, case in enumerate(cases):
+            of_row = motion[: last[row] + 1, :, :, row].copy()
+            end, after = End.TIMEOUT, None
+            if not np.isnan(gaps_m[row]):
+                end, after = End.MERGED, self._follow_up(of_row[-1])
+            trajectory = Trajectory(case, of_row, end, after=after)
+            gaps[row] = self._criterion.judged(trajectory, self._lines).signed_gap
+        return gaps.reshape(shape)
+
+    def _follow_up(self, at_m: FloatArray) -> FloatArray | None:
+        """Predict the motion after a state at M, (A, 3): all keep their speeds for a reaction."""
+        steps = round(min(REACTION_S, self._scenario.follow_up_s) / DT_S)
+        after = np.tile(at_m, (steps + 1, 1, 1))
+        after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
+        return after if steps else None
+
+    def _play(
+        self, cases: Sequence[Case], drives: Sequence[Drive], motion: FloatArray | None = None
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Roll cases out, an equal number with each controller in turn.
+
+        Args:
+            cases: R cases.
+            drives: the controllers.
+            motion: filled with the states, (steps + 1, A, 3, R). Without it a case also ends where
+                it cannot fail any more.
+
+        Returns:
+            Gaps at M in m, (R,), NaN where the VUT never arrives, and last steps, (R,).
+        """
+        scenario = self._scenario
+        x_m, v_mps = np.array([case.starts() for case in cases]).T.copy()
+        a_mps2 = np.zeros_like(x_m)
+        levels = np.array([case.level for case in cases])
+        svo_rad = np.array([case.svo_rad or 0.0 for case in cases])
+        rows = np.arange(len(cases))
+        first_rows = np.arange(len(cases) // len(drives), len(cases), len(cases) // len(drives))
+        gap_m = np.full(len(cases), np.nan)
+        last = np.full(len(cases), scenario.max_steps)
+        cars = np.flatnonzero(np.arange(len(x_m)) != VUT)
+        held_mps2 = np.zeros((len(cars), len(cases)))
+        observation = Observation(scenario, len(cases))
+        for step in range(scenario.max_steps):
+            inputs = observation.step(x_m, v_mps, a_mps2[VUT])
+            if step % DECISION_STEPS == 0:
+                for level, network in self._networks.items():
+                    at = np.flatnonzero(levels[rows] == level)
+                    if len(at):
+                        held_mps2[:, at] = self._decisions(
+                            network, cars, x_m[:, at], v_mps[:, at], svo_rad[rows[at]]
+                        )
+            a_mps2[cars] = held_mps2
+            if len(cars) > 1:
+                taken_m = scenario.pov_length_m + scenario.min_gap_m
+                keep_safe(a_mps2, x_m, v_mps, taken_m, -scenario.a_min_mps2, scenario.tau_s)
+            parts = np.split(inputs, np.searchsorted(rows, first_rows))
+            for_vut = [np.ravel(drive(part)) for drive, part in zip(drives, parts, strict=True)]
+            a_mps2[VUT] = np.concatenate(for_vut)
+            a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
+            v_next_mps = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
+            # The recorded acceleration of a vehicle that comes to a stand.
+            a_mps2 = np.maximum(a_mps2, v_mps / -DT_S)
+            if motion is not None:
+                motion[step][:, :, rows] = np.stack((x_m, v_mps, a_mps2), axis=1)
+            x_m, v_mps = x_m + v_mps * DT_S, v_next_mps
+            ended = x_m[VUT] >= 0.0
+            if motion is None:
+                ended |= x_m[cars].min(axis=0) > FAR * scenario.dx_crash_m
+            else:
+                motion[step + 1][:, :2, rows] = np.stack((x_m, v_mps), axis=1)
+            if ended.any():
+                gap_m[rows[ended]] = _gap_at_merge_m(x_m[:, ended], v_mps[:, ended])
+                last[rows[ended]] = step + 1
+                going = ~ended
+                if not going.any():
+                    break
+                rows, held_mps2 = rows[going], held_mps2[:, going]
+                x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
+                observation.keep(going)
+        return gap_m, last
+
+    def _decisions(
+        self,
+        network: QNetwork,
+        cars: NDArray[np.int64],
+        x_m: FloatArray,
+        v_mps: FloatArray,
+        svo_rad: FloatArray,
+    ) -> FloatArray:
+        """Return the accelerations that the cars of the mainline choose, (C, R)."""
+        limited, count = network.limited(self._scenario), len(cars)
+        features = feature_columns(
+            x_m[cars].ravel(),
+            v_mps[cars].ravel(),
+            np.tile(x_m[VUT], count),
+            np.tile(v_mps[VUT], count),
+            np.tile(svo_rad, count) if network.sees_svo else None,
+            scenario=limited,
+        )
+        chosen = network.values_at_once(np.array(features).T).argmax(axis=1)
+        chosen_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
+        return chosen_mps2
+
+
+def _gap_at_merge_m(x_m: FloatArray, v_mps: FloatArray) -> FloatArray:
+    """Return the gap, (R,), to the car nearest to the VUT at M, in states (A, R).
+
+    A VUT that has not arrived keeps its speed, or 0.5 m/s where it stands.
+    """
+    left_s = np.maximum(-x_m[VUT], 0.0) / np.maximum(v_mps[VUT], 0.5)
+    gaps = np.delete(x_m + v_mps * left_s, VUT, axis=0) - np.maximum(x_m[VUT], 0.0)
+    nearest = np.abs(gaps).argmin(axis=0)
+    gap_m: FloatArray = gaps[nearest, np.arange(len(nearest))]
+    return gap_m
 
 
 class ControllerModel:
-    """Learns from the motions of a campaign; see `Predictor`.
+    """An ensemble of trees that learns from the motions of a campaign; see `Predictor`.
 
-    Its predictions are a pure function of the outcomes, whatever their order. All levels of a
-    campaign teach the same model.
+    A controller is smooth in some regions and jumps in others, and its inputs are unknown:
+    extremely randomised trees (Geurts et al., 2006) fit both. Half of the members see the present
+    state alone, the others also the past. Each member leaves out every GROUPS-th case, so that
+    members disagree where cases are few.
+
+    Its predictions are a pure function of the outcomes, whatever their order. The cases of all
+    levels train the same model.
+
+    Example:
+        model = ControllerModel(pool, povs, seed=1)
+        model.tell(outcomes, motions)
+        gaps = model.predict({0: points})[0]
     """
 
     members = 2 * GROUPS
@@ -57,28 +326,26 @@ class ControllerModel:
         criterion: Criterion = PAPER_CRITERION,
         lines: CentreLines | None = None,
     ) -> None:
-        """Prepare a model that has learned nothing.
+        """Prepare an untrained model.
 
         Args:
             pool: the cases.
             povs: the drivers of the POV.
             seed: of the trees.
-            criterion: what counts as a failure.
+            criterion: condition of a failure.
             lines: centre lines of the road.
         """
         self._scenario, self._seed = pool.scenario, seed
         self._rollout = ModelRollout(pool, povs, criterion, lines)
         self._batch: dict[int, int] = {}
         self._motions: dict[int, FloatArray] = {}
-        self._steps: dict[int, Steps] = {}
+        # By group, the cases that its members learned from; by member, its tree.
         self._cases: dict[int, list[int]] = {}
-        """By group, the cases that its members learned from."""
         self._trees: dict[int, Any] = {}
-        """By member."""
         self._has_learned = False
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Take outcomes and their motions by index; an episode that went wrong teaches nothing."""
+        """Take outcomes and their motions by index; an episode with an error is left out."""
         self._has_learned = False
         for outcome in outcomes:
             if not outcome.measures.end.is_error:
@@ -86,39 +353,22 @@ class ControllerModel:
                 self._motions[outcome.index] = motions[outcome.index]
 
     def can_predict(self, level: int) -> bool:
-        """Return whether it has seen enough, and the POV of the level is known."""
-        return len(self._motions) >= FEWEST and self._rollout.can_predict(level)
+        """Return whether there are four cases to learn from, and the POV of the level is known."""
+        return len(self._motions) >= 4 and self._rollout.can_predict(level)
 
     def predict(
         self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> dict[int, FloatArray]:
-        """Return the gaps at M of cases by level, (M, n) each; see `Predictor`.
-
-        All members and levels are one rollout: each row is a case and the member that drives in it.
-        """
+        """Return the gaps at M of cases by level, (M, n) each; see `Predictor`."""
         if not self._has_learned:
             self._learn()
-        trees = [self._trees[number] for number in range(self.members)]
-        if member is not None:
-            trees = [trees[member]]
-        counts = [len(of_level) for of_level in points.values()]
-        ends = sum(counts) * np.arange(1, len(trees) + 1)
-
-        def drive(inputs: Inputs, rows: NDArray[np.int64]) -> FloatArray:
-            accelerations = np.empty(len(rows))
-            first = 0
-            for tree, last in zip(trees, np.searchsorted(rows, ends).tolist(), strict=True):
-                if last > first:
-                    accelerations[first:last] = tree.predict(inputs[first:last])[:, 0]
-                first = last
-            return accelerations
-
-        gaps = self._rollout.play(points, len(trees), drive)
-        by_level = np.split(gaps, np.cumsum(counts)[:-1], axis=1)
-        return dict(zip(points, by_level, strict=True))
+        members = range(self.members) if member is None else [member]
+        gaps = self._rollout.play(points, [self._trees[number].predict for number in members])
+        ends = np.cumsum([len(of_level) for of_level in points.values()])
+        return dict(zip(points, np.split(gaps, ends[:-1], axis=1), strict=True))
 
     def _learn(self) -> None:
-        """Learn the trees of each group whose cases have changed."""
+        """Fit the trees of each group whose cases have changed."""
         from sklearn.tree import ExtraTreeRegressor
 
         self._has_learned = True
@@ -127,54 +377,82 @@ class ControllerModel:
             if cases == self._cases.get(group):
                 continue
             self._cases[group] = cases
-            steps = self._steps_of(cases)
-            inputs = np.concatenate([inputs for inputs, _ in steps])
-            accelerations = np.concatenate([a_mps2 for _, a_mps2 in steps])
-            for member, looked_at in ((group, inputs[:, :-HISTORY]), (GROUPS + group, inputs)):
+            inputs, accelerations = self._steps([self._motions[index] for index in cases])
+            for member, seen in ((group, inputs[:, :-PAST_INPUTS]), (GROUPS + group, inputs)):
                 seed = (self._seed * self.members + member) % 2**32
-                tree = ExtraTreeRegressor(max_features=MAX_FEATURES, random_state=seed)
-                # What `predict` of the estimator checks costs more than the tree does.
-                self._trees[member] = tree.fit(looked_at, accelerations).tree_
+                # Each node of a tree chooses among half of the inputs.
+                tree = ExtraTreeRegressor(max_features=0.5, random_state=seed)
+                # The checks in `predict` of the estimator cost more than the tree does.
+                self._trees[member] = tree.fit(seen, accelerations).tree_
 
     def _learned_by(self, group: int) -> list[int]:
         """Return the cases that members of a group learn from, by index."""
         until = max(self._batch.values())
-        if len(self._batch) > AT_ONCE and until >= GROUPS:
+        # Up to 100 cases all members learn from every batch; later they take turns.
+        if len(self._batch) > 100 and until >= GROUPS:
             until -= (until - group) % GROUPS
         cases = sorted(index for index, batch in self._batch.items() if batch <= until)
-        if len(cases) > LEARNED:
-            half = LEARNED // 2
-            spread = np.linspace(0, len(cases) - half, half, endpoint=False).astype(np.int64)
-            cases = [cases[place] for place in spread.tolist()] + cases[-half:]
+        # At most 500 cases: the last 250, and 250 spread over the others.
+        if len(cases) > 500:
+            spread = np.linspace(0, len(cases) - 250, 250, endpoint=False).astype(np.int64)
+            cases = [cases[place] for place in spread.tolist()] + cases[-250:]
         if len(cases) < GROUPS:
             return cases
         return [index for index in cases if index % GROUPS != group]
 
-    def _steps_of(self, cases: Sequence[int]) -> list[Steps]:
-        """Return the inputs and accelerations of the VUT in cases, by index."""
-        if len(self._steps) > KEPT:
-            self._steps.clear()
-        new = [index for index in cases if index not in self._steps]
-        if new:
-            observed = self._observed_steps([self._motions[index] for index in new])
-            self._steps.update(zip(new, observed, strict=True))
-        return [self._steps[index] for index in cases]
+    def _steps(self, motions: Sequence[FloatArray]) -> tuple[Inputs, FloatArray]:
+        """Return the inputs and accelerations of the VUT in all steps of motions.
 
-    def _observed_steps(self, motions: Sequence[FloatArray]) -> list[Steps]:
-        """Return inputs and accelerations of the VUT in motions, (T + 1, A, 3) each."""
-        longest = max(map(len, motions))
-        together = np.empty((longest, *motions[0].shape[1:], len(motions)))
-        for place, motion in enumerate(motions):
-            together[: len(motion), ..., place] = motion
-            together[len(motion) :, ..., place] = motion[-1, ..., :]
+        Args:
+            motions: (T + 1, A, 3) each.
+
+        Returns:
+            Inputs, (steps, inputs), and accelerations in m/s2, (steps,), motion by motion.
+        """
+        lengths = np.array([len(motion) for motion in motions])
+        together = np.empty((len(motions), lengths.max(), *motions[0].shape[1:]))
+        for states, motion in zip(together, motions, strict=True):
+            states[: len(motion)] = motion
+            states[len(motion) :] = motion[-1]
         observation = Observation(self._scenario, len(motions))
-        last = np.zeros(len(motions))
+        last_mps2 = np.zeros(len(motions))
         inputs = []
-        for state in together[:-1]:
-            inputs.append(observation.see(state[:, 0], state[:, 1], last).copy())
-            last = state[VUT, 2]
-        by_step, steps = np.array(inputs), []
-        for place, motion in enumerate(motions):
-            of_case = np.ascontiguousarray(by_step[: len(motion) - 1, place])
-            steps.append((of_case, motion[:-1, VUT, 2]))
-        return steps
+        for state in together.transpose(1, 3, 2, 0)[:-1].copy():
+            inputs.append(observation.step(state[0], state[1], last_mps2))
+            last_mps2 = state[2, VUT]
+        is_step = np.arange(len(inputs)) < lengths[:, None] - 1
+        accelerations = together[:, :-1, VUT, 2]
+        return np.stack(inputs, axis=1)[is_step], accelerations[is_step]
+
+
+class ControllerModelPair:
+    """Models of two versions of a VUT; together they predict the gap of a regression.
+
+    See `Predictor` and `regression`. Each member of the new version's model is paired with the
+    member of the old version's model that learned from the same cases.
+    """
+
+    members = ControllerModel.members
+
+    def __init__(self, new: ControllerModel, old: ControllerModel) -> None:
+        """Take a model of each version."""
+        self._new, self._old = new, old
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the new version and their motions, (T + 1, A, 3), by index."""
+        self._new.tell(outcomes, motions)
+
+    def tell_old(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Take outcomes of the old version and their motions, in the same way."""
+        self._old.tell(outcomes, motions)
+
+    def can_predict(self, level: int) -> bool:
+        """Return whether both models can predict cases of a level."""
+        return self._new.can_predict(level) and self._old.can_predict(level)
+
+    def predict(
+        self, points: Mapping[int, FloatArray], member: int | None = None
+    ) -> dict[int, FloatArray]:
+        """Return the gaps of a regression by level, (M, n) each; see `Predictor`."""
+        new, old = self._new.predict(points, member), self._old.predict(points, member)
+        return {level: regression_gaps(new[level], old[level]) for level in points}

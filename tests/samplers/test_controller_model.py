@@ -18,10 +18,8 @@ from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.samplers.controller_model import ControllerModel
+from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, Observation
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.samplers.observation import NOW, Observation
-from merge_sumo.samplers.rollout import FAR, ModelRollout
 from merge_sumo.scenario.case import (
     Case,
     Pool,
@@ -32,6 +30,12 @@ from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.povs import Povs
 
 SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=2)
+
+
+def slows(inputs: np.ndarray) -> np.ndarray:
+    return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
+
+
 SLOWS = "def vut(seen):\n    return -0.5 if seen.v_vut_mps > 10.0 else 1.0\n"
 
 
@@ -77,10 +81,7 @@ class TestGames:
         outcomes, _ = ran(f"{tmp_path / 'slows.py'}:vut", level, points, scenario, povs)
         games = ModelRollout(Pool(levels=(level,), scenario=scenario), povs)
 
-        def slows(inputs, _rows):
-            return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
-
-        found = games.play({level: points}, 1, slows)[0]
+        found = games.play({level: points}, [slows])[0]
         assert np.isfinite(found).any()
         # The POV decides in float32 here: one that has no preference may choose otherwise.
         true = gaps_of(outcomes)
@@ -90,12 +91,12 @@ class TestGames:
     def test_end_where_the_pov_is_far_behind_the_merge_point(self):
         drives = []
 
-        def stops(inputs, rows):
-            drives.append(len(rows))
+        def stops(inputs):
+            drives.append(len(inputs))
             return np.full(len(inputs), -4.0)
 
         rollout = ModelRollout(Pool(levels=(0,), scenario=US23), POVS)
-        gaps = rollout.play({0: np.full((3, 2), 0.5)}, 1, stops)
+        gaps = rollout.play({0: np.full((3, 2), 0.5)}, [stops])
         assert (gaps > FAR).all()
         assert len(drives) < US23.max_steps / 2
 
@@ -111,9 +112,7 @@ class TestGames:
         lines = centre_lines(road)
         expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
         rollout = ModelRollout(pool, POVS, criterion, lines)
-        (found,) = rollout.play(
-            {0: points}, 1, lambda inputs, _: np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
-        )
+        (found,) = rollout.play({0: points}, [slows])
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)
         assert (np.abs(found) < 1.0).any()
 
@@ -122,11 +121,8 @@ class TestGames:
         points = {0: random.random((5, 2)), 2: random.random((7, 3)), 1: random.random((4, 2))}
         rollout = ModelRollout(Pool(levels=(0, 1, 2), scenario=US23), POVS)
 
-        def slows(inputs, _rows):
-            return np.where(inputs[:, 6] > 10.0, -0.5, 1.0)
-
-        together = rollout.play(points, 2, slows)
-        alone = [rollout.play({level: of}, 1, slows)[0] for level, of in points.items()]
+        together = rollout.play(points, [slows, slows])
+        alone = [rollout.play({level: of}, [slows])[0] for level, of in points.items()]
         assert together == pytest.approx(np.tile(np.concatenate(alone), (2, 1)), nan_ok=True)
 
     def test_cannot_be_played_against_a_program(self):
@@ -139,14 +135,13 @@ class TestWatching:
         for step in range(5):
             x = np.array([[-200.0 + step], [-100.0 + 2.0 * step]])
             v = np.array([[30.0], [20.0]])
-            seen = observation.see(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
-        assert observation.now == NOW
+            seen = observation.step(x, v, np.array([0.0 if step < 4 else -2.0]))[0].copy()
         assert seen[:7].tolist() == [-2.0, -104.0, 10.0, -196.0, 30.0, -92.0, 20.0]
         # The time, steps since the jump, the lowest and the highest acceleration so far.
-        assert seen[NOW : NOW + 4].tolist() == [4.0, 0.0, -2.0, 0.0]
+        assert seen[17:21].tolist() == [4.0, 0.0, -2.0, 0.0]
         # Earlier accelerations, then gap and closing speed 0.3 s ago.
-        assert seen[NOW + 4 : NOW + 8].tolist() == [0.0] * 4
-        assert seen[NOW + 8 : NOW + 10].tolist() == [-101.0, 10.0]
+        assert seen[21:25].tolist() == [0.0] * 4
+        assert seen[25:27].tolist() == [-101.0, 10.0]
 
 
 class TestTwin:
