@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import asdict, replace
 from importlib import import_module
 from pkgutil import iter_modules
-from typing import Final
 
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers import __name__ as room
@@ -22,7 +21,7 @@ def found() -> dict[str, BuiltInVut]:
     return dict(sorted(vuts.items()))
 
 
-BUILT_IN_VUTS: Final = found()
+BUILT_IN_VUTS = found()
 
 
 class BuiltInKind(ControllerKind):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import msgspec
 import numpy as np
@@ -357,7 +357,7 @@ def as_wish(merge: Any) -> int:
     raise WrongAnswerError(f"wishes {_shown(merge)} instead of True or False, to merge or not")
 
 
-MERGES_ABOVE: Final = 0.5
+MERGES_ABOVE = 0.5
 """A number that says whether to merge, as of a network or a unit, wishes it above this."""
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from types import FrameType, TracebackType
-from typing import Any, Final, Self, TextIO
+from typing import Any, Self, TextIO
 
 from merge_sumo.interrupt import Stopped
 from merge_sumo.scenario.trajectory import as_reason
@@ -23,9 +23,9 @@ class DeadlineExceeded(BaseException):
     """A call took too long. Not an Exception, so that a controller does not catch it by habit."""
 
 
-RING_AFTER: Final = 1.02
+RING_AFTER = 1.02
 """The timer rings at this share of the deadline, when the call is certainly late."""
-MOST_CHARACTERS: Final = 300
+MOST_CHARACTERS = 300
 """Maximum length of a text that comes from a controller."""
 
 heartbeat: list[Callable[[float], None]] = []

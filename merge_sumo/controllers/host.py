@@ -17,7 +17,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -33,7 +33,7 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import Left
 from merge_sumo.spawning import named
 
-ALIVE_S: Final = 0.25
+ALIVE_S = 0.25
 """Least time between two messages that a request proceeds."""
 
 
@@ -110,7 +110,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         return answers, wishes
 
 
-_DTYPES: Final = (np.bool_, np.int64, np.float64, np.float64, np.int64, np.bool_)
+_DTYPES = (np.bool_, np.int64, np.float64, np.float64, np.int64, np.bool_)
 """Of the arrays of a `Scene`."""
 
 
@@ -132,9 +132,9 @@ def unpacked(contents: tuple[bytes | None, ...]) -> Scene:
     return Scene(active, step, x_m.reshape(shape), v_mps.reshape(shape), facing, merged)
 
 
-encode: Final = msgspec.msgpack.Encoder().encode
-decode_request: Final = msgspec.msgpack.Decoder(HostRequest).decode
-decode_answer: Final = msgspec.msgpack.Decoder(HostReply | None).decode
+encode = msgspec.msgpack.Encoder().encode
+decode_request = msgspec.msgpack.Decoder(HostRequest).decode
+decode_answer = msgspec.msgpack.Decoder(HostReply | None).decode
 
 
 def main(settings: Mapping[str, Any]) -> None:
@@ -221,7 +221,7 @@ def _installed() -> tuple[str, ...]:
     return tuple(f"{Path(folder).resolve()}{os.sep}" for folder in folders)
 
 
-_INSTALLED: Final = _installed()
+_INSTALLED = _installed()
 
 
 def _default_signals() -> None:

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -26,10 +26,10 @@ from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import Left, as_signals
 
-SUPPORTED: Final = os.name == "posix"
+SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
-GRACE: Final = 1.5
-GRACE_S: Final = 1.25
+GRACE = 1.5
+GRACE_S = 1.25
 """The process is killed after GRACE deadlines and GRACE_S seconds: by then it should have ended the
 call by itself."""
 
@@ -107,7 +107,7 @@ class ControllerProcess(ChildProcess):
         if self.alive:
             with suppress(ProcessDiedError, UserError):
                 self.request(HostRequest("close"))
-                self.ended()
+                self.exit_code()
         self.kill()
 
 

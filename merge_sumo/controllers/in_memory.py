@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Final, Protocol, SupportsFloat
+from typing import Any, Protocol, SupportsFloat
 
 from merge_sumo.controllers.controller import Seen
 from merge_sumo.controllers.kinds import parse, runs_code
@@ -39,7 +39,7 @@ class ActsInBatches(Protocol):
 
 AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
 """A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
-MAINS: Final = ("__main__", "__mp_main__")
+MAINS = ("__main__", "__mp_main__")
 
 
 def spec_of(vut: Any) -> str:

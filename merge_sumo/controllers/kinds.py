@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.hosting import SUPPORTED, HostedKind
 from merge_sumo.controllers.python import installed_vuts
@@ -21,7 +19,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
 from merge_sumo.registry import Registry
 
-KINDS: Final[Registry[type[ControllerKind]]] = Registry(
+KINDS: Registry[type[ControllerKind]] = Registry(
     "merge_sumo.vut_kinds",
     "kind of VUT",
     {

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
 from merge_sumo.printable import meant, quoted
 
-DIGITS: Final = 3
+DIGITS = 3
 """A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
 
 

@@ -1,4 +1,4 @@
-"""Processes that run a controller: started, watched and stopped; what they print is kept in a log.
+"""Processes that run a controller: started, watched and stopped, with their output in a log.
 
 `Program` is a user's own program. `ChildProcess` runs a function of this package, which answers
 messages.
@@ -11,7 +11,6 @@ import shlex
 import shutil
 import signal
 import socket
-import stat
 import struct
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import IO, Any
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import ScratchFolder
@@ -29,102 +28,83 @@ from merge_sumo.printable import printable
 from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.spawning import end_with, python_command
 
-LOG: Final = "controller.log"
+LOG = "controller.log"
 """In the folder of a campaign."""
-TAIL_BYTES: Final = 2000
-MOST_BYTES: Final = 4 << 20
+MOST_BYTES = 4 << 20
 """A longer log loses its older part: a controller may print for ever."""
-KEPT_BYTES: Final = 1 << 20
-PENDING_BYTES: Final = 1 << 16
-"""What is kept of what is printed before the folder of the log is there."""
-PATIENCE_S: Final = 1.0
-"""Time that the end of what is printed has to come."""
-LINES: Final = 40
-"""Of the end of a log that is shown."""
-LINE_BYTES: Final = 200
+ENDING_S = 2.0
+"""Time that a process has to end by itself."""
 
 
 class Output:
     """Reads what a process prints until it ends, so that a full pipe never holds it up.
 
     Attributes:
-        log: file to which it is added; None shows it on standard error. A log that is set later
-            has what was printed before, too.
+        log: file to which the text is added; None shows it on standard error. A log that is set
+            later also gets the text that was printed before.
         tail: the last bytes that were printed.
     """
 
-    def __init__(self, pipe: IO[bytes], log: Path | None, *, is_shown: bool = True) -> None:
-        """Read a pipe.
-
-        Args:
-            pipe: what the process prints.
-            log: file to which it is added.
-            is_shown: whether it is shown where there is no log.
-        """
+    def __init__(self, pipe: IO[bytes], log: Path | None) -> None:
+        """Read a pipe in a thread."""
         self.log, self.tail = log, b""
-        self._pipe, self._is_shown = pipe, is_shown
-        self._pending = b""
+        self._pipe, self._pending = pipe, b""
         self._thread = threading.Thread(target=self._read, daemon=True)
         self._thread.start()
 
-    def last_line(self) -> str:
-        """Return the last line that was printed, after a little wait for the end; "" for none."""
+    def lines(self) -> list[str]:
+        """Return the last lines that were printed, after a short wait for the end."""
         self.close()
-        lines = self.tail.decode("utf-8", errors="replace").strip().splitlines()
+        return self.tail.decode("utf-8", errors="replace").strip().splitlines()
+
+    def last_line(self) -> str:
+        """Return the last line that was printed; "" for none."""
+        lines = self.lines()
         return as_reason(lines[-1]) if lines else ""
 
     def close(self) -> None:
-        """Take what is left; what a process that was left behind prints later is lost."""
-        self._thread.join(PATIENCE_S)
+        """Wait a second for the rest; later output of the processes that it started is lost."""
+        self._thread.join(1.0)
 
     def _read(self) -> None:
         with self._pipe as pipe:
             while part := os.read(pipe.fileno(), 1 << 16):
-                self.tail = (self.tail + part)[-TAIL_BYTES:]
-                self._pending = (self._pending + part)[-PENDING_BYTES:]
-                if self.log is None and self._is_shown:
+                self.tail = (self.tail + part)[-2000:]
+                self._pending = (self._pending + part)[-(1 << 16) :]
+                if self.log is None:
                     sys.stderr.write(part.decode("utf-8", errors="replace"))
                 self._keep()
         self._keep()
 
     def _keep(self) -> None:
         if self.log is not None and self._pending and self.log.parent.is_dir():
-            with suppress(OSError):  # a full disk costs what was printed, not the campaign
+            with suppress(OSError):  # a full disk costs the text, not the campaign
                 append(self.log, self._pending)
             self._pending = b""
 
 
-def _opened(log: Path, flags: int) -> IO[bytes] | None:
-    """Open a log; None where something else is in its place, which is not followed or waited for.
-
-    Raises OSError where it cannot be opened.
-    """
-    careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    descriptor = os.open(log, flags | careful, 0o644)
-    if stat.S_ISREG(os.fstat(descriptor).st_mode):
-        return os.fdopen(descriptor, "rb" if flags == os.O_RDONLY else "r+b", buffering=0)
-    os.close(descriptor)
-    return None
+def _is_writable_log(log: Path) -> bool:
+    """Return whether a log is a file or not there; anything else is not followed or waited for."""
+    return not log.is_symlink() and (log.is_file() or not log.exists())
 
 
 def end_of(log: Path) -> str:
-    """Return the last lines of a log, printable; "" where there is no such file."""
-    text = ""
+    """Return the last 40 lines of a log, printable; "" where there is no such file."""
+    text = b""
     with suppress(OSError):
-        file = _opened(log, os.O_RDONLY)
-        if file is not None:
-            with file:
-                file.seek(max(file.seek(0, os.SEEK_END) - LINES * LINE_BYTES, 0))
-                text = file.read(LINES * LINE_BYTES).decode("utf-8", errors="replace")
-    return "\n".join(map(printable, text.splitlines()[-LINES:]))
+        if _is_writable_log(log):
+            with log.open("rb") as file:
+                file.seek(max(file.seek(0, os.SEEK_END) - 8000, 0))
+                text = file.read(8000)
+    lines = text.decode("utf-8", errors="replace").splitlines()
+    return "\n".join(map(printable, lines[-40:]))
 
 
 def append(log: Path, content: bytes) -> None:
-    """Add to a log, from whichever of several processes; OSError when that cannot be done."""
-    opened = _opened(log, os.O_RDWR | os.O_CREAT | os.O_APPEND)
-    if opened is None:
+    """Add to a log, from any of several processes; OSError when that cannot be done."""
+    if not _is_writable_log(log):
         return
-    with opened as file:
+    with log.open("ab+", buffering=0) as file:
         if sys.platform != "win32":  # several processes may write
             import fcntl
 
@@ -132,33 +112,26 @@ def append(log: Path, content: bytes) -> None:
         file.write(content)
         size = file.seek(0, os.SEEK_END)
         if size > MOST_BYTES:
-            file.seek(size - KEPT_BYTES)
-            end = file.read(KEPT_BYTES)
+            file.seek(size - MOST_BYTES // 4)
+            end = file.read()
             file.truncate(0)
-            file.write(b"[what was printed before is gone]\n" + end)
-
-
-ENDING_S: Final = 2.0
-"""Time that a process has to end by itself."""
+            file.write(b"[the older part of this log was removed]\n" + end)
 
 
 class Started:
-    """A process in a group of its own, and what it prints.
+    """A process in a group of its own.
 
     Attributes:
         output: what it prints.
     """
 
-    def __init__(
-        self, name: str, command: Sequence[str], log: Path | None, *, is_shown: bool, **more: Any
-    ) -> None:
+    def __init__(self, name: str, command: Sequence[str], log: Path | None, **more: Any) -> None:
         """Start a process.
 
         Args:
-            name: what it is, for a sentence.
+            name: its description, for an error message.
             command: its arguments.
-            log: file to which what it prints is added.
-            is_shown: whether it is shown where there is no log.
+            log: file to which its output is added; None shows it.
             more: arguments of `subprocess.Popen`.
 
         Raises:
@@ -177,16 +150,21 @@ class Started:
         except OSError as error:
             raise UserError(f"{name} cannot be started: {error.strerror}") from error
         assert self._process.stdout is not None  # noqa: S101 (piped)
-        self.output = Output(self._process.stdout, log, is_shown=is_shown)
+        self.output = Output(self._process.stdout, log)
+
+    def kill_group(self) -> None:
+        """Kill the process and the processes that it started, and wait for its end."""
+        self.signal(signal.SIGKILL)
+        self._process.wait()
+        self.output.close()
 
     def signal(self, number: int) -> None:
-        """Send a signal to the process and to what it started, if any is left."""
+        """Send a signal to the process and to the processes that it started, if any is left."""
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, number)
 
 
-MOST_MESSAGE_BYTES: Final = 1 << 24
-BROKEN: Final = "broke the channel to its process"
+BROKEN = "broke the channel to its process"
 
 
 class ProcessDiedError(Exception):
@@ -215,7 +193,6 @@ class ChildProcess(Started):
         *,
         cwd: str | None = None,
         log: Path | None = None,
-        is_shown: bool = True,
     ) -> None:
         """Start a process.
 
@@ -225,8 +202,7 @@ class ChildProcess(Started):
             folder: is removed when the process ends.
             environment: of the process.
             cwd: its working folder, by default that of this process.
-            log: file to which what it prints is added.
-            is_shown: whether what it prints is shown where there is no log.
+            log: file to which its output is added; None shows it.
 
         Raises:
             UserError: if no process can be started.
@@ -241,7 +217,6 @@ class ChildProcess(Started):
                 "a process for the VUT",
                 python_command(main, {**settings, **inherited}),
                 log,
-                is_shown=is_shown,
                 pass_fds=tuple(inherited.values()),
                 cwd=cwd,
                 env=environment,
@@ -280,7 +255,7 @@ class ChildProcess(Started):
             time = struct.pack("ll", *divmod(time_us, 1_000_000))
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time)
         try:
-            return self._connection.recv_bytes(MOST_MESSAGE_BYTES)
+            return self._connection.recv_bytes(1 << 24)
         except BlockingIOError:
             if self._process.poll() is not None:
                 raise self._died() from None
@@ -292,8 +267,8 @@ class ChildProcess(Started):
             self.kill()
             raise
 
-    def ended(self) -> int | None:
-        """Wait a little for the process to end; return its exit code, None where it goes on."""
+    def exit_code(self) -> int | None:
+        """Wait a little for the process to end; return its exit code, None where it still runs."""
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(ENDING_S)
         return None
@@ -306,9 +281,7 @@ class ChildProcess(Started):
         self._connection.close()
         self._socket.close()
         os.close(self._lifeline)
-        self.signal(signal.SIGKILL)
-        self._process.wait()
-        self.output.close()
+        self.kill_group()
         self._folder.cleanup()
 
     def __del__(self) -> None:
@@ -317,9 +290,9 @@ class ChildProcess(Started):
 
     def _died(self) -> ProcessDiedError:
         """End the process; return how it ended."""
-        code = self.ended()
+        code = self.exit_code()
         self.kill()
-        if code is None:  # it closed the connection and goes on
+        if code is None:  # it closed the connection and still runs
             return ProcessDiedError(BROKEN)
         if code >= 0:
             return ProcessDiedError(f"ended its process with exit code {code}")
@@ -380,16 +353,13 @@ def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
 class Program(Started):
     """A running program of the user's."""
 
-    def __init__(
-        self, arguments: list[str], port: int, log: Path | None, *, is_shown: bool = True
-    ) -> None:
+    def __init__(self, arguments: list[str], port: int, log: Path | None) -> None:
         """Start it.
 
         Args:
             arguments: its command, in which `{port}` stands for the port.
             port: where it is to connect, also in MERGE_SUMO_PORT.
-            log: file to which what it prints is added.
-            is_shown: whether it is shown where there is no log.
+            log: file to which its output is added; None shows it.
 
         Raises:
             UserError: if it cannot be started.
@@ -398,7 +368,6 @@ class Program(Started):
             f"the command {arguments[0]!r}",
             [argument.replace("{port}", str(port)) for argument in arguments],
             log,
-            is_shown=is_shown,
             env={**os.environ, "MERGE_SUMO_PORT": str(port)},
         )
 
@@ -421,7 +390,4 @@ class Program(Started):
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(ENDING_S)
         finally:
-            # The group, because a program may have started others that are left.
-            self.signal(signal.SIGKILL)
-            self._process.wait()
-            self.output.close()
+            self.kill_group()

@@ -14,7 +14,7 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +47,7 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.scenario.signals import Left, as_signals
 
-objects: Final[dict[str, Any]] = {}
+objects: dict[str, Any] = {}
 """The objects of this process that are controllers, by the arguments of their specs."""
 
 

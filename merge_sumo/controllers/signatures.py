@@ -13,15 +13,15 @@ from functools import partial
 from inspect import Parameter
 from pathlib import Path
 from types import MemberDescriptorType
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable
 
-OF_ONE: Final = {"act": ("seen",), "reset": ("seen",), "close": ()}
-OF_A_BATCH: Final = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
+OF_ONE = {"act": ("seen",), "reset": ("seen",), "close": ()}
+OF_A_BATCH = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
 """Methods of a VUT, and what each is called with; a `reset` may have a `seed` besides."""
 
 

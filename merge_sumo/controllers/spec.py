@@ -14,7 +14,7 @@ from functools import cached_property
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Self
 
 import msgspec
 
@@ -27,7 +27,7 @@ from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
 from merge_sumo.workers import workers_or_cores
 
 BUILT_IN, INSTALLED, PYTHON, HERE = "built-in", "installed", "python", "here"
-WITHOUT_PREFIX: Final = (BUILT_IN, INSTALLED, PYTHON)
+WITHOUT_PREFIX = (BUILT_IN, INSTALLED, PYTHON)
 """The kinds whose specs do not begin with the name of the kind."""
 
 

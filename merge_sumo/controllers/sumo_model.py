@@ -10,7 +10,6 @@ to merge: the lane on which the VUT is after SUMO's step is its wish.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,13 +22,13 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.sumo.world import World
 
-SHARED_OPTIONS: Final = {
+SHARED_OPTIONS = {
     *("maxSpeed", "accel", "decel", "emergencyDecel"),
     *("apparentDecel", "tau", "minGap", "speedFactor", "impatience", "jmIgnoreFoeProb"),
     *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
     *("jmAdvance",),
 }
-LANE_CHANGE_OPTIONS: Final = {
+LANE_CHANGE_OPTIONS = {
     *("lcStrategic", "lcStrategicLookahead", "lcLookaheadLeft", "lcAssertive", "lcSigma"),
     *("lcCooperative", "lcCooperativeSpeed", "lcCooperativeMinSpeed", "lcCooperativeRoundabout"),
     *("lcCooperativeHelpTime", "lcCooperativeHelpThreshold"),
@@ -40,13 +39,13 @@ LANE_CHANGE_OPTIONS: Final = {
 }
 """Those of SUMO's lane-change model LC2013; -1 turns some of them off. The others that SUMO knows
 are of its sublane model, which does not drive here."""
-ACC_OPTIONS: Final = {
+ACC_OPTIONS = {
     *("speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
     *("gapControlGainSpeed", "gapControlGainSpace", "collisionAvoidanceGainSpeed"),
     *("collisionAvoidanceGainSpace", "collisionAvoidanceOverride"),
 }
-NO_NOISE: Final = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0}
-MODELS: Final[dict[str, tuple[set[str], dict[str, float]]]] = {
+NO_NOISE = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0}
+MODELS: dict[str, tuple[set[str], dict[str, float]]] = {
     "Krauss": ({"sigma", "sigmaStep"}, {"sigma": 0.0}),
     "IDM": ({"delta", "stepping"}, {}),
     "EIDM": (

@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby, pairwise
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from lxml import etree
 
@@ -22,20 +22,20 @@ from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
 from merge_sumo.road.netfile import Point
 from merge_sumo.scenario.scenario import Bounds
 
-COPY: Final = "@"
+COPY = "@"
 """Stands in an id for the number of the copy."""
-AT_M: Final = f"M{COPY}"
+AT_M = f"M{COPY}"
 """Where the paths become one, which is the end of the acceleration lane on a road with one."""
-GORE: Final = f"gore{COPY}"
-END: Final = f"end{COPY}"
-LANE: Final = f"lane{COPY}"
+GORE = f"gore{COPY}"
+END = f"end{COPY}"
+LANE = f"lane{COPY}"
 """The edge of an acceleration lane and of the mainline next to it."""
-KEPT_TYPES: Final = (
+KEPT_TYPES = (
     *("priority", "priority_stop", "allway_stop", "zipper", "unregulated"),
     *("right_before_left", "left_before_right"),
 )
 """Junctions at M that keep their rules; others, as those with traffic lights, are "priority"."""
-STATES: Final = "MmZ=sw"
+STATES = "MmZ=sw"
 """Rights of way that a link at M keeps; one with a traffic light yields, or not, without it."""
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 from lxml import etree
@@ -20,21 +20,21 @@ from merge_sumo.road.xml_input import harmless_net, to_bytes
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, rgb
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
-NET: Final = "road.net.xml"
-TYPES: Final = "types.add.xml"
-ROAD: Final = "road.json"
-OPTIONS: Final = (*SUMO_OPTIONS, "--collision.action", "warn")
+NET = "road.net.xml"
+TYPES = "types.add.xml"
+ROAD = "road.json"
+OPTIONS = (*SUMO_OPTIONS, "--collision.action", "warn")
 """SUMO reports collisions, which change nothing."""
-DEPARTURE_SPEED_MODE: Final = 38
+DEPARTURE_SPEED_MODE = 38
 """Of the VUT: its limits of acceleration act, SUMO's checks of safety do not."""
-COLOURS: Final = (*rgb("pov"), 255), (*rgb("vut"), 255)
+COLOURS = (*rgb("pov"), 255), (*rgb("vut"), 255)
 """Of the cars of the mainline, and of the VUT."""
-FASTEST_MPS: Final = 45.0
+FASTEST_MPS = 45.0
 """Speed that a car can drive wherever the road allows less; the limit of the shipped road."""
-VUT_ID: Final = VEHICLES[VUT]
-ID_COUNT: Final = 0x01
+VUT_ID = VEHICLES[VUT]
+ID_COUNT = 0x01
 """Variable that every domain has."""
-SPEED_MARGIN_MPS: Final = 2.0
+SPEED_MARGIN_MPS = 2.0
 """More than a vehicle gains in a step, unless a controller commands it without any limit."""
 
 State = Sequence[float]

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.errors import UserError
 from merge_sumo.sumo.binding import SUMO_VERSION, sumo_program
@@ -36,7 +36,7 @@ def packer() -> Callable[..., bytes]:
     return pack
 
 
-EXAMPLES: Final[tuple[Any, ...]] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
+EXAMPLES: tuple[Any, ...] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
 """Values of the arguments with which one function or another of the client sends its command."""
 
 

@@ -187,8 +187,7 @@ def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
 def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path):
     (tmp_path / "others").touch()
     (tmp_path / "link").symlink_to(tmp_path / "others")
-    with pytest.raises(OSError, match="symbolic link"):
-        append(tmp_path / "link", b"x")
+    append(tmp_path / "link", b"x")
     assert (tmp_path / "others").read_bytes() == b""
     os.mkfifo(tmp_path / "pipe")
     append(tmp_path / "pipe", b"x")

@@ -301,7 +301,7 @@ def test_a_program_that_ends_while_its_client_goes_on_is_an_error_of_every_case(
         assert "ended with exit code 0, and its connection goes on" in trajectory.error
 
 
-@pytest.mark.skipif(not child.KNOWN_HERE, reason="needs /proc/net/tcp")
+@pytest.mark.skipif(not child.KNOWS_USERS, reason="needs /proc/net/tcp")
 class TestTheUserOfAConnection:
     @pytest.mark.parametrize(
         ("family", "source", "target"),

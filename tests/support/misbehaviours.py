@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from textwrap import dedent, indent
-from typing import Final
 
-GUILTY_MPS: Final = 34.0
-DEADLINE_S: Final = 0.3
-LATE: Final = f"took longer than the deadline of {DEADLINE_S} s"
+GUILTY_MPS = 34.0
+DEADLINE_S = 0.3
+LATE = f"took longer than the deadline of {DEADLINE_S} s"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +29,7 @@ class Misbehaviour:
     refused: bool = False
 
 
-CLASS: Final = """
+CLASS = """
 class Vut:
     def reset(self, seen):
         self.guilty = seen.v_pov_mps > {limit}
@@ -40,7 +39,7 @@ class Vut:
         return min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)
 {methods}
 """
-BATCHED: Final = """
+BATCHED = """
 import numpy as np
 class Vut:
     def __init__(self, corridors):
@@ -78,7 +77,7 @@ def loads(setup: str, reason: str | None = None, **how) -> Misbehaviour:
     return replace(acts("", reason, setup=setup, **how), refused=reason is not None)
 
 
-STUBBORN: Final = """
+STUBBORN = """
 while True:
     try:
         while True: pass
@@ -86,7 +85,7 @@ while True:
 """
 """Swallows what interrupts it."""
 
-CATALOGUE: Final = {
+CATALOGUE = {
     "segfault": acts("import ctypes; ctypes.string_at(0)", "by signal 11 (SIGSEGV)"),
     "sleeps and holds the interpreter": acts("import ctypes; ctypes.PyDLL(None).sleep(60)", LATE),
     "a list that grows": acts(

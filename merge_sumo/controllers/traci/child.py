@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 
@@ -41,18 +41,18 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.sumo.binding import sumo_environment
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, State, write_files
 
-HOST: Final = "127.0.0.1"
-KNOWN_HERE: Final = sys.platform == "linux"
-"""Whether the system says whose a connection is; elsewhere whoever comes first is served."""
-START_S: Final = 60.0
+HOST = "127.0.0.1"
+KNOWS_USERS = sys.platform == "linux"
+"""Whether the system tells the user of a connection; elsewhere the first client is served."""
+START_S = 60.0
 """Time that the process has to start, on whatever machine."""
-WORK_S: Final = 10.0
+WORK_S = 10.0
 """Time that SUMO has for the questions of a controller in a step, besides the deadline."""
-FAREWELL_STEPS: Final = 10
+FAREWELL_STEPS = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
-MOST_MEMORY_BYTES: Final = 4 << 30
-MOST_FILE_BYTES: Final = 16 << 20
-ROUNDING_S: Final = 1e-9
+MOST_MEMORY_BYTES = 4 << 30
+MOST_FILE_BYTES = 16 << 20
+ROUNDING_S = 1e-9
 
 
 class Answer(msgspec.Struct, omit_defaults=True):
@@ -112,7 +112,7 @@ class Child(ChildProcess):
             folder,
             sumo_environment(),
             cwd=folder.name,
-            is_shown=False,
+            log=Path(os.devnull),  # SUMO's warnings
         )
 
     def do(self, action: str, patience_s: float = START_S, **values: Any) -> Answer:
@@ -131,8 +131,8 @@ class Child(ChildProcess):
         answer = msgspec.msgpack.decode(content, type=Answer)
         if answer.refused:
             self.kill()
-            said, *_ = self.output.tail.decode("utf-8", errors="replace").strip().split("\n")
-            raise UserError(said.removeprefix("Error: ") or answer.refused)
+            lines = self.output.lines()
+            raise UserError(lines[0].removeprefix("Error: ") if lines else answer.refused)
         return answer
 
 
@@ -185,7 +185,7 @@ class Server:
         return Answer(port=int(self._listener.getsockname()[1]))
 
     def accept(self, wait_s: float, deadline_s: float) -> Answer:
-        """Wait for a client of this user, in the place of the one before.
+        """Wait for a client of this user; it replaces the one before, on an empty road.
 
         Args:
             wait_s: time to wait.
@@ -193,35 +193,30 @@ class Server:
         """
         if self._sumo is None:
             self._sumo = MirrorSimulation(self._folder)
-            self._sumo.load()
-        until = monotonic() + wait_s
-        while self._listener is not None and (left_s := until - monotonic()) > 0.0:
-            self._listener.settimeout(left_s)
-            try:
-                connection = self._listener.accept()[0]
-            except OSError:
-                continue
-            user = user_of(connection)
-            if user == os.geteuid() or not KNOWN_HERE:
-                self._serve(connection, self._sumo, deadline_s)
-                return Answer(accepted=True)
+        assert self._listener is not None, "listening"  # noqa: S101
+        self._listener.settimeout(wait_s)
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:
+            return Answer()
+        user = user_of(connection)
+        if KNOWS_USERS and user != os.geteuid():
             connection.close()
             self._notes.append(
                 f"a process of the user {user} connected to the port of the controller and was "
                 "not served"
             )
-        return Answer()
-
-    def _serve(self, connection: socket.socket, sumo: MirrorSimulation, deadline_s: float) -> None:
-        """Take a new client, which begins with an empty road."""
+            return Answer()
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._close_client()
-        sumo.load()
-        self._client, self._session, self._deadline_s = connection, Session(sumo), deadline_s
+        self._sumo.load()
+        self._client, self._session = connection, Session(self._sumo)
+        self._deadline_s = deadline_s
         self._commands: deque[Command] = deque()
         self._reply = b""
         self._until_step_s: float | None = None
         """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
+        return Answer(accepted=True)
 
     def drop(self) -> Answer:
         """Close the port and the connection of the client."""

@@ -10,24 +10,24 @@ import struct
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from merge_sumo.sumo.binding import SUMO_VERSION
 from merge_sumo.sumo.traci_names import packer
 
-MAX_MESSAGE_BYTES: Final = 1 << 20
+MAX_MESSAGE_BYTES = 1 << 20
 """Limit of a message; garbage that is read as a length mostly exceeds it."""
-MAX_NESTING: Final = 4
-API_VERSION: Final = 22
+MAX_NESTING = 4
+API_VERSION = 22
 """Version of the TraCI of SUMO 1.28."""
 VERSION, STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
 GET_VEHICLE, GET_JUNCTION, SET_VEHICLE = 0xA4, 0xA9, 0xC4
 OK, ERROR = 0x00, 0xFF
-NUMBERS: Final = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d"}
+NUMBERS = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d"}
 """Forms of `struct` by the types of numbers."""
 STRING, STRING_LIST, COMPOUND, DOUBLE_LIST, COLOR = 0x0C, 0x0E, 0x0F, 0x10, 0x11
 LON_LAT, ROAD = 0x00, 0x04
-PLACES: Final = "goGOr"
+PLACES = "goGOr"
 """Letters of `pack` by the types of positions: on earth, in the plane, both with height, and on a
 road."""
 
@@ -308,8 +308,8 @@ def _stage(stage: Any) -> bytes:
     return _fields("isssldddsddds", attrgetter(*names.split())(stage))
 
 
-STOP: Final = "lane endPos stoppingPlaceID stopFlags duration until"
-LAYOUTS: Final[dict[str, Callable[[Any], bytes]]] = {
+STOP = "lane endPos stoppingPlaceID stopFlags duration until"
+LAYOUTS: dict[str, Callable[[Any], bytes]] = {
     "getLeader": lambda answer: _fields("sd", answer or ("", -1.0)),
     "getFollower": lambda answer: _fields("sd", answer or ("", -1.0)),
     "getNeighbors": _neighbours,

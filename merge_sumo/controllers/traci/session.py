@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from functools import cache
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from merge_sumo.controllers.traci.protocol import (
     ERROR,
@@ -41,29 +41,29 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, RefusedError, State
 from merge_sumo.sumo.traci_names import functions, name_of
 
-QUESTIONS: Final = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
+QUESTIONS = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
 SET, SUBSCRIBE, CONTEXT, RESPONSE = 0x20, 0x30, -0x20, 0x10
 """Offsets from the questions of a domain to its commands, subscriptions and context subscriptions,
 and from questions and subscriptions to their answers."""
-SERVED_BY: Final = {
+SERVED_BY = {
     "trafficlight.getNemaPhaseCalls": "trafficlight.getParameter",
     "vehicle.couldChangeLane": "vehicle.getLaneChangeState",
     "vehicle.getLeftFollowers": "vehicle.getNeighbors",
 }
 """Of several functions that read one variable, by the first: the one that SUMO's server calls."""
-DISTANCES: Final = ("simulation.getDistance2D", "vehicle.getDrivingDistance")
-WITH_PARAMETER: Final = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
+DISTANCES = ("simulation.getDistance2D", "vehicle.getDrivingDistance")
+WITH_PARAMETER = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
 """Functions whose variables have a parameter in a subscription."""
-OWN_TYPE: Final = f"{VUT_ID}@{VUT_ID}"
+OWN_TYPE = f"{VUT_ID}@{VUT_ID}"
 """What SUMO calls the type of a vehicle that has numbers of its own."""
-STAYED: Final = (
+STAYED = (
     "vut came to the end of the acceleration lane without a lane change: it departs in lane change "
     "mode 0, in which changeLane merges it at once; in 1621, SUMO's own, SUMO merges it"
 )
-OFF_THE_LANE_M: Final = 2.0
+OFF_THE_LANE_M = 2.0
 """A vehicle that its own model moves is on a lane up to here: half of the width of a wide one."""
-COMING: Final = 2
+COMING = 2
 """Vehicles that are expected between two episodes."""
 
 
@@ -79,16 +79,16 @@ class Effect(Enum):
     REFUSED = "Refused: the scenario and the campaign decide it"
 
 
-SPEEDS: Final = frozenset({"setSpeed", "slowDown", "setAcceleration", "setSpeedMode"})
-GAPS_AND_STOPS: Final = frozenset({"openGap", "setStop", "resume", "setLaneChangeMode"})
-MODEL: Final = frozenset(
+SPEEDS = frozenset({"setSpeed", "slowDown", "setAcceleration", "setSpeedMode"})
+GAPS_AND_STOPS = frozenset({"openGap", "setStop", "resume", "setLaneChangeMode"})
+MODEL = frozenset(
     {
         *("setMaxSpeed", "setAccel", "setDecel", "setEmergencyDecel", "setApparentDecel"),
         *("setTau", "setMinGap", "setImperfection", "setSpeedFactor"),
     }
 )
 """Numbers of SUMO's car-following model."""
-EFFECTS: Final = {
+EFFECTS = {
     Effect.CARRIED_OUT: SPEEDS | GAPS_AND_STOPS | MODEL,
     Effect.ON_A_LANE: frozenset({"changeLane", "changeLaneRelative"}),
     Effect.REACHED: frozenset({"setPreviousSpeed", "moveToXY"}),
@@ -108,7 +108,7 @@ EFFECTS: Final = {
     ),
 }
 """Commands on vehicles and their types by what becomes of them; others are refused."""
-ONLY_SEEN: Final = ("gui", "poi", "polygon")
+ONLY_SEEN = ("gui", "poi", "polygon")
 """Domains of objects that are only looked at."""
 
 

@@ -10,11 +10,13 @@ two episodes the road is empty for one step.
 from __future__ import annotations
 
 import math
+import os
 import sys
 from collections.abc import Collection
 from contextlib import suppress
+from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -38,9 +40,9 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.world import World
 
-DEFAULT_PORT: Final = 8813
+DEFAULT_PORT = 8813
 """Port of TraCI clients that are given no other."""
-LOOK_S: Final = 0.1
+LOOK_S = 0.1
 """Time between two looks whether a program that is waited for has ended."""
 
 
@@ -125,6 +127,7 @@ class TraciVut(Driver):
         """
         super().__init__(1)
         self._port, self._command, self._options = port, command, options
+        self._log = options.log
         self._road, self._scenario = road, scenario
         self._child = Child(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
@@ -132,7 +135,7 @@ class TraciVut(Driver):
         self._lane_m = scenario.lane_m
         self._limits_mps2 = scenario.a_min_mps2, scenario.a_max_mps2
         self._program: Program | None = None
-        self._connected = self._has_started = False
+        self._connected = False
         self._reason: str | None = None
         self._noted: set[str] = set()
         self._in_vain: set[str] = set()
@@ -277,9 +280,8 @@ class TraciVut(Driver):
             self._stop_program(grace=True)
         if not self._connected:
             if self._command is not None:
-                log = self._options.log
-                self._program = Program(self._command, port, log, is_shown=not self._has_started)
-                self._has_started = True
+                self._program = Program(self._command, port, self._log)
+                self._log = self._log or Path(os.devnull)  # the same text again is not shown
             else:
                 sys.stderr.write(
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
