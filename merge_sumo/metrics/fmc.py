@@ -3,14 +3,12 @@
 Source: Wang, Zhang, Lee, Peng, "An Interaction-aware Evaluation Method for Highly Automated
 Vehicles", section "Problem formulation for adaptive testing": M(s, rho, lambda) is the integral of
 1 dv over the union of the balls B(rho, s_i) around the cases s_i with P(s_i) < lambda. The caller
-picks the failing cases; here they are points in coordinates normalised to [0, 1] per dimension, and
+chooses the failing cases; they are points in coordinates normalised to [0, 1] per dimension, and
 the balls are not clipped to the unit cube.
 
-One dimension is a sum of gaps and two dimensions follow from the boundary arcs of the union; both
-are exact up to rounding. Three dimensions integrate the exact two-dimensional union over parallel
-slices, to within about 1e-4 of the volume. More dimensions are sampled.
+In one and two dimensions the volume is exact up to rounding. In more it is sampled.
 
-The paper has two and three dimensions, with one radius. Failures are a thin layer beside a
+The paper has two and three dimensions, with one radius. Failures are a thin layer next to a
 hypersurface of the pool, where the order of merging changes, and a ball covers a disc of it with
 one dimension less. In more dimensions a disc of the paper's radius would be next to nothing, so
 there the radius is the one for which the disc is as large as in three (`radius_for`): to cover as
@@ -25,43 +23,22 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 RADIUS: Final = 0.05
 """Ball radius rho of the paper, in normalised coordinates (no unit)."""
-MOST_DIMENSIONS: Final = 6
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 
-_SAMPLES: Final = 1 << 17
-"""Places of the union at which balls are counted."""
-_SEED: Final = 20210909
-
-_TURN: Final = 2.0 * np.pi
-# Inside this module lengths are in radii: every ball has radius 1.
-_MAX_SPAN: Final = 1e6  # the boundary integral loses span * 1e-16 of a disc to rounding
-_MERGE: Final = 2.0**-40  # points are snapped to this grid: moves a boundary by 1e-12 at most
-_MIN_ARC_RAD: Final = 1e-14  # a shorter arc is the rounding of two angles below 2 pi
-_FIRST_NEIGHBOURS: Final = 8
-_MORE_NEIGHBOURS: Final = 4  # factor from one round to the next
-_CHUNK: Final = 1 << 14  # disc-neighbour pairs at once: fits the cache, bounds the memory
-_COINCIDENT: Final = 1e-100  # stands for a distance of 0 that has to have a direction
-_TURNED_RAD: Final = (1.0, 0.7, 0.3)  # about x, y, z; any angles with nothing special to them
-# Slices per ball diameter. What is left of the errors of single balls averages out, so many spread
-# balls need the fewest (measured: 24 slices keep 400 of them within 8e-5). Few balls can afford
-# more, up to a budget of discs, and a heap not much larger than one ball needs more in all.
-_SLICES: Final = 24
-_SLICES_IN_ALL: Final = 64
-_MAX_SLICES: Final = 250
-_DISC_BUDGET: Final = 10_000
-# Distances are rounded (0.2 - 0.15 > 0.05): without this slack a grid with the spacing of the
-# radius would fall apart into regions at random.
-_LINK_SLACK: Final = 1e-9
+SAMPLES = 1 << 17
+"""Places at which the balls are counted."""
+SLACK = 1e-9
+"""Relative rounding of distances (0.2 - 0.15 > 0.05): else a grid with the spacing of the radius
+would fall apart into regions at random."""
+PAIRS_AT_ONCE = 1 << 14
+"""Pairs of a disc and a neighbour that are computed together: they fit into the cache."""
 
 
 def ball_volume(dimension: int) -> float:
@@ -80,82 +57,81 @@ def radius_for(dimension: int) -> float:
     return float((RADIUS**2 * ball_volume(2) / ball_volume(disc)) ** (1.0 / disc))
 
 
-def fmc(points: ArrayLike, radius: float | None = None) -> float:
-    """Volume of the union of equal balls: M(s, rho, lambda) of Wang et al.
+def fmc(points: ArrayLike) -> float:
+    """Return the volume of the union of balls: M(s, rho, lambda) of Wang et al.
 
     Args:
         points: centres of the balls, shape (n, d) with d from 1 to 6, in normalised coordinates:
             the cases with a score below lambda. Shape (0,) also means no points. Not modified;
             order and repeated points do not matter.
-        radius: radius rho of the balls, in the same coordinates; by default `radius_for(d)`.
 
     Returns:
-        Length (d = 1), area (d = 2) or volume of the union, not clipped to the unit cube; 0.0 for
-        no points. Exact up to rounding for d = 1 and 2. For d = 3 within about 1e-4 of the volume
-        (measured on clusters, bands, plates and lattices: mostly 3e-5, 1.3e-4 at worst), so that
-        one more point may lower the figure by as much. For d > 3 with a standard error of at most
-        1e-3 of the volume for clouds and bands of 1,000 points (measured for d = 4 to 6), 4e-3 for
-        20,000, and 2e-2 for heaps. The same points have the same figure.
+        Length (d = 1), area (d = 2) or volume of the union of balls of radius `radius_for(d)`, not
+        clipped to the unit cube; 0.0 for no points. Exact up to rounding for d = 1 and 2. Sampled
+        for d > 2, with a standard error of at most 1e-3 of the volume for clouds and bands of 1,000
+        points, 4e-3 for 20,000, and 2e-2 for heaps. The same points have the same figure.
 
     Raises:
-        ValueError: points of another shape or dimension, points that are not finite, a radius that
-            is not a positive finite number, or points more than a million radii apart.
+        ValueError: points of another shape or dimension, points that are not finite, or points more
+            than a million radii apart.
+
+    Example:
+        >>> fmc([[0.5, 0.5]])  # pi * 0.05**2
+        0.007853981633974483
     """
-    cases = _checked(points, radius)
-    dimension = cases.shape[1]
-    unit = radius_for(dimension) if radius is None else radius
-    return _volume(cases.tobytes(), dimension, float(unit)) if len(cases) else 0.0
+    cases = _checked(points)
+    return _volume(cases.tobytes(), cases.shape[1]) if len(cases) else 0.0
 
 
 @lru_cache(maxsize=256)
-def _volume(cases: bytes, dimension: int, unit: float) -> float:
-    """Return the volume of the union: a search that goes on asks for that of its beginning."""
-    centres = _in_radii(np.frombuffer(cases).reshape(-1, dimension), unit)
+def _volume(cases: bytes, dimension: int) -> float:
+    """Return the volume of the union; a search that continues asks again for its beginning."""
+    radius = radius_for(dimension)
+    centres = _in_radii(np.frombuffer(cases).reshape(-1, dimension), radius)
     if dimension == 1:
         volume = 2.0 + float(np.minimum(np.diff(centres[:, 0]), 2.0).sum())
     elif dimension == 2:
-        # The one slice of balls.
-        flat = np.column_stack([centres, np.zeros(len(centres))])
-        volume = _sliced_area(flat, cKDTree(flat), np.arange(len(flat)), np.zeros(len(flat)))
-    elif dimension == 3:
-        volume = _union_volume(centres)
+        volume = _union_area(centres)
     else:
         # A place is drawn as often as it is in balls (Karp and Luby, 1983).
         volume = len(centres) * ball_volume(dimension) * float((1.0 / _balls_at(centres)).mean())
-    return float(volume * unit**dimension)
+    return float(volume * radius**dimension)
 
 
-def covered(points: ArrayLike, failures: ArrayLike, radius: float | None = None) -> BoolArray:
-    """Return which of some points, (m, d), the balls around failures, (n, d), contain: (m,).
+def covered(points: ArrayLike, failures: ArrayLike) -> BoolArray:
+    """Return which of some points the balls around failures contain.
 
     The mean over failing points that were drawn uniformly, whatever was searched, is the *covered
     share*: the share of the failing volume that lies within a radius of a failure found. It is a
-    share of independent points, so its error is that of a binomial share of m, in any dimension.
-    Raises as `fmc` does.
+    share of independent points, so its error is that of a binomial share, in any dimension.
+
+    Args:
+        points: places, (m, d), as those of `fmc`.
+        failures: centres of the balls, (n, d).
+
+    Returns:
+        Shape (m,).
     """
-    return _near(points, failures, radius, nth=1)
+    return _near(points, failures, nth=1)
 
 
-def has_neighbour(points: ArrayLike, radius: float | None = None) -> BoolArray:
-    """Return which of some points, (n, d), have another one within the radius: (n,).
-
-    Raises as `fmc` does.
-    """
-    return _near(points, points, radius, nth=2)
+def has_neighbour(points: ArrayLike) -> BoolArray:
+    """Return which of some points, (n, d), have another one within the radius: (n,)."""
+    return _near(points, points, nth=2)
 
 
-def _near(points: ArrayLike, others: ArrayLike, radius: float | None, nth: int) -> BoolArray:
+def _near(points: ArrayLike, others: ArrayLike, nth: int) -> BoolArray:
     """Return for which points, (m, d), the nth nearest of others is within the radius, (m,)."""
-    drawn, found = _checked(points, radius), _checked(others, radius)
-    if not (len(drawn) and len(found)):
-        return np.zeros(len(drawn), dtype=np.bool_)
-    limit = (radius_for(drawn.shape[1]) if radius is None else radius) * (1.0 + _LINK_SLACK)
-    distance, _ = cKDTree(found).query(drawn, k=[nth], distance_upper_bound=2.0 * limit)
+    places, found = _checked(points), _checked(others)
+    if len(places) == 0 or len(found) == 0:
+        return np.zeros(len(places), dtype=np.bool_)
+    limit = radius_for(places.shape[1]) * (1.0 + SLACK)
+    distance, _ = cKDTree(found).query(places, k=[nth], distance_upper_bound=2.0 * limit)
     within: BoolArray = distance[:, 0] <= limit
     return within
 
 
-def growth_bound(points: ArrayLike, radius: float | None = None) -> float:
+def growth_bound(points: ArrayLike) -> float:
     """Return the most that as many uniform cases again add to the FMC, as a share of it.
 
     Of N uniform cases, the failures within a radius of a place x are Poisson distributed with mean
@@ -165,115 +141,70 @@ def growth_bound(points: ArrayLike, radius: float | None = None) -> float:
     is the share of the union that lies in one ball alone, up to the randomness of the cases.
 
     Args:
-        points: failing ones of uniform cases, shape (n, d).
-        radius: as of `fmc`.
+        points: failures among uniform cases, shape (n, d).
 
     Returns:
         0 to 1; 1 where no two balls overlap, 0 for no points. Sampled, to within 0.01. The order
-        of the points does not matter; a point given twice counts twice. Raises as `fmc` does.
+        of the points does not matter; a repeated point counts twice.
     """
-    cases = _checked(points, radius)
+    cases = _checked(points)
     if len(cases) == 0:
         return 0.0
-    unit = radius_for(cases.shape[1]) if radius is None else radius
-    balls = _balls_at(cases[np.lexsort(cases.T)] / unit)
+    in_order = cases[np.lexsort(cases.T)]
+    balls = _balls_at(in_order / radius_for(cases.shape[1]))
     return float((balls == 1).sum() / (1.0 / balls).sum())
 
 
 def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
-    """Connected regions of failures: components of the graph that links points within a radius.
+    """Return the connected region of each failure: points within a radius are linked.
 
     Args:
         points: cases, shape (n, d) with d from 1 to 6, in normalised coordinates. Shape (0,) also
             means no points. Not modified.
-        radius: two points at this distance or less (to within 1e-9 of it) are in one region; by
-            default `radius_for(d)`.
+        radius: largest distance of two linked points; by default `radius_for(d)`.
 
     Returns:
         Shape (n,): the region of each point. Region 0 has the most points, then 1 and so on;
-        regions of equal size are in the order of their first point. Empty for no points. Memory
-        grows with the number of points, however dense they are.
+        regions of equal size are in the order of their first point.
 
     Raises:
-        ValueError: points of another shape or dimension, points that are not finite, or a radius
-            that is not a positive finite number.
+        ValueError: points of another shape or dimension, or points that are not finite.
     """
-    cases = _checked(points, radius)
-    if len(cases) == 0:
-        return np.zeros(0, dtype=np.int64)
-    # Pairs grow with the square of the number of copies of a point, so link each place once.
-    places, place = np.unique(cases, axis=0, return_inverse=True)
-    place = place.reshape(-1)  # a column in NumPy 2.0.0
+    cases = _checked(points)
     limit = radius_for(cases.shape[1]) if radius is None else radius
-    component = _linked(places, limit * (1.0 + _LINK_SLACK))[place]
-    _, first, size = np.unique(component, return_index=True, return_counts=True)
+    tree = cKDTree(cases)
+    first = np.full(len(cases), -1)
+    for start in range(len(cases)):
+        to_visit = [start] if first[start] < 0 else []
+        while to_visit:
+            near = np.array(tree.query_ball_point(cases[to_visit.pop()], limit * (1.0 + SLACK)))
+            new = near[first[near] < 0]
+            first[new] = start
+            to_visit += new.tolist()
+    _, region, size = np.unique(first, return_inverse=True, return_counts=True)
     rank = np.empty(len(size), dtype=np.int64)
-    rank[np.lexsort((first, -size))] = np.arange(len(size))
-    ranked: IntArray = rank[component]
+    rank[np.argsort(-size, kind="stable")] = np.arange(len(size))
+    ranked: IntArray = rank[region]
     return ranked
-
-
-def _linked(places: FloatArray, limit: float) -> IntArray:
-    """Return the component of each of n distinct points, (n,), linked at `limit` or less.
-
-    Dense points have too many links to list. Their nearest neighbours link most of them; points in
-    one cell of a grid with a diagonal of `limit` are linked anyhow. What these leave apart is
-    looked at part by part, among the points that have more neighbours than were looked at.
-    """
-    n, dimension = places.shape
-    near = min(_FIRST_NEIGHBOURS + 1, n)
-    distance, neighbour = cKDTree(places).query(places, k=np.arange(1, near + 1))
-    point, column = np.nonzero(distance <= limit)
-    all_looked_at = (distance[:, -1] > limit) | (near == n)
-    grid = np.floor(places / (limit / np.sqrt(dimension))).astype(np.int64)
-    _, first, cell = np.unique(grid, axis=0, return_index=True, return_inverse=True)
-    cell = cell.reshape(-1)
-    links = [
-        np.column_stack([point, neighbour[point, column]]),
-        np.column_stack([np.arange(n), first[cell]]),
-    ]
-    component = _components(links, n)
-    crowded = np.flatnonzero(~all_looked_at)
-    labels = component[crowded]
-    for label in np.unique(labels)[:-1].tolist():
-        own, later = crowded[labels == label], crowded[labels > label]
-        low, high = places[own].min(axis=0) - limit, places[own].max(axis=0) + limit
-        later = later[((places[later] >= low) & (places[later] <= high)).all(axis=1)]
-        if not len(later):
-            continue
-        distance, nearest = cKDTree(places[own]).query(places[later])
-        near_enough = distance <= limit
-        links.append(np.column_stack([own[nearest[near_enough]], later[near_enough]]))
-    return _components(links, n)
-
-
-def _components(links: list[IntArray], n: int) -> IntArray:
-    """Return the component of each of n points, (n,), from arrays of linked pairs, (m, 2)."""
-    pairs = np.concatenate(links)
-    graph = coo_array((np.ones(len(pairs), dtype=np.bool_), pairs.T), shape=(n, n))
-    component: IntArray = connected_components(graph, directed=False)[1]
-    return component
 
 
 def _balls_at(centres: FloatArray) -> IntArray:
     """Return in how many unit balls around centres, (n, d), places drawn in them lie."""
-    rng, dimension = np.random.default_rng(_SEED), centres.shape[1]
-    direction = rng.standard_normal((_SAMPLES, dimension))
+    rng, dimension = np.random.default_rng(20210909), centres.shape[1]
+    direction = rng.standard_normal((SAMPLES, dimension))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    reach = rng.random((_SAMPLES, 1)) ** (1.0 / dimension)
-    places = centres[rng.integers(len(centres), size=_SAMPLES)] + reach * direction
+    reach = rng.random((SAMPLES, 1)) ** (1.0 / dimension)
+    places = centres[rng.integers(len(centres), size=SAMPLES)] + reach * direction
     balls = cKDTree(centres).query_ball_point(places, 1.0, return_length=True)
     return np.maximum(np.asarray(balls, dtype=np.int64), 1)
 
 
-def _checked(points: ArrayLike, radius: float | None) -> FloatArray:
-    """The points as an array (n, d), d = 1 to 6, or a ValueError that says what is wrong."""
-    if radius is not None and not (np.isfinite(radius) and radius > 0.0):
-        raise ValueError(f"radius must be a positive finite number, got {radius}")
+def _checked(points: ArrayLike) -> FloatArray:
+    """Return points as an array (n, d), or raise a ValueError that says what is wrong."""
     cases = np.asarray(points, dtype=np.float64)
     if cases.shape == (0,):
         return np.zeros((0, 1))
-    if cases.ndim != 2 or not 1 <= cases.shape[1] <= MOST_DIMENSIONS:
+    if cases.ndim != 2 or not 1 <= cases.shape[1] <= 6:
         raise ValueError(f"points must have shape (n, d) with d from 1 to 6, got {cases.shape}")
     bad = np.flatnonzero(~np.isfinite(cases).all(axis=1))
     if len(bad):
@@ -282,144 +213,80 @@ def _checked(points: ArrayLike, radius: float | None) -> FloatArray:
 
 
 def _in_radii(cases: FloatArray, radius: float) -> FloatArray:
-    """The distinct points, sorted, in radii from the middle of their bounding box."""
-    if len(cases) == 0:
-        return cases
+    """Return the distinct points, sorted, in radii from the middle of their bounding box."""
     low, high = cases.min(axis=0), cases.max(axis=0)
     with np.errstate(over="ignore"):
         span = float(((high - low) / radius).max())
-    if span > _MAX_SPAN:
-        raise ValueError(
-            f"points span {span:.3g} radii, more than {_MAX_SPAN:.0e}: normalise them to [0, 1]"
-        )
-    # The same case written with another rounding is the same case. Sorting makes the result equal
-    # to the last bit for every order of the points.
-    return np.unique(np.round((cases - (low + high) / 2.0) / radius / _MERGE) * _MERGE, axis=0)
+    # The boundary integral loses span * 1e-16 of a disc to rounding.
+    if span > 1e6:
+        raise ValueError(f"points span {span:.3g} radii, more than 1e+06: normalise them to [0, 1]")
+    # Snapped to a grid, which moves a boundary by 1e-12 at most: a case written with another
+    # rounding is the same case. Sorting makes the result equal to the last bit for every order.
+    grid = 2.0**-40
+    return np.unique(np.round((cases - (low + high) / 2.0) / radius / grid) * grid, axis=0)
 
 
-def _union_volume(centres: FloatArray) -> float:
-    """Volume of the union of unit balls around distinct centres (n, 3).
+def _union_area(centres: FloatArray) -> float:
+    """Return the area of the union of unit discs around distinct centres, (n, 2).
 
-    Midpoint rule over the area A(z) of slices, with the error of its worst kinks taken off: where
-    a ball begins or ends at z0, A changes by pi (2 t - t^2), t = |z - z0|, unless another ball
-    hides that pole. A lone ball is exact that way. What is left are the heights where boundaries
-    meet, and A is smoother (t^1.5): with m slices per diameter about m^-2.5, of either sign.
+    Each circle is first compared with its nearest discs. A circle that some of them cover is not
+    part of the boundary; the others, few where discs are dense, are compared with more and more.
     """
-    n = len(centres)
-    # Cases on a grid or in a plane would have all their kinks at the same heights, where errors add
-    # up; turned by no special angle, they cancel out. The volume does not change.
-    balls: FloatArray = Rotation.from_euler("xyz", _TURNED_RAD).apply(centres)
-    tree = cKDTree(balls)
-    bottom, top = float(balls[:, 2].min()) - 1.0, float(balls[:, 2].max()) + 1.0
-    per_diameter = max(_SLICES, _DISC_BUDGET // n, int(_SLICES_IN_ALL * 2.0 / (top - bottom)))
-    per_diameter = min(per_diameter, _MAX_SLICES)
-    step = 2.0 / per_diameter
-    first = np.floor((balls[:, 2] - 1.0 - bottom) / step).astype(np.int64)
-    nth = first[:, None] + np.arange(per_diameter + 2)
-    heights = bottom + step * (nth.astype(np.float64) + 0.5)
-    ball, column = np.nonzero(np.abs(heights - balls[:, 2:]) < 1.0)
-    volume = step * _sliced_area(balls, tree, ball, heights[ball, column])
-    for side in (-1.0, 1.0):
-        poles = balls[:, 2] + side
-        bare = poles[_bare_poles(balls, tree, side, depth=step / 4.0)]
-        phase = np.mod((bare - bottom) / step - 0.5, 1.0)
-        # Euler-Maclaurin: where A' jumps by 2 pi, the sum exceeds the integral by this.
-        excess = -(step**2) / 2.0 * _TURN * (phase**2 - phase + 1.0 / 6.0)
-        volume -= float(excess.sum())
-    return volume
-
-
-def _bare_poles(balls: FloatArray, tree: cKDTree, side: float, depth: float) -> NDArray[np.bool_]:
-    """Which unit balls (n, 3) show a pole, the lower (side -1) or the upper one (side 1).
-
-    A pole is hidden if a ball that reaches further contains the point `depth` inside it. Asking for
-    that point and not for the pole itself makes two poles that are closer than the slices can tell
-    one kink (measured: an eighth to a half of the distance of the slices does equally well).
-    """
-    inside = balls + np.array([0.0, 0.0, side * (1.0 - depth)])
-    # The balls that reach furthest past a point within the cap are the nearest to it.
-    _, near = tree.query(inside, k=np.arange(1, min(_FIRST_NEIGHBOURS, len(balls)) + 1))
-    further = side * (balls[near, 2] - balls[:, 2:]) > 0.0
-    contains = np.linalg.norm(balls[near] - inside[:, None], axis=2) < 1.0
-    bare: NDArray[np.bool_] = ~(further & contains).any(axis=1)
-    return bare
-
-
-def _sliced_area(balls: FloatArray, tree: cKDTree, ball: IntArray, height: FloatArray) -> float:
-    """Area of the union of discs in each slice, summed over the slices.
-
-    A disc is the cut of unit ball `ball[i]` of the distinct `balls` (n, 3) at z = `height[i]`; all
-    discs of a slice must be given. Each disc's circle is first compared with its nearest balls: a
-    circle that some of them cover is no part of the boundary, whatever the others do. Only the
-    circles left over, few where balls are dense, are compared with more, at last with all.
-    """
-    n = len(balls)
-    area = 0.0
-    neighbours = _FIRST_NEIGHBOURS + 1  # a ball is its own nearest
-    while len(ball):
-        neighbours = min(neighbours, n)
-        undecided: list[IntArray] = []
-        rows = max(1, _CHUNK // neighbours)
-        for start in range(0, len(ball), rows):
-            part = slice(start, start + rows)
-            known, left = _boundary_integral(balls, tree, ball[part], height[part], neighbours)
+    tree = cKDTree(centres)
+    area, neighbours = 0.0, 9
+    discs = np.arange(len(centres))
+    while len(discs):
+        neighbours = min(neighbours, len(centres))
+        undecided = []
+        rows = max(1, PAIRS_AT_ONCE // neighbours)
+        for start in range(0, len(discs), rows):
+            part = discs[start : start + rows]
+            known, left = _boundary_integral(tree, part, neighbours)
             area += known
-            undecided.append(start + left)
-        again = np.concatenate(undecided)
-        ball, height = ball[again], height[again]
-        neighbours *= _MORE_NEIGHBOURS
+            undecided.append(left)
+        discs = np.concatenate(undecided)
+        neighbours *= 4
     return area
 
 
-def _boundary_integral(
-    balls: FloatArray, tree: cKDTree, ball: IntArray, height: FloatArray, neighbours: int
-) -> tuple[float, IntArray]:
-    """Integral of (x dy - y dx) / 2 over the uncovered arcs of some discs (Green's theorem).
+def _boundary_integral(tree: cKDTree, discs: IntArray, neighbours: int) -> tuple[float, IntArray]:
+    """Integrate (x dy - y dx) / 2 over the uncovered arcs of some discs (Green's theorem).
 
-    Returns the integral over the discs that have no more than the given number of neighbours, and
-    the indices of the discs with an uncovered arc that have more and so are undecided.
+    Args:
+        tree: centres of all unit discs, (n, 2).
+        discs: the discs to integrate over, (m,), as indices of centres.
+        neighbours: number of the nearest discs that may cover a circle, the disc itself included.
+
+    Returns:
+        The integral over the discs that have no more neighbours than that, and the discs with an
+        uncovered arc that have more and so are undecided.
     """
-    n = len(balls)
-    used, row = np.unique(ball, return_inverse=True)
-    # Balls 2 apart touch at most. Missing neighbours get the index n.
-    _, near = tree.query(balls[used], k=np.arange(1, neighbours + 1), distance_upper_bound=2.0)
-    complete = (near[:, -1] == n) | (neighbours == n)
-    absent = (near == n) | (near == used[:, None])
-    near = np.where(absent, 0, near)
+    centres = tree.data[discs]
+    # Discs 2 apart touch at most. Missing neighbours get the index n and an infinite distance.
+    distance, near = tree.query(centres, k=np.arange(1, neighbours + 1), distance_upper_bound=2.0)
+    has_all = np.isinf(distance[:, -1]) | (neighbours == tree.n)
+    absent = np.isinf(distance) | (distance == 0.0)
+    away = tree.data[np.where(absent, discs[:, None], near)] - centres[:, None]
 
-    # What concerns a pair of balls and not the slice: direction and distance in the plane.
-    dx, dy, dz = (balls[near, axis] - balls[used, axis][:, None] for axis in range(3))
-    # Of two balls above each other, each must see the other one on the opposite side.
-    above = (dx == 0.0) & (dy == 0.0)
-    dx = np.where(above, np.copysign(_COINCIDENT, near - used[:, None]), dx)
-    distance = np.where(absent, 4.0, np.hypot(dx, dy))
-    direction = np.where(absent, 0.0, np.arctan2(dy, dx))
-    slope = np.where(absent, 0.0, dz / distance)
-    z_sum = balls[near, 2] + balls[used, 2][:, None]
-
-    # A neighbour covers the angles within `half` of its direction, from the cosine rule
-    # (d^2 + r^2 - r'^2) / 2dr; beyond +-1 it covers nothing or all. r^2 - r'^2 is written as a
-    # product so that it is exactly opposite for the two discs, which then agree on who covers whom.
-    # An absent one gets no width.
-    own = balls[ball]
-    size = np.sqrt(1.0 - (height - own[:, 2]) ** 2)
-    cosine = distance[row] + slope[row] * (z_sum[row] - 2.0 * height[:, None])
-    half = np.arccos(np.clip(cosine / (2.0 * size[:, None]), -1.0, 1.0))
-    begin = direction[row] - half
-    begin[begin < 0.0] += _TURN
+    # A neighbour covers the angles within `half` of its direction, an absent one none.
+    turn = 2.0 * np.pi
+    half = np.arccos(np.where(absent, 2.0, distance) / 2.0)
+    begin = np.arctan2(away[..., 1], away[..., 0]) - half
+    begin[begin < 0.0] += turn
     end = begin + 2.0 * half
 
     # Cut the circle at angle 0: one more interval holds what reaches over the cut. With begins and
     # ends sorted apart, the k-th end is followed by a gap if it comes before begin k + 1, for then
     # as many intervals have ended there as have begun.
-    over = np.maximum(end.max(axis=1) - _TURN, 0.0)
-    ends = np.sort(np.column_stack([over, np.minimum(end, _TURN)]), axis=1)
-    begins = np.sort(np.column_stack([begin, np.full(len(ball), _TURN)]), axis=1)
-    uncovered = begins - ends > _MIN_ARC_RAD
-    undecided = np.flatnonzero(uncovered.any(axis=1) & ~complete[row])
+    over = np.maximum(end.max(axis=1) - turn, 0.0)
+    ends = np.sort(np.column_stack([over, np.minimum(end, turn)]), axis=1)
+    begins = np.sort(np.column_stack([begin, np.full(len(discs), turn)]), axis=1)
+    # A shorter arc is the rounding of two angles below 2 pi.
+    uncovered = begins - ends > 1e-14
+    undecided = discs[uncovered.any(axis=1) & ~has_all]
 
-    disc, gap = np.nonzero(uncovered & complete[row][:, None])
-    low, high, r = ends[disc, gap], begins[disc, gap], size[disc]
-    x_part = own[disc, 0] * (np.sin(high) - np.sin(low))
-    y_part = own[disc, 1] * (np.cos(high) - np.cos(low))
-    return float(np.sum(r * (r * (high - low) + x_part - y_part))) / 2.0, undecided
+    disc, gap = np.nonzero(uncovered & has_all[:, None])
+    low, high = ends[disc, gap], begins[disc, gap]
+    x_part = centres[disc, 0] * (np.sin(high) - np.sin(low))
+    y_part = centres[disc, 1] * (np.cos(high) - np.cos(low))
+    return float(np.sum(high - low + x_part - y_part)) / 2.0, undecided
