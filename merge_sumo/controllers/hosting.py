@@ -114,6 +114,8 @@ class ControllerProcess(ChildProcess):
 class HostedKind(ControllerKind):
     """A controller whose code runs in a process of its own; the first driver takes that process."""
 
+    asks_sumo = False
+
     def __init__(
         self,
         spec: ControllerSpec,
@@ -134,8 +136,7 @@ class HostedKind(ControllerKind):
         """
         super().__init__(spec, options)
         self._kind, self._process = kind, None
-        self.asks_sumo, self.no_parameters = kind.asks_sumo, kind.no_parameters
-        self.files_are_known = kind.files_are_known
+        self.no_parameters = kind.no_parameters
         if loaded is None:
             self._process = self.process()
             loaded = self._process.loaded

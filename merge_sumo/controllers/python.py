@@ -7,8 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import EntryPoint
@@ -95,7 +94,8 @@ class OfPython(ControllerKind):
         self._keywords: dict[str, float] = {}
         self._attributes: dict[str, float] = {}
         for name, value in spec.numbers().items():
-            (self._keywords if name in defaults else self._attributes)[name] = value
+            chosen = self._keywords if name in defaults else self._attributes
+            chosen[name] = value
         if self._attributes and self._is_function:
             raise spec.has_no(next(iter(self._attributes)), defaults)
         self._numbers: dict[str, float] = {}
@@ -110,8 +110,8 @@ class OfPython(ControllerKind):
     def refused(self, target: Any) -> UserError:
         """Return the error for a target that is not a VUT."""
         return UserError(
-            f"{self.spec} is {text_of(target, repr)[:80]}: a VUT is a class with `act(self, seen)` "
-            "or `act_batch(self, seen)`, or a function `f(seen)`"
+            f"{self.spec.argument} is {text_of(target, repr)[:80]}: a VUT is a class or an object "
+            "with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
         )
 
     def controller(self) -> Controller:
@@ -224,13 +224,6 @@ class HereKind(OfPython):
         if file and Path(file).is_file():
             self.code = (Path(file),)
         return target
-
-    def refused(self, target: Any) -> UserError:
-        """Return the error for an object that is not a VUT."""
-        return UserError(
-            f"{text_of(target, repr)[:80]} is no VUT: give a spec, a class or an object with "
-            "`act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
-        )
 
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
         """Travel with the object."""
@@ -437,31 +430,25 @@ def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
         reset(*arguments)
 
 
-@contextmanager
-def _working_folder_in_path() -> Iterator[None]:
-    """Let modules in the working folder be imported, as a user who starts Python there expects."""
-    folder = str(Path.cwd())
-    if folder in sys.path:
-        yield
-        return
-    sys.path.append(folder)
-    try:
-        yield
-    finally:
-        sys.path.remove(folder)
-
-
 def _module_of(source: str) -> ModuleType:
     """Return the module of a file or of a name; `UserError` where it cannot be loaded."""
     try:
         if source.endswith(".py"):
             check_code(Path(source))
             return module_of_file(Path(source))
-        with _working_folder_in_path():
+        # As a user who starts Python in the working folder expects, its modules can be imported.
+        folder = str(Path.cwd())
+        is_new = folder not in sys.path
+        if is_new:
+            sys.path.append(folder)
+        try:
             found = importlib.util.find_spec(source.partition(".")[0])
             if found is not None and found.has_location and found.origin is not None:
                 check_code(Path(found.origin))
             return importlib.import_module(source)
+        finally:
+            if is_new:
+                sys.path.remove(folder)
     except UserError:
         raise
     except (Exception, SystemExit) as error:
@@ -477,7 +464,7 @@ def _cannot_load(what: str, error: BaseException) -> UserError:
 def module_of_file(path: Path) -> ModuleType:
     """Return the module that a file holds; it is executed once, and again when it has changed.
 
-    Modules beside it are found. Raises OSError where it cannot be read, and what its code raises.
+    Modules next to it are found. Raises OSError where it cannot be read, and what its code raises.
     """
     return _executed(path.resolve(), path.stat().st_mtime_ns)
 
@@ -489,7 +476,7 @@ def _executed(path: Path, _changed_ns: int) -> ModuleType:
         raise ImportError("it is no Python file")
     module = importlib.util.module_from_spec(spec)
     if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))  # for the modules beside it
+        sys.path.append(str(path.parent))  # for the modules next to it
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module

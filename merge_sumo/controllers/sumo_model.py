@@ -1,8 +1,8 @@
 """SUMO's own drivers as VUT: a car-following model with SUMO's junction logic.
 
 At every step the model decides on a speed from the state, as it does in any SUMO simulation; the
-POV is a vehicle on the road for it, before M by the right of way of the zipper junction and behind
-M as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
+POV is a vehicle on the road for it, before M by the right of way of the zipper junction and after M
+as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
 any other, and eq. (4) moves the car. On an acceleration lane SUMO's lane-change model decides when
 to merge: the lane on which the VUT is after SUMO's step is its wish.
 """
@@ -22,53 +22,42 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.sumo.world import World
 
-SHARED_OPTIONS = {
-    *("maxSpeed", "accel", "decel", "emergencyDecel"),
-    *("apparentDecel", "tau", "minGap", "speedFactor", "impatience", "jmIgnoreFoeProb"),
-    *("jmIgnoreFoeSpeed", "jmSigmaMinor", "jmStoplineGap", "jmTimegapMinor", "jmExtraGap"),
-    *("jmAdvance",),
+SHARED_OPTIONS = (
+    "maxSpeed accel decel emergencyDecel apparentDecel tau minGap speedFactor impatience "
+    "jmIgnoreFoeProb jmIgnoreFoeSpeed jmSigmaMinor jmStoplineGap jmTimegapMinor jmExtraGap "
+    "jmAdvance"
+)
+LANE_CHANGE_OPTIONS = (
+    "lcStrategic lcStrategicLookahead lcLookaheadLeft lcAssertive lcSigma lcCooperative "
+    "lcCooperativeSpeed lcCooperativeMinSpeed lcCooperativeRoundabout lcCooperativeHelpTime "
+    "lcCooperativeHelpThreshold lcSpeedGain lcSpeedGainRight lcSpeedGainLookahead "
+    "lcSpeedGainRemainTime lcKeepRight lcKeepRightAcceptanceTime lcContRight lcOpposite "
+    "lcOvertakeRight lcOvertakeDeltaSpeedFactor lcMaxSpeedLatStanding lcMaxSpeedLatFactor "
+    "lcMaxDistLatStanding"
+)
+"""Options of SUMO's lane-change model LC2013; -1 turns some of them off. SUMO's other ones are
+those of its sublane model, which does not drive here."""
+ACC = (
+    "speedControlGain gapClosingControlGainSpeed gapClosingControlGainSpace gapControlGainSpeed "
+    "gapControlGainSpace collisionAvoidanceGainSpeed collisionAvoidanceGainSpace "
+    "collisionAvoidanceOverride"
+)
+MODELS = {
+    "Krauss": "sigma sigmaStep",
+    "IDM": "delta stepping",
+    "EIDM": "delta stepping tpreview tPersDrive treaction tPersEstimate ccoolness jerkmax "
+    "epsilonacc taccmax Mflatness Mbegin maxvehpreview sigmaleader sigmagap sigmaerror",
+    "ACC": ACC,
+    "CACC": f"{ACC} speedControlGainCACC gapClosingControlGainGap gapClosingControlGainGapDot "
+    "gapControlGainGap gapControlGainGapDot collisionAvoidanceGainGap "
+    "collisionAvoidanceGainGapDot",
 }
-LANE_CHANGE_OPTIONS = {
-    *("lcStrategic", "lcStrategicLookahead", "lcLookaheadLeft", "lcAssertive", "lcSigma"),
-    *("lcCooperative", "lcCooperativeSpeed", "lcCooperativeMinSpeed", "lcCooperativeRoundabout"),
-    *("lcCooperativeHelpTime", "lcCooperativeHelpThreshold"),
-    *("lcSpeedGain", "lcSpeedGainRight", "lcSpeedGainLookahead", "lcSpeedGainRemainTime"),
-    *("lcKeepRight", "lcKeepRightAcceptanceTime", "lcContRight", "lcOpposite", "lcOvertakeRight"),
-    *("lcOvertakeDeltaSpeedFactor", "lcMaxSpeedLatStanding", "lcMaxSpeedLatFactor"),
-    "lcMaxDistLatStanding",
+"""Options of each model, in addition to the shared ones."""
+NO_NOISE = {
+    "Krauss": {"sigma": 0.0},
+    "EIDM": {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0},
 }
-"""Those of SUMO's lane-change model LC2013; -1 turns some of them off. The others that SUMO knows
-are of its sublane model, which does not drive here."""
-ACC_OPTIONS = {
-    *("speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace"),
-    *("gapControlGainSpeed", "gapControlGainSpace", "collisionAvoidanceGainSpeed"),
-    *("collisionAvoidanceGainSpace", "collisionAvoidanceOverride"),
-}
-NO_NOISE = {"sigmaleader": 0.0, "sigmagap": 0.0, "sigmaerror": 0.0}
-MODELS: dict[str, tuple[set[str], dict[str, float]]] = {
-    "Krauss": ({"sigma", "sigmaStep"}, {"sigma": 0.0}),
-    "IDM": ({"delta", "stepping"}, {}),
-    "EIDM": (
-        {
-            *("delta", "stepping", "tpreview", "tPersDrive", "treaction", "tPersEstimate"),
-            *("ccoolness", "jerkmax", "epsilonacc", "taccmax", "Mflatness", "Mbegin"),
-            *("maxvehpreview", *NO_NOISE),
-        },
-        NO_NOISE,
-    ),
-    "ACC": (ACC_OPTIONS, {}),
-    "CACC": (
-        {
-            *ACC_OPTIONS,
-            *("speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot"),
-            *("gapControlGainGap", "gapControlGainGapDot", "collisionAvoidanceGainGap"),
-            "collisionAvoidanceGainGapDot",
-        },
-        {},
-    ),
-}
-"""Options of each model besides the shared ones, and its defaults that are not SUMO's: without
-noise all are deterministic."""
+"""Defaults that are not SUMO's: without noise all models are deterministic."""
 
 
 class SumoKind(ControllerKind):
@@ -84,18 +73,18 @@ class SumoKind(ControllerKind):
         super().__init__(spec, options)
         model = spec.argument
         if model not in MODELS:
-            raise UserError(f"{spec}: choose one of {', '.join(f'sumo:{m}' for m in MODELS)}")
-        own, defaults = MODELS[model]
-        known = SHARED_OPTIONS | LANE_CHANGE_OPTIONS | own
+            raise UserError(f"{spec}: choose one of sumo:{', sumo:'.join(MODELS)}")
+        known = f"{SHARED_OPTIONS} {LANE_CHANGE_OPTIONS} {MODELS[model]}".split()
         self.settable = chosen = spec.numbers()
         for name, value in chosen.items():
             if name not in known:
                 raise spec.has_no(name, known)
-            least = -1 if name in LANE_CHANGE_OPTIONS else 0
+            least = -1 if name.startswith("lc") else 0
             if value < least:
                 raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
-        options_of_type = {name: f"{value:.12g}" for name, value in (defaults | chosen).items()}
-        self.vut_type = {"carFollowModel": model, **options_of_type}
+        self.vut_type = {"carFollowModel": model}
+        for name, value in (NO_NOISE.get(model, {}) | chosen).items():
+            self.vut_type[name] = f"{value:.12g}"
 
     def driver(self, corridors: int, world: object) -> Driver:
         """Return a driver in a world of SUMO."""

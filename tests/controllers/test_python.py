@@ -158,9 +158,9 @@ class Vut:
     ("source", "name", "said"),
     [
         ("", "Vut", "has no 'Vut'"),
-        ("Vut = 3", "Vut", "a VUT is a class with `act"),
-        ("Vut = object()", "Vut", "a VUT is a class with `act"),
-        ("class Vut: pass", "Vut", "a VUT is a class with `act"),
+        ("Vut = 3", "Vut", "a VUT is a class or an object"),
+        ("Vut = object()", "Vut", "a VUT is a class or an object"),
+        ("class Vut: pass", "Vut", "a VUT is a class or an object"),
         ("def Vut(): pass", "Vut", "Vut() is called as Vut(seen)"),
         ("1 / 0", "Vut", "ZeroDivisionError"),
         ("import sys; sys.exit(1)", "Vut", "SystemExit"),

@@ -62,10 +62,7 @@ def test_questions_of_collisions_get_what_a_real_sumo_says(tmp_path):
 def test_questions_of_lights_and_stops_get_what_a_real_sumo_says(tmp_path):
     with lit_crossing(tmp_path) as connections:
         ours, real = connections
-        light = real.trafficlight.getIDList()[0]
         for question in (
-            ("trafficlight", "getControlledLinks", (light,)),
-            ("trafficlight", "getAllProgramLogics", (light,)),
             ("vehicle", "getNextTLS", ("vut",)),
             ("vehicle", "getStops", ("vut",)),
             ("vehicle", "getNextStops", ("vut",)),

@@ -223,10 +223,18 @@ def packed(function: str, answer: Any) -> bytes:
     Raises:
         ProtocolError: if there is no such form.
     """
-    layout = LAYOUTS.get(function) or LAYOUTS.get(function.partition(".")[2])
+    name = function.partition(".")[2]
     try:
-        if layout is not None:
-            return layout(answer)
+        if name in FIELDS:
+            return _fields(FIELDS[name], answer or NOBODY)
+        if name in ROWS:
+            return _rows(ROWS[name], answer)
+        if name in OBJECTS:
+            form, attributes = OBJECTS[name]
+            values = attrgetter(*attributes.split())
+            return _rows(form, list(map(values, answer)))
+        if name in LAYOUTS:
+            return LAYOUTS[name](answer)
         return pack(_form_of(answer), answer)
     except (TypeError, ValueError, AttributeError, struct.error) as error:
         raise ProtocolError("there is no form for the answer") from error
@@ -259,12 +267,6 @@ def _rows(form: str, rows: Sequence[Iterable[Any]]) -> bytes:
     return compound(1 + len(rows) * len(form), content)
 
 
-def _objects(form: str, names: str) -> Callable[[Sequence[Any]], bytes]:
-    """Return what packs objects as rows of their attributes."""
-    values = attrgetter(*names.split())
-    return lambda answer: _rows(form, list(map(values, answer)))
-
-
 def _links(answer: Sequence[Sequence[Any]]) -> bytes:
     """Pack links: libsumo has the lane inside the junction at another position than the wire."""
     return _rows("ssBBBssd", [(link[0], link[4], *link[1:4], *link[5:]) for link in answer])
@@ -277,63 +279,44 @@ def _neighbours(answer: Sequence[tuple[str, float]]) -> bytes:
     return compound(len(answer), content)
 
 
-def _lists(answer: Sequence[Sequence[Sequence[str]]]) -> bytes:
-    count, content = 1, pack("i", len(answer))
-    for links in answer:
-        count += 1 + len(links)
-        content += pack("i", len(links))
-        for link in links:
-            content += pack("l", link)
-    return compound(count, content)
+def _lights(answer: Sequence[Sequence[Any]]) -> bytes:
+    """Pack traffic lights: libsumo has a state as a letter, the wire as its number."""
+    return _rows("sidb", [(*light, ord(state)) for *light, state in answer])
 
 
-def _programs(answer: Sequence[Any]) -> bytes:
-    programs = b""
-    for program in answer:
-        phases = b""
-        for phase in program.getPhases():
-            values = pack("dsdd", phase.duration, phase.state, phase.minDur, phase.maxDur)
-            following = _fields("i" * len(phase.next), phase.next)
-            phases += compound(6, values + following + pack("s", phase.name))
-        pairs = program.subParameter.items()
-        head = pack("sii", program.programID, program.type, program.currentPhaseIndex)
-        head += compound(len(program.getPhases()), phases)
-        programs += compound(5, head + _fields("l" * len(pairs), pairs))
-    return compound(len(answer), programs)
+def _polygon(answer: Sequence[Sequence[float]]) -> bytes:
+    return pack("p", answer)
 
 
-def _stage(stage: Any) -> bytes:
-    names = "type vType line destStop edges travelTime cost length intended depart departPos"
-    names += " arrivalPos description"
-    return _fields("isssldddsddds", attrgetter(*names.split())(stage))
-
-
+NOBODY = "", -1.0
+"""The leader or follower of a vehicle that has none."""
 STOP = "lane endPos stoppingPlaceID stopFlags duration until"
-LAYOUTS: dict[str, Callable[[Any], bytes]] = {
-    "getLeader": lambda answer: _fields("sd", answer or ("", -1.0)),
-    "getFollower": lambda answer: _fields("sd", answer or ("", -1.0)),
-    "getNeighbors": _neighbours,
-    "getLaneChangeState": lambda answer: _fields("ii", answer),
-    "getBestLanes": lambda answer: _rows("sddbBl", answer),
-    "getJunctionFoes": lambda answer: _rows("sddddssBB", answer),
-    "getNextLinks": _links,
-    "getLinks": _links,
-    "getNextStops": _objects("sdsidd", STOP),
-    "getStops": _objects(
+FIELDS = {
+    "getLeader": "sd",
+    "getFollower": "sd",
+    "getLaneChangeState": "ii",
+    "getParameterWithKey": "ss",
+}
+ROWS = {"getBestLanes": "sddbBl", "getJunctionFoes": "sddddssBB"}
+OBJECTS = {
+    "getNextStops": ("sdsidd", STOP),
+    "getStops": (
         "sdsiddddddsssssd",
         f"{STOP} startPos intendedArrival arrival depart split join actType tripId line speed",
     ),
-    "getNextTLS": lambda answer: _rows("sidb", [(*light, ord(state)) for *light, state in answer]),
-    "getCollisions": _objects(
+    "getCollisions": (
         "ssssddssd",
         "collider victim colliderType victimType colliderSpeed victimSpeed type lane pos",
     ),
-    "findRoute": _stage,
-    "findIntermodalRoute": lambda answer: compound(len(answer), b"".join(map(_stage, answer))),
-    "getAllProgramLogics": _programs,
-    "getControlledLinks": _lists,
-    "getShape": lambda answer: pack("p", answer),
-    "getNetBoundary": lambda answer: pack("p", answer),
-    "getParameterWithKey": lambda answer: _fields("ss", answer),
 }
-"""Answers whose form does not follow from their type in Python, by the name of the function."""
+LAYOUTS: dict[str, Callable[[Any], bytes]] = {
+    "getNeighbors": _neighbours,
+    "getNextLinks": _links,
+    "getLinks": _links,
+    "getNextTLS": _lights,
+    "getShape": _polygon,
+    "getNetBoundary": _polygon,
+}
+"""Layouts of the answers whose form does not follow from their type in Python, by the name of the
+function: letters of `pack` of one compound, of rows, of rows of objects by their attributes, and
+functions for the rest."""

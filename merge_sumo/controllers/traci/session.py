@@ -79,33 +79,22 @@ class Effect(Enum):
     REFUSED = "Refused: the scenario and the campaign decide it"
 
 
-SPEEDS = frozenset({"setSpeed", "slowDown", "setAcceleration", "setSpeedMode"})
-GAPS_AND_STOPS = frozenset({"openGap", "setStop", "resume", "setLaneChangeMode"})
-MODEL = frozenset(
-    {
-        *("setMaxSpeed", "setAccel", "setDecel", "setEmergencyDecel", "setApparentDecel"),
-        *("setTau", "setMinGap", "setImperfection", "setSpeedFactor"),
-    }
+SPEEDS = "setSpeed slowDown setAcceleration setSpeedMode"
+MODEL = (
+    "setMaxSpeed setAccel setDecel setEmergencyDecel setApparentDecel setTau setMinGap "
+    "setImperfection setSpeedFactor"
 )
 """Numbers of SUMO's car-following model."""
+REACHED = "setPreviousSpeed moveToXY"
 EFFECTS = {
-    Effect.CARRIED_OUT: SPEEDS | GAPS_AND_STOPS | MODEL,
-    Effect.ON_A_LANE: frozenset({"changeLane", "changeLaneRelative"}),
-    Effect.REACHED: frozenset({"setPreviousSpeed", "moveToXY"}),
-    Effect.LOOKS: frozenset(
-        {
-            *("setColor", "setSignals", "setShapeClass", "setWidth", "setHeight", "setLine"),
-            *("highlight", "setEmissionClass", "setBoardingDuration"),
-        }
-    ),
-    Effect.IN_VAIN: frozenset(
-        {
-            *("setMass", "setLateralAlignment", "setMaxSpeedLat", "setMinGapLat", "changeSublane"),
-            *("setImpatience", "setSpeedDeviation", "setRoutingMode", "setAdaptedTraveltime"),
-            *("setEffort", "setVia", "updateBestLanes", "rerouteTraveltime", "rerouteEffort"),
-            "setParameter",
-        }
-    ),
+    Effect.CARRIED_OUT: f"{SPEEDS} {MODEL} openGap setStop resume setLaneChangeMode",
+    Effect.ON_A_LANE: "changeLane changeLaneRelative",
+    Effect.REACHED: REACHED,
+    Effect.LOOKS: "setColor setSignals setShapeClass setWidth setHeight setLine highlight "
+    "setEmissionClass setBoardingDuration",
+    Effect.IN_VAIN: "setMass setLateralAlignment setMaxSpeedLat setMinGapLat changeSublane "
+    "setImpatience setSpeedDeviation setRoutingMode setAdaptedTraveltime setEffort setVia "
+    "updateBestLanes rerouteTraveltime rerouteEffort setParameter",
 }
 """Commands on vehicles and their types by what becomes of them; others are refused."""
 ONLY_SEEN = ("gui", "poi", "polygon")
@@ -121,7 +110,7 @@ def effect_of(names: tuple[str, ...]) -> Effect:
         return Effect.OWN_KEYS
     if domain in ("vehicle", "vehicletype"):
         for effect, accepted in EFFECTS.items():
-            if not own.isdisjoint(accepted):
+            if not own.isdisjoint(accepted.split()):
                 return effect
     elif domain in ONLY_SEEN or "setParameter" in own:
         return Effect.LOOKS
@@ -129,11 +118,15 @@ def effect_of(names: tuple[str, ...]) -> Effect:
 
 
 def is_answered(names: tuple[str, ...]) -> bool:
-    """Return whether SUMO is asked what the questions that share a number ask.
+    """Return whether SUMO is asked the question that has these names.
 
-    Not of its window, without which SUMO may end, nor of signals of trains.
+    Not of its window, without which SUMO may end, and not of trains, of programs of traffic lights
+    and of routes to find, which a merge does not need.
     """
-    return bool(names) and not names[0].startswith("gui.") and "Constraint" not in names[0]
+    name = names[0] if names else "gui."
+    return not name.startswith(("gui.", "simulation.find")) and not any(
+        part in name for part in ("Constraint", "ProgramLogics", "ControlledLinks")
+    )
 
 
 class NotFiniteError(Exception):
@@ -449,15 +442,15 @@ class Session:
         """
         name = function.partition(".")[2]
         numbers = [value for value in arguments if isinstance(value, float)]
-        for number in numbers if name in MODEL else ():
+        for number in numbers if name in MODEL.split() else ():
             if not 0.0 <= number < math.inf or (name, number) == ("setMaxSpeed", 0.0):
                 raise RefusedError(f"Invalid value {number:g} of {function}.")
         if not all(map(math.isfinite, numbers)):
             raise NotFiniteError(f"{function}({', '.join(f'{n:g}' for n in numbers)})")
-        if name in EFFECTS[Effect.REACHED]:
+        if name in REACHED.split():
             self._reach(function, numbers)
             return
-        self._commands_speeds |= name in SPEEDS
+        self._commands_speeds |= name in SPEEDS.split()
         if function == "vehicle.changeLaneRelative":
             lane, duration_s, *relative = arguments
             arguments = [lane, duration_s]
