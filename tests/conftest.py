@@ -150,3 +150,14 @@ def pytest_runtest_call(item: pytest.Item):
     if tracer is not None and sys.gettrace() is None:
         item.warn(pytest.PytestWarning("the tracer of coverage had ended and goes on"))
         sys.settrace(tracer)
+
+
+@pytest.fixture
+def write_vut(tmp_path):
+    """Return a function that writes the source of a controller, and returns its spec."""
+
+    def write(source: str, name: str = "Vut", file: str = "my_vut.py") -> str:
+        (tmp_path / file).write_text(source, encoding="utf-8")
+        return f"{tmp_path / file}:{name}"
+
+    return write

@@ -1,1 +1,1 @@
-"""Vehicles under test: what a user brings, and how it is called."""
+"""Vehicles under test: the controllers of users, and the way in which they are called."""

@@ -39,7 +39,7 @@ class _State(NamedTuple):
 
 
 class Seen(_State):
-    """What a VUT sees at a step: time and state, and nothing of the POV's driver.
+    """State of the road that a VUT sees at a step, without anything of the POV's driver.
 
     A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
 
@@ -109,7 +109,7 @@ def seen_in(
     *,
     merged: bool = False,
 ) -> Seen:
-    """Return what a VUT sees of the vehicles of a corridor.
+    """Return the observation of a VUT in a corridor.
 
     Args:
         t_s: time since the episode began.
@@ -128,7 +128,7 @@ def seen_in(
 
 
 class Start(msgspec.Struct, array_like=True, frozen=True):
-    """What a controller learns when an episode begins; level and orientation of the POV are hidden.
+    """First observation of an episode; level and orientation of the POV are hidden.
 
     Attributes:
         seed: seed of the episode, for controllers that draw random numbers.
@@ -169,7 +169,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
 
     @property
     def seen(self) -> Seen:
-        """What the controller sees at the start."""
+        """The controller's observation at the start."""
         return seen_in(0.0, self.met, self.x_m, self.v_mps, self.lane_m)
 
 
@@ -198,7 +198,7 @@ class Controller(ABC):
         return {}
 
     def close(self) -> None:  # noqa: B027 (most hold nothing)
-        """Release what the controller holds."""
+        """Release files, processes and memory of the controller."""
 
 
 class ControllerDriver(Driver):
@@ -249,7 +249,7 @@ class ControllerArray(ControllerDriver):
         try:
             with self._deadline as deadline:
                 if self._replace[corridor]:
-                    activity = "made anew for this episode"
+                    activity = "created again for this episode"
                     self._close(corridor)
                     deadline.start()
                     self._controllers[corridor] = self._new()
@@ -299,7 +299,7 @@ class ControllerArray(ControllerDriver):
         return np.array(answers)
 
     def reason(self, corridor: int) -> str | None:
-        """Return what the controller of a corridor did wrong."""
+        """Return the error of the controller of a corridor."""
         return self._reasons[corridor]
 
     def signals(self) -> Mapping[int, Left]:
@@ -329,7 +329,7 @@ class WrongAnswerError(Exception):
 def as_answer(answer: Any) -> tuple[float, int]:
     """Return an answer as an acceleration and a wish, `NO_WISH` where it says nothing of one.
 
-    Raises `WrongAnswerError` for what is neither one real number nor (number, whether to merge).
+    Raises `WrongAnswerError` unless it is one real number or (number, whether to merge).
     """
     if type(answer) is float:
         return answer, NO_WISH
@@ -340,7 +340,7 @@ def as_answer(answer: Any) -> tuple[float, int]:
 
 
 def as_number(answer: Any) -> float:
-    """Return an answer as a float; raises `WrongAnswerError` for what is not one real number."""
+    """Return an answer as a float; raises `WrongAnswerError` unless it is one real number."""
     if isinstance(answer, (int, float, np.integer, np.floating)) and not isinstance(answer, bool):
         return float(answer)
     if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
@@ -349,7 +349,7 @@ def as_number(answer: Any) -> float:
 
 
 def as_wish(merge: Any) -> int:
-    """Return `MERGE` or `STAY`; raises `WrongAnswerError` for what is not True, False, 1 or 0."""
+    """Return `MERGE` or `STAY`; raises `WrongAnswerError` unless it is True, False, 1 or 0."""
     value = merge.item() if isinstance(merge, np.ndarray) and merge.shape == () else merge
     is_number = isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
     if is_number and value in (0, 1):

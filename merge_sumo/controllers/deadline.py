@@ -1,4 +1,4 @@
-"""Limit the time of calls to a controller, and describe what a call raised."""
+"""Limit the time of calls to a controller, and describe the errors of calls."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ process an interrupt is the controller's own doing."""
 class Deadline:
     """Ends calls to a controller that take longer than the deadline.
 
-    While it is entered, a timer in the main thread interrupts a late call, and what the controller
-    prints goes to standard error. Native code is not interrupted, and neither is a call in another
-    thread or on Windows: such a call counts as late when it returns.
+    While it is entered, a timer in the main thread interrupts a late call, and the output of
+    the controller goes to standard error. Native code is not interrupted, and neither is a call in
+    another thread or on Windows: such a call counts as late when it returns.
 
     Example:
         ```python
@@ -94,7 +94,7 @@ class Deadline:
             raise DeadlineExceeded
 
     def reason(self, error: BaseException) -> str:
-        """Describe what a call raised, with file and line; Ctrl-C is raised again."""
+        """Describe the error of a call, with file and line; Ctrl-C is raised again."""
         self._since_s = math.inf
         if isinstance(error, (Stopped, KeyboardInterrupt)) and not heartbeat:
             raise error

@@ -1,8 +1,8 @@
-"""The process that hosts a user's controller: what the controller breaks is this process alone.
+"""The process that hosts a user's controller: the controller can break this process alone.
 
 `hosting.ControllerProcess` starts it and sends it requests. Each has one reply; while a request
 takes long, a reply of None says that it proceeds. Nothing is pickled: a user's code runs here, so
-what is sent is data of known types.
+the messages are data of known types.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         parameters: those of the controllers that were made.
         accelerations_mps2: answers of the drivers.
         wishes: whether they wish to merge.
-        reasons: what is wrong with an answer, by corridor.
+        reasons: the errors of answers, by corridor.
         signals: signals of the answers, by corridor.
     """
 
@@ -86,7 +86,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
 
     @classmethod
     def of(cls, driver: ControllerDriver, scene: Scene) -> HostReply:
-        """Return what a driver answers to a scene."""
+        """Return the answer of a driver to a scene."""
         answers, reasons = driver.act(scene), dict[int, str]()
         for corridor in np.flatnonzero(~np.isfinite(answers) & scene.active).tolist():
             if (reason := driver.reason(corridor)) is not None:
@@ -140,7 +140,7 @@ decode_answer = msgspec.msgpack.Decoder(HostReply | None).decode
 def main(settings: Mapping[str, Any]) -> None:
     """Host a controller until the connection ends."""
     sys.argv[1:] = []
-    # What is printed shortly before a crash must not be lost in a buffer.
+    # Output shortly before a crash must not be lost in a buffer.
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     _default_signals()
     connection = connected(settings, RLIMIT_DATA=int(settings["memory_gib"] * 2**30))

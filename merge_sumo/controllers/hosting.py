@@ -38,7 +38,7 @@ class ControllerProcess(ChildProcess):
     """The process of a controller, which is loaded in it.
 
     Attributes:
-        loaded: what is known of the controller.
+        loaded: properties of the controller.
     """
 
     def __init__(
@@ -123,13 +123,13 @@ class HostedKind(ControllerKind):
         kind: type[ControllerKind],
         loaded: HostReply | None = None,
     ) -> None:
-        """Load the controller, unless it is known what it is.
+        """Load the controller, unless its properties are known.
 
         Args:
             spec: the controller.
             options: how it is hosted.
             kind: its kind.
-            loaded: what is known of it.
+            loaded: its properties.
 
         Raises:
             UserError: if it cannot be loaded.
@@ -238,7 +238,7 @@ class HostedDriver(ControllerDriver):
         return self._parameters
 
     def reason(self, corridor: int) -> str | None:
-        """Return what the controller of a corridor did wrong."""
+        """Return the error of the controller of a corridor."""
         return self._answer.reasons.get(corridor)
 
     def files(self) -> tuple[Path, ...]:

@@ -1,6 +1,6 @@
 """VUTs that are objects of this Python process: a class of a notebook, a lambda, an instance.
 
-What can be imported is named, `module:Name`, and hosted as on the command line. The rest is kept
+An importable one is named, `module:Name`, and hosted as on the command line. The rest is kept
 here under a name of its own, `here:Name`, and drives in the process that runs the cases.
 """
 
@@ -43,9 +43,9 @@ MAINS = ("__main__", "__mp_main__")
 
 
 def spec_of(vut: Any) -> str:
-    """Return what names a VUT in this process and in those that it starts: a spec as it is.
+    """Return the spec of a VUT for this process and for those that it starts.
 
-    Raises `UserError` for what is no VUT.
+    Raises `UserError` for other objects.
     """
     if isinstance(vut, str):
         return vut
@@ -85,7 +85,7 @@ def names_code(text: str) -> bool:
 def travels(spec: ControllerSpec) -> bool:
     """Return whether other processes can be given a VUT: by name, or as a copy of the object.
 
-    What the main module defines cannot be found there.
+    They cannot find definitions of the main module.
     """
     if spec.kind != HERE:
         return True
@@ -97,9 +97,14 @@ def travels(spec: ControllerSpec) -> bool:
 
 
 def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None, AnyWorkers]:
-    """Return the specs of what drives, and which workers can have it.
+    """Return the specs of both controllers, and the workers that can have them.
 
-    Says in a sentence where something drives in this process that could do it harm.
+    Prints a notice where a controller drives in this process and could do it harm.
+
+    Args:
+        vut: the VUT, a spec or an object.
+        pov: the controller of the POV; None for the drivers of the scenario.
+        workers: the requested workers.
     """
     specs = spec_of(vut), None if pov is None else spec_of(pov)
     for spec in (parse(text) for text in specs if text is not None):
@@ -109,8 +114,8 @@ def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None
         if not travels(spec):
             workers, where = 1, "in this process, without workers"
         notice(
-            f"{spec.argument} is an object, so it drives {where}, which what it does wrong may "
-            "end; put its class or function into a module for a process of its own",
+            f"{spec.argument} is an object, so it drives {where}, which its faults may end; "
+            "put its class or function into a module for a process of its own",
             UserWarning,
         )
     return *specs, workers

@@ -40,7 +40,7 @@ KINDS: Registry[type[ControllerKind]] = Registry(
 def parse(text: str) -> ControllerSpec:
     """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`; an unknown name is of `installed`.
 
-    Raises `UserError` for what is no parameter, and for one that is given twice.
+    Raises `UserError` for a malformed parameter, and for one that is given twice.
     """
     kind, _, argument = text.partition(":")
     if kind not in KINDS or kind in WITHOUT_PREFIX:

@@ -11,7 +11,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import meant, quoted
 
 DIGITS = 3
-"""A value is rounded to so many digits of its range: 0.5..3 to thousandths."""
+"""Digits of a rounded value relative to its range: 0.5..3 is rounded to thousandths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Range:
 
     @classmethod
     def parsed(cls, text: str) -> Range:
-        """Read a range, NAME=LOW..HIGH; raises `UserError` for what is none."""
+        """Read a range, NAME=LOW..HIGH; raises `UserError` for other text."""
         name, _, bounds = text.partition("=")
         try:
             low, high = map(float, bounds.split("..", 1))
@@ -44,7 +44,7 @@ class Range:
 
     @property
     def digits(self) -> int:
-        """Digits behind the point of a rounded value."""
+        """Digits after the decimal point of a rounded value."""
         return min(max(0, DIGITS - math.floor(math.log10(self.high - self.low))), 100)
 
 

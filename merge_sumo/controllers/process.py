@@ -37,7 +37,7 @@ ENDING_S = 2.0
 
 
 class Output:
-    """Reads what a process prints until it ends, so that a full pipe never holds it up.
+    """Reads the output of a process until it ends, so that a full pipe never holds it up.
 
     Attributes:
         log: file to which the text is added; None shows it on standard error. A log that is set
@@ -122,7 +122,7 @@ class Started:
     """A process in a group of its own.
 
     Attributes:
-        output: what it prints.
+        output: its standard output and standard error.
     """
 
     def __init__(self, name: str, command: Sequence[str], log: Path | None, **more: Any) -> None:
@@ -274,7 +274,7 @@ class ChildProcess(Started):
         return None
 
     def kill(self) -> None:
-        """End the process, and what it started."""
+        """End the process, and the processes that it started."""
         if not self.alive:
             return  # what its descriptors were may be others' by now
         self.alive = False
@@ -313,7 +313,7 @@ def connected(settings: Mapping[str, Any], **limits: int) -> Connection:
     lower_limits(**limits, RLIMIT_CORE=0)
     end_with(settings["lifeline"])
     inherited = settings["connection"]
-    connection = Connection(os.dup(inherited))  # not inherited by what a controller starts
+    connection = Connection(os.dup(inherited))  # child processes do not inherit it
     os.close(inherited)
     return connection
 
@@ -333,10 +333,10 @@ def split_command(command: str) -> list[str]:
 
 
 def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
-    """Return the files of a command that are code: others are what it reads and writes.
+    """Return the files of a command that are code: it reads and writes the others.
 
     These are its program and, where that is one that this machine has for all, as an interpreter,
-    the first file behind it.
+    the first file after it.
     """
     program, *others = arguments
     words = [program]
@@ -382,7 +382,7 @@ class Program(Started):
         return f"the controller {how}" + (f": {line}" if line else "")
 
     def stop(self, grace_s: float) -> None:
-        """End the program and what it started; it may end by itself for a while first."""
+        """End the program and its child processes; it has some time to end by itself first."""
         try:
             self._process.wait(grace_s)
         except subprocess.TimeoutExpired:

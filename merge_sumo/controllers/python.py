@@ -89,7 +89,7 @@ class OfPython(ControllerKind):
         acts = self._is_batched or callable(getattr(target, "act", None))
         if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
             raise self.refused(target)
-        by_place = int(not self._is_class or self._is_batched)  # what is seen, or the corridors
+        by_place = int(not self._is_class or self._is_batched)  # what is observed, or the corridors
         defaults = defaults_of(target, by_place)
         self._keywords: dict[str, float] = {}
         self._attributes: dict[str, float] = {}
@@ -170,7 +170,7 @@ class PythonKind(OfPython):
     hosted = True
 
     def target(self) -> Any:
-        """Return what the module has by that name."""
+        """Return the object of that name in the module."""
         source, _, name = self.spec.argument.rpartition(":")
         module = _module_of(source)
         target: Any = module
@@ -195,7 +195,7 @@ class InstalledKind(PythonKind):
     form = what = example = ""
 
     def target(self) -> Any:
-        """Return what the package registers."""
+        """Return the object that the package registers."""
         name = self.spec.argument
         try:
             target = installed_vuts()[name].load()
@@ -290,7 +290,7 @@ class BatchedVut(ControllerDriver):
         self._replace = False
         self._raised: str | None = None
         self._wrong: dict[int, str] = {}
-        """What is wrong in a corridor alone: its reset raised something, or its wish is none."""
+        """Errors of single corridors: their reset raised one, or their merge request is invalid."""
         self._lanes_m = np.zeros((2, corridors))
 
     def reset(self, corridor: int, start: Start) -> None:
@@ -365,7 +365,7 @@ class BatchedVut(ControllerDriver):
 
 @dataclass(frozen=True, slots=True)
 class SeenBatch:
-    """What a batched VUT sees: like `Seen`, with arrays over the K corridors, (K,).
+    """Observation of a batched VUT: like `Seen`, with arrays over the K corridors, (K,).
 
     In a corridor that is not `active` the numbers mean nothing. The arrays are copies. Of all cars
     of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K). Where
@@ -394,7 +394,7 @@ class SeenBatch:
 
 
 def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
-    """Return what a VUT sees of a scene; the lanes, (2, K), begin and end there."""
+    """Return the observation of a scene; `lanes_m`, (2, K), has begin and end of the lanes."""
     x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
     order = np.argsort(-x_m, axis=0, kind="stable")
     begin_m, end_m = lanes_m.copy()
@@ -473,7 +473,7 @@ def module_of_file(path: Path) -> ModuleType:
 def _executed(path: Path, _changed_ns: int) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"merge_sumo_file_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ImportError("it is no Python file")
+        raise ImportError("it is not a Python file")
     module = importlib.util.module_from_spec(spec)
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))  # for the modules next to it

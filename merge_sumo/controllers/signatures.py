@@ -22,7 +22,7 @@ from merge_sumo.printable import printable
 
 OF_ONE = {"act": ("seen",), "reset": ("seen",), "close": ()}
 OF_A_BATCH = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()}
-"""Methods of a VUT, and what each is called with; a `reset` may have a `seed` besides."""
+"""Methods of a VUT and their arguments; a `reset` may also have a `seed`."""
 
 
 def is_code(target: Any) -> bool:
@@ -58,9 +58,9 @@ def check_call(
     """Raise `UserError` where a function cannot be called with some arguments in order.
 
     Args:
-        function: what is called.
+        function: the function to check.
         arguments: names of the arguments, for the sentence.
-        seeded: whether it is called with the keyword `seed` besides.
+        seeded: whether it is also called with the keyword `seed`.
     """
     known = partial(function, seed=0) if seeded else function
     if fits(known, len(arguments)) is not False:
@@ -134,7 +134,7 @@ def attributes_of(made: Any) -> dict[str, float]:
 
 
 def number_of(value: Any) -> float | None:
-    """Return a value as a number; None for what is not a finite one."""
+    """Return a value as a number; None unless it is a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     number = value.item() if isinstance(value, np.generic) else value

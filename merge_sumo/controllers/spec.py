@@ -45,7 +45,7 @@ class ControllerOptions:
     memory_gib: float = MEMORY_GIB
     """Memory that the process of a user's code may take."""
     log: Path | None = None
-    """File to which what a controller prints is added; None is standard error."""
+    """File to which the output of a controller is added; None is standard error."""
     policies: Path | None = None
     """Folder of the networks of the learned VUTs; None for the shipped ones."""
 
@@ -115,7 +115,7 @@ class ControllerKind:
 
     Attributes:
         form: how a user writes it; "" for a kind that is not listed.
-        what: what it is, in a phrase.
+        what: its description, in a phrase.
         example: an option `--vut` that names one.
         has_parameters: whether "?" ends the argument in a spec.
         no_parameters: why a spec cannot set parameters, in a clause; "" where it can.
@@ -170,7 +170,7 @@ class ControllerKind:
         return ControllerArray(corridors, self.controller, self.options.deadline_s)
 
     def release(self) -> None:
-        """End what was started to load it, as its drivers are in other processes."""
+        """End the process that loaded it, as its drivers are in other processes."""
 
     @cached_property
     def files(self) -> Files:
@@ -182,7 +182,7 @@ class ControllerKind:
         return self._changed(spec, self.options)
 
     def with_log(self, log: Path) -> Self:
-        """Return the same controller, with what it prints added to a file."""
+        """Return the same controller, with its output added to a file."""
         return self._changed(self.spec, replace(self.options, log=log))
 
     def _changed(self, spec: ControllerSpec, options: ControllerOptions) -> Self:

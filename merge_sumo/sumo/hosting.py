@@ -71,8 +71,12 @@ def _path(lanes: Sequence[_HostedLane]) -> HostedPath:
 def hosted_net(road: Corridor, copies: int, *, lane_goes_on: bool = False) -> bytes:
     """Return the net with `copies` copies of a road.
 
-    With `lane_goes_on` the acceleration lane leads on, too: for replays, where the record changes
-    lanes, also in the step that crosses its end, in which SUMO stops a vehicle at a dead end.
+    Args:
+        road: the paths of mainline and ramp.
+        copies: number of copies.
+        lane_goes_on: whether the acceleration lane leads on, too. In a replay the record changes
+            lanes, also in the step that crosses the end of the lane, and SUMO stops a vehicle at a
+            dead end.
     """
     text = ['<net version="1.20">\n']
     # SUMO reads edges before the junctions that name their lanes, and connections last.
@@ -93,7 +97,7 @@ def _numbered(text: str, copy: int) -> str:
 class _HostedLane(NamedTuple):
     edge: str
     junction: str
-    """Behind the lane, or around it when it is internal."""
+    """After the lane, or around it when it is internal."""
     piece: Piece
     number: int = 0
     """Among the lanes of its edge, from the right."""
@@ -161,12 +165,12 @@ def _hops(lanes: Sequence[_HostedLane], *, lane_goes_on: bool) -> Iterator[_Hop]
         if following < len(lanes) and lanes[here].leads_on:
             yield _Hop(lanes[here], lanes[here + 1 : following], lanes[following])
         elif following < len(lanes) and lane_goes_on:
-            # From the end of the acceleration lane, beside the way of the mainline's lanes.
-            beside, via, target = lanes[here + 1 : following], [], lanes[following]
-            if beside:
-                length_m = math.fsum(other.piece.length_m for other in beside)
+            # From the end of the acceleration lane, next to the lanes of the mainline.
+            inner, via, target = lanes[here + 1 : following], [], lanes[following]
+            if inner:
+                length_m = math.fsum(other.piece.length_m for other in inner)
                 shape = (lanes[here].piece.shape[-1], target.piece.shape[0])
-                piece = replace(beside[0].piece, length_m=length_m, shape=shape)
+                piece = replace(inner[0].piece, length_m=length_m, shape=shape)
                 via = [_HostedLane(f":{AT_M}_lane0", AT_M, piece)]
             yield _Hop(lanes[here], via, target)
         else:

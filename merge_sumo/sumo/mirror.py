@@ -206,7 +206,7 @@ class MirrorSimulation:
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
         """Put the vehicles that are on the road into their states.
 
-        Those beyond the end of the net, where paths go on without a road, arrive.
+        Those beyond the end of the net, where paths continue without a road, arrive.
 
         Args:
             states: by the names of the vehicles.

@@ -44,8 +44,8 @@ EXAMPLES: tuple[Any, ...] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0
 def functions() -> dict[tuple[int, int], tuple[str, ...]]:
     """Return functions, as `vehicle.getSpeed`, by the numbers of their command and variable.
 
-    Every function of the client's domains is called with a connection that only notes what it
-    would send.
+    Every function of the client's domains is called with a connection that only notes the
+    command.
     """
     traci = load_traci()
     found: dict[tuple[int, int], list[str]] = {}

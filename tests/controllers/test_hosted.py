@@ -39,17 +39,6 @@ def Vut(seen):
 """
 
 
-@pytest.fixture
-def spec(tmp_path):
-    """Return a function that writes a source and returns its spec."""
-
-    def write(source: str) -> str:
-        (tmp_path / "my_vut.py").write_text(source, encoding="utf-8")
-        return f"{tmp_path / 'my_vut.py'}:Vut"
-
-    return write
-
-
 def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", spec, "--level", "0"]
     command += ["--cases", "4", "--sampler", "uniform", "--quiet", "--out", str(out), *more]
@@ -58,10 +47,10 @@ def campaign(spec: str, out: Path, *more: str) -> subprocess.Popen:
 
 @pytest.mark.slow
 def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_and_ignores_signals(
-    spec, tmp_path
+    write_vut, tmp_path
 ):
     with none_left():
-        parent = campaign(spec(HANGS), tmp_path / "run", "--workers", "2", "--deadline", "600")
+        parent = campaign(write_vut(HANGS), tmp_path / "run", "--workers", "2", "--deadline", "600")
         assert wait_for((tmp_path / "hangs").exists)
         os.kill(parent.pid, signal.SIGKILL)
         parent.wait()
@@ -69,9 +58,9 @@ def test_a_parent_that_is_killed_leaves_no_process_behind_even_if_the_vut_hangs_
 
 
 @pytest.mark.slow
-def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(spec, tmp_path):
+def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(write_vut, tmp_path):
     with none_left():
-        parent = campaign(spec(HANGS), tmp_path / "run", "--deadline", "600")
+        parent = campaign(write_vut(HANGS), tmp_path / "run", "--deadline", "600")
         assert wait_for((tmp_path / "hangs").exists)
         for _ in range(2):
             os.kill(parent.pid, signal.SIGINT)
@@ -87,8 +76,8 @@ def scene(corridors: int) -> Scene:
     return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
 
 
-def test_after_a_death_it_starts_again_and_knows_which_files_there_were(spec):
-    vut = load(spec("import os\ndef Vut(seen):\n    os._exit(3)\n"), OPTIONS).open(2)
+def test_after_a_death_it_starts_again_and_knows_which_files_there_were(write_vut):
+    vut = load(write_vut("import os\ndef Vut(seen):\n    os._exit(3)\n"), OPTIONS).open(2)
     try:
         for _ in range(2):
             with pytest.raises(VutLostError, match="exit code 3"):
@@ -98,7 +87,7 @@ def test_after_a_death_it_starts_again_and_knows_which_files_there_were(spec):
         vut.close()
 
 
-def test_a_controller_is_opened_once_and_drives_in_that_process(spec, tmp_path):
+def test_a_controller_is_opened_once_and_drives_in_that_process(write_vut, tmp_path):
     source = """
 import os, pathlib
 with open(pathlib.Path(__file__).with_name("opened"), "a") as file:
@@ -106,11 +95,11 @@ with open(pathlib.Path(__file__).with_name("opened"), "a") as file:
 def Vut(seen):
     return 1.0
 """
-    run_campaign(campaign_settings(vut=spec(source), cases=4, batch=2), tmp_path / "run")
+    run_campaign(campaign_settings(vut=write_vut(source), cases=4, batch=2), tmp_path / "run")
     assert len((tmp_path / "opened").read_text().split()) == 1
 
 
-def test_half_an_answer_and_no_more_ends_at_the_deadline(spec):
+def test_half_an_answer_and_no_more_ends_at_the_deadline(write_vut):
     source = """
 import os, time
 def Vut(seen):
@@ -126,7 +115,7 @@ def Vut(seen):
         except BaseException:
             pass
 """
-    vut = load(spec(source), OPTIONS).open(2)
+    vut = load(write_vut(source), OPTIONS).open(2)
     try:
         with pytest.raises(VutLostError, match=r"the deadline of 0\.3 s"):
             vut.act(scene(2))
@@ -134,16 +123,16 @@ def Vut(seen):
         vut.close()
 
 
-def test_controllers_that_take_long_together_are_not_late(spec):
+def test_controllers_that_take_long_together_are_not_late(write_vut):
     source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
-    vut = load(spec(source), OPTIONS).open(10)  # 2 s, and the process has 1.7 s
+    vut = load(write_vut(source), OPTIONS).open(10)  # 2 s, and the process has 1.7 s
     try:
         assert vut.act(scene(10)).tolist() == [1.0] * 10
     finally:
         vut.close()
 
 
-def test_its_code_may_not_change_and_data_that_it_reads_may(spec, tmp_path):
+def test_its_code_may_not_change_and_data_that_it_reads_may(write_vut, tmp_path):
     (tmp_path / "helper.py").touch()
     count = tmp_path / "count.txt"
     count.write_text("1")
@@ -153,7 +142,7 @@ COUNT = pathlib.Path(__file__).with_name("count.txt").read_text()
 def Vut(seen):
     return 1.0
 """
-    factory = load(spec(source))
+    factory = load(write_vut(source))
     assert {Path(name).name for name in factory.files} == {"my_vut.py", "helper.py"}
     count.write_text("2")
     factory.open(1).close()
@@ -162,9 +151,9 @@ def Vut(seen):
         factory.open(1)
 
 
-def test_what_it_imports_while_it_drives_is_of_its_files(spec, tmp_path):
+def test_what_it_imports_while_it_drives_is_of_its_files(write_vut, tmp_path):
     (tmp_path / "late.py").touch()
-    vut = load(spec("def Vut(seen):\n    import late\n    return 1.0\n"), OPTIONS).open(1)
+    vut = load(write_vut("def Vut(seen):\n    import late\n    return 1.0\n"), OPTIONS).open(1)
     try:
         assert {f.name for f in vut.files()} == {"my_vut.py"}
         vut.act(scene(1))
@@ -173,8 +162,10 @@ def test_what_it_imports_while_it_drives_is_of_its_files(spec, tmp_path):
         vut.close()
 
 
-def test_what_it_prints_is_in_the_folder_of_the_campaign(spec, tmp_path, capfd):
-    vut = spec('print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n')
+def test_what_it_prints_is_in_the_folder_of_the_campaign(write_vut, tmp_path, capfd):
+    vut = write_vut(
+        'print("loading \\x1b[31m")\ndef Vut(seen):\n    print("acting")\n    return 1.0\n'
+    )
     run = run_campaign(
         campaign_settings(vut=vut, cases=2, sampler="uniform", batch=2),
         tmp_path / "run",

@@ -12,21 +12,12 @@ from support.networks import constant_network as network
 from support.vut_contract import begin, cases_of, in_process, on_lane, run_cases
 
 from merge_sumo.drivers.base import MERGE, STAY
-from merge_sumo.drivers.policies import NETWORKS
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 
 onnx = pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("onnx")
-    for name in NETWORKS:
-        export_onnx(name, folder / f"{name}.onnx")
-    return folder
 
 
 @pytest.mark.parametrize("scenario", [US23, SMALLER], ids=["us23", "smaller"])

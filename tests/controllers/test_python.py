@@ -20,18 +20,6 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23, VUT
 from merge_sumo.scenario.trajectory import End
 
-
-@pytest.fixture
-def vut(tmp_path):
-    """Return a function that writes a source and returns the spec of a name in it."""
-
-    def write(source: str, name: str = "Vut", file: str = "my_vut.py") -> str:
-        (tmp_path / file).write_text(source, encoding="utf-8")
-        return f"{tmp_path / file}:{name}"
-
-    return write
-
-
 BATCHED = """
 import numpy as np
 class Vut:
@@ -46,10 +34,10 @@ class Vut:
 
 @pytest.mark.parametrize(("source", "name"), [(LEVEL0_CLASS, "Level0"), (BATCHED, "Vut")])
 def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
-    vut, tmp_path, source, name
+    write_vut, tmp_path, source, name
 ):
     lines: list = []
-    for spec in ("level0", vut(source, name)):
+    for spec in ("level0", write_vut(source, name)):
         settings = campaign_settings(
             vut=spec, levels=(0, 2), cases=20, batch=10, seed=3, sampler="gpr"
         )
@@ -59,8 +47,8 @@ def test_the_level_0_law_as_a_users_code_gives_the_same_outcomes_as_level0(
     assert lines[0] == lines[1]
 
 
-def test_a_module_in_the_working_folder_is_found(vut, tmp_path, monkeypatch):
-    vut(LEVEL0_CLASS, file="module_of_a_user.py")
+def test_a_module_in_the_working_folder_is_found(write_vut, tmp_path, monkeypatch):
+    write_vut(LEVEL0_CLASS, file="module_of_a_user.py")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [p for p in sys.path if p])
     assert run_cases(in_process("module_of_a_user:Level0"), cases_of(3))[0].end is End.MERGED
@@ -94,11 +82,11 @@ class Vut:
 """
 
 
-def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_path):
+def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(write_vut, tmp_path):
     case = Case(
         level=2, x_pov0_m=-250.0, v_pov0_mps=30.0, svo_rad=0.5, v_vut0_mps=17.0, scenario=US23
     )
-    (trajectory,) = run_cases(in_process(vut(WATCHER)), [case])
+    (trajectory,) = run_cases(in_process(write_vut(WATCHER)), [case])
     at_reset, *steps = json.loads((tmp_path / "seen.json").read_text())
     start = {"t_s": 0.0, "x_pov_m": -250.0, "v_pov_mps": 30.0, "x_vut_m": -182.0, "v_vut_mps": 17.0}
     assert at_reset == start
@@ -110,7 +98,7 @@ def test_it_sees_time_and_state_and_nothing_about_who_drives_the_pov(vut, tmp_pa
     assert len(steps) == len(trajectory.whole) - 1
 
 
-def test_each_corridor_has_an_object_of_its_own(vut):
+def test_each_corridor_has_an_object_of_its_own(write_vut):
     source = """
 class Vut:
     def reset(self, seen):
@@ -120,23 +108,23 @@ class Vut:
         assert self.count == round(seen.t_s * 10) + 1, self.count
         return 1.0
 """
-    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(40))} == {End.MERGED}
+    assert {t.end for t in run_cases(in_process(write_vut(source)), cases_of(40))} == {End.MERGED}
 
 
-def test_a_batched_vut_cannot_move_the_cars(vut):
+def test_a_batched_vut_cannot_move_the_cars(write_vut):
     source = BATCHED.replace("return ", "seen.x_vut_m[:] = 5.0; seen.v_vut_mps[:] = 1.0; return ")
-    assert {t.end for t in run_cases(in_process(vut(source)), cases_of(4))} == {End.MERGED}
+    assert {t.end for t in run_cases(in_process(write_vut(source)), cases_of(4))} == {End.MERGED}
 
 
-def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(vut):
+def test_answers_outside_the_limits_are_clipped_and_counted_but_rounding_is_not(write_vut):
     for answer, clipped in ((7.0, True), (2.0 + 1e-12, False), (2, False)):
         source = f"def Vut(seen):\n    return {answer}\n"
-        (trajectory,) = run_cases(in_process(vut(source, file=f"v{answer}.py")), cases_of(1))
+        (trajectory,) = run_cases(in_process(write_vut(source, file=f"v{answer}.py")), cases_of(1))
         assert trajectory.clipped_steps == (len(trajectory.motion) - 1) * clipped
         assert (trajectory.a_vut_mps2[:-1] == 2.0).all()
 
 
-def test_what_it_prints_goes_to_standard_error_and_close_is_called(vut, capsys):
+def test_what_it_prints_goes_to_standard_error_and_close_is_called(write_vut, capsys):
     source = """
 class Vut:
     def act(self, seen):
@@ -146,7 +134,7 @@ class Vut:
         print("goodbye")
         raise ValueError("too late")
 """
-    (trajectory,) = run_cases(in_process(vut(source)), cases_of(1), corridors=1)
+    (trajectory,) = run_cases(in_process(write_vut(source)), cases_of(1), corridors=1)
     said = capsys.readouterr()
     assert trajectory.end is End.MERGED
     assert said.out == ""
@@ -168,18 +156,18 @@ class Vut:
         ("import not_a_module_at_all", "Vut", "No module named"),
     ],
 )
-def test_what_cannot_be_a_vut_is_refused_in_a_sentence(vut, source, name, said):
+def test_what_cannot_be_a_vut_is_refused_in_a_sentence(write_vut, source, name, said):
     with pytest.raises(UserError, match=r"(?i)vut") as refused:
-        in_process(vut(source, name))
+        in_process(write_vut(source, name))
     assert said in str(refused.value)
 
 
-def test_the_example_of_the_tutorial_is_ten_lines_and_drives(vut):
+def test_the_example_of_the_tutorial_is_ten_lines_and_drives(write_vut):
     page = Path(__file__).parents[2] / "docs" / "tutorials" / "python-vut.md"
     text = page.read_text(encoding="utf-8")
     (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
     assert len(source.strip().splitlines()) <= 10
-    trajectories = run_cases(in_process(vut(source, "MyVut")), cases_of(20))
+    trajectories = run_cases(in_process(write_vut(source, "MyVut")), cases_of(20))
     assert {t.end for t in trajectories} == {End.MERGED}
     assert any(t.a_vut_mps2.min() == -2.0 for t in trajectories)
 
@@ -205,10 +193,10 @@ class Vut:
 
 
 @pytest.mark.parametrize("source", [SEEDED, SEEDED_BATCH])
-def test_a_controller_that_takes_a_seed_draws_anew_for_each_draw_and_the_same_again(vut, source):
+def test_a_controller_that_takes_a_seed_draws_again_for_each_draw_and_repeats_it(write_vut, source):
     first, *_ = cases_of(1)
     second = replace(first, draw=1)
-    ran = run_cases(in_process(vut(source)), [first, second, first, second])
+    ran = run_cases(in_process(write_vut(source)), [first, second, first, second])
     commands = [trajectory.motion[0, VUT, 2] for trajectory in ran]
     drawn = [random.Random(case.told_seed).uniform(0.0, 1.0) for case in (first, second)]  # noqa: S311
     assert commands == drawn * 2

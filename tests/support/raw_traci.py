@@ -91,7 +91,6 @@ MISDEEDS = {
     "half a message": lambda c: (c.socket.sendall(b"\0\0\0\x20\x05"), c.read(1)),
     "a huge message": lambda c: (c.socket.sendall(b"\x7f\xff\xff\xff"), c.read(1)),
     "crashes": lambda c: 1 / 0,
-    "hangs": lambda c: time.sleep(600),
 }
 """What a client may do wrong in an episode."""
 

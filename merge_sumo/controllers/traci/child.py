@@ -2,8 +2,7 @@
 
 `Child` is its handle in the process that runs the cases. The two exchange MessagePack, which is
 read as data, over a pair of sockets. The child gets the states of the vehicles step by step, and
-answers with the speed that SUMO gives the VUT by what the client commanded, or with what the client
-did wrong.
+answers with the speed that SUMO gives the VUT by the client's commands, or with the client's fault.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ KNOWS_USERS = sys.platform == "linux"
 START_S = 60.0
 """Time that the process has to start, on whatever machine."""
 WORK_S = 10.0
-"""Time that SUMO has for the questions of a controller in a step, besides the deadline."""
+"""Time that SUMO has for the questions of a controller in a step, in addition to the deadline."""
 FAREWELL_STEPS = 10
 """Steps on an empty road, with no vehicle to come, in which a client may end by itself."""
 MOST_MEMORY_BYTES = 4 << 30
@@ -56,7 +55,7 @@ ROUNDING_S = 1e-9
 
 
 class Answer(msgspec.Struct, omit_defaults=True):
-    """What the child answers.
+    """Answer of the child process.
 
     Attributes:
         v_mps: the speed that the VUT is to have after the step; None beyond the end of the net.
@@ -65,9 +64,9 @@ class Answer(msgspec.Struct, omit_defaults=True):
         port: where the child listens.
         accepted: whether a client is connected.
         closed: whether the client has said goodbye while no vehicle was on the road.
-        fault: what the client did wrong; "" for nothing.
+        fault: the client's fault; "" for none.
         gone: whether its connection is gone, so that its program may say why.
-        refused: why the child cannot do what was asked.
+        refused: why the child cannot carry out the request.
         notes: sentences for the log.
         in_vain: commands of the episode that change nothing here.
     """
@@ -147,7 +146,7 @@ def main(settings: Mapping[str, Any]) -> None:
 
 
 class Server:
-    """Serves one client at a time; its public methods are what the parent may ask for."""
+    """Serves one client at a time; its public methods are the requests of the parent."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

@@ -33,7 +33,7 @@ road."""
 
 
 class ProtocolError(Exception):
-    """Bytes that are not TraCI; the text says what is wrong with them."""
+    """Bytes that are not TraCI; the text gives the reason."""
 
 
 class Command(NamedTuple):
@@ -164,7 +164,7 @@ def commands_of(body: bytes) -> list[Command]:
 
 
 def message(content: bytes) -> bytes:
-    """Return what is sent: the content after its length."""
+    """Return a message: the content after its length."""
     return struct.pack("!i", len(content) + 4) + content
 
 
@@ -218,10 +218,10 @@ def packed(function: str, answer: Any) -> bytes:
 
     Args:
         function: the function of libsumo, which decides where the type in Python does not.
-        answer: what it returned.
+        answer: its return value.
 
     Raises:
-        ProtocolError: if there is no such form.
+        ProtocolError: for an answer without a form.
     """
     name = function.partition(".")[2]
     try:

@@ -1,9 +1,9 @@
-"""What a TraCI client asks and commands: libsumo's functions of the same names answer.
+"""Questions and commands of a TraCI client: libsumo's functions of the same names answer.
 
 The session has no socket and does not decide when a step is made. Time runs on over the episodes:
-in each the vehicles depart, and when it ends they arrive. A client gets what it has subscribed to
-with the answer to every step. SUMO's own results are those before the vehicles are put where those
-of the campaign are, so every value is read again.
+in each the vehicles depart, and when it ends they arrive. A client gets the values of its
+subscriptions with the answer to every step. SUMO's own results are those before the vehicles are
+put where those of the campaign are, so every value is read again.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ COMING = 2
 
 
 class Effect(Enum):
-    """What becomes of a command."""
+    """Effect of a command on the simulation."""
 
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
     ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
@@ -96,14 +96,14 @@ EFFECTS = {
     "setImpatience setSpeedDeviation setRoutingMode setAdaptedTraveltime setEffort setVia "
     "updateBestLanes rerouteTraveltime rerouteEffort setParameter",
 }
-"""Commands on vehicles and their types by what becomes of them; others are refused."""
+"""Commands on vehicles and their types by their effect; others are refused."""
 ONLY_SEEN = ("gui", "poi", "polygon")
 """Domains of objects that are only looked at."""
 
 
 @cache
 def effect_of(names: tuple[str, ...]) -> Effect:
-    """Return what becomes of the commands that share a number."""
+    """Return the effect of the commands that share a number."""
     domain = names[0].partition(".")[0] if names else ""
     own = {name.partition(".")[2] for name in names}
     if "vehicle.setParameter" in names:
@@ -160,7 +160,7 @@ class Session:
     """The simulation as one client sees it.
 
     Attributes:
-        notes: sentences on what a command does less than in SUMO, once each.
+        notes: sentences on commands that do less than in SUMO, once each.
         in_vain: commands of this episode that change nothing here, and would in SUMO.
         expected: whether more vehicles may come.
         subscriptions: variables, each with its parameter as it was sent.
@@ -282,7 +282,7 @@ class Session:
             raise RefusedError(f"merge-sumo does not answer {function}: {error}") from error
 
     def _own_answer(self, function: str, name: str) -> Any:
-        """Return what SUMO cannot know here; None where it knows."""
+        """Return an answer that SUMO cannot know here; None where it knows."""
         if name in self.sumo.at_m:
             # SUMO's own answers to these are those before the vehicle was put back.
             if function == "vehicle.getPosition":
@@ -316,7 +316,7 @@ class Session:
         return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
 
     def _distance(self, function: str, name: str, reader: Reader) -> tuple[str, list[Any]]:
-        """Return what measures from a vehicle to a position, or from one position to another."""
+        """Return the function for a distance to a position, and its arguments."""
         ends = [reader.typed() for _ in range(reader.count() - 1)]
         driving = bool(reader.number("B"))
         points = [value for end in ends for value in end.place[:2]]
@@ -342,7 +342,7 @@ class Session:
     # Subscriptions
 
     def _subscribe(self, subject: Subject, reader: Reader) -> bytes:
-        """Add to what is subscribed of a subject; return the first values.
+        """Add to the subscriptions of a subject; return the first values.
 
         A subscription without variables ends those of the subject.
         """

@@ -69,7 +69,7 @@ class TraciKind(ControllerKind):
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Read the port or the command.
 
-        Raises `UserError` for a port or a command that is none, and for code that others may write.
+        Raises `UserError` for an invalid port or command, and for code that others may write.
         """
         super().__init__(spec, options)
         self._command, self._port = None, 0
@@ -160,7 +160,7 @@ class TraciVut(Driver):
         self._in_vain.clear()
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the acceleration that follows from what the client commanded, or NaN."""
+        """Return the acceleration that follows from the client's commands, or NaN."""
         if self._reason is None:
             try:
                 return np.array([self._acceleration_mps2(scene)])
@@ -170,11 +170,11 @@ class TraciVut(Driver):
         return np.array([math.nan])
 
     def reason(self, corridor: int) -> str | None:
-        """Return what the client did wrong."""
+        """Return the fault of the client."""
         return self._reason
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return what the client commanded in vain."""
+        """Return the commands of the client that changed nothing."""
         return self._in_vain
 
     def close(self) -> None:
@@ -187,7 +187,7 @@ class TraciVut(Driver):
         self._child.kill()
 
     def _acceleration_mps2(self, scene: Scene) -> float:
-        """Show the vehicles, and return what the client commands for the coming step."""
+        """Show the vehicles, and return the acceleration that the client commands."""
         # A car that is not sensed may be shown farther away than the road begins.
         x_m = np.maximum(scene.x_m[:, 0], self._begins_m).tolist()
         v_mps = scene.v_mps[:, 0].tolist()
@@ -202,7 +202,7 @@ class TraciVut(Driver):
         else:
             answer = self._ask("step", states=states, merged=merged)
         if self._program is not None and (ended := self._program.ended(0.0)):
-            raise FaultError(f"{ended}, and its connection goes on")
+            raise FaultError(f"{ended}, and its connection is still open")
         if scene.merged is not None:
             self._wishes = np.array([MERGE if answer.merge else STAY], dtype=np.int8)
         wanted_mps = answer.v_mps
@@ -231,7 +231,7 @@ class TraciVut(Driver):
     def _enter(self, **values: Any) -> Answer:
         """Let the vehicles depart, for the client that is connected or for a new one.
 
-        A controller may run once per episode: a goodbye on an empty road is no fault.
+        A controller may run once per episode: a goodbye on an empty road is not a fault.
         """
         for _ in range(2):
             if not self._connected:
@@ -243,14 +243,14 @@ class TraciVut(Driver):
         raise FaultError("the controller closed the connection before the vehicles departed")
 
     def _ask(self, action: str, patience_s: float = 0.0, **values: Any) -> Answer:
-        """Return what the serving process answers; raises `FaultError` and `VutLostError`."""
+        """Return the answer of the child process; raises `FaultError` and `VutLostError`."""
         patience_s += self._options.deadline_s + WORK_S
         try:
             answer = self._child.do(action, patience_s, **values)
         except ProcessDiedError as died:
             if died.hung:
                 raise FaultError(
-                    "the SUMO that answers the controller did not come to an end with what it asked"
+                    "the SUMO that answers the controller took too long for a question"
                 ) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
@@ -317,7 +317,7 @@ class TraciVut(Driver):
         )
 
     def _note(self, sentence: str) -> None:
-        """Add a sentence to what the controller printed, once for all the times it is started."""
+        """Add a sentence to the log of the controller, once for all its starts."""
         if sentence in self._noted:
             return
         self._noted.add(sentence)
