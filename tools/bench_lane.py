@@ -65,7 +65,11 @@ def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
 
 
 def idm(
-    gap_m: FloatArray, v: FloatArray, v_leader: FloatArray, _: FloatArray, v_desired: FloatArray
+    gap_m: FloatArray,
+    v: FloatArray,
+    v_leader: FloatArray,
+    _: FloatArray,
+    v_desired: FloatArray | float,
 ) -> FloatArray:
     """Return accelerations as `acc_mps2` does, by IDM."""
     return idm_mps2(gap_m, v, v_leader, v_desired)
@@ -103,7 +107,8 @@ def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
     found = {}
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
-        pov = LanePov(Level0Pov(len(cases)), follow)
+        pov = LanePov(Level0Pov(len(cases)))
+        pov.follow_mps2 = follow  # type: ignore[assignment]
         merges = played(cases, pov, MergesAt(len(cases), 0.0))
         easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]
         hard = [one for one in easy if one.after is not None and one.after[:, 0, 2].min() < -3.0]

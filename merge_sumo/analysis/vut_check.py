@@ -208,7 +208,7 @@ def _not_numbers(ground: Simulator, case: Case) -> list[str]:
     try:
         answer = float(ground.vut.act(scene)[0])
     except VutLostError as lost:
-        return [f"To a state that is not a number it answers nothing, but {lost.reason}."]
+        return [f"To a state that is not a number it answers nothing, but {lost}."]
     if np.isfinite(answer):
         return [f"To a state that is not a number it answers {answer:g} m/s2."]
     return []

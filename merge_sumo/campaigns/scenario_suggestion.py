@@ -90,9 +90,8 @@ def suggested(road: Corridor, name: str) -> Scenario:
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     lane_m = road.lane_m and suggested_lane_m(road)
     way_m = np.array([0.0, lane_m[1] if lane_m else 0.0]) - x_vut0_m
-    due_s, end_s = level0_time_to(
-        way_m, np.array(v_vut0_mps), US23.level0_a_mps2, level0_v_mps
-    ).tolist()
+    profile = replace(US23, level0_v_mps=level0_v_mps)
+    due_s, end_s = level0_time_to(way_m, np.array(v_vut0_mps), profile).tolist()
     slow, fast = round(SLOWEST * limit_mps, 1), round(limit_mps, 1)
     low = max(-fast * due_s * (1.0 + MARGIN), -ROOM * road.mainline.before_m)
     high = max(-slow * due_s * (1.0 - MARGIN), low / 2.0)

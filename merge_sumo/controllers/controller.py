@@ -155,8 +155,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         x_m, v_mps = np.array(case.starts(), dtype=np.float64).T
         met = POV
         if len(x_m) > 2:
-            level0 = scenario.level0_a_mps2, scenario.level0_v_mps
-            met = int(car_met(x_m[:, None], v_mps[:, None], *level0)[0])
+            met = int(car_met(x_m[:, None], v_mps[:, None], scenario)[0])
         return cls(
             seed=case.told_seed,
             a_min_mps2=float(scenario.a_min_mps2),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,10 +9,8 @@ from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 
-ROUNDING_MPS2: Final = 1e-9
-"""A command this little outside the limits is a rounding error."""
-SLOWEST_MPS: Final = 0.1
-"""Power over speed is no limit below this speed."""
+ROUNDING_MPS2 = 1e-9
+"""A command outside the limits by less is a rounding error."""
 
 
 def whole_steps(time_s: float) -> tuple[int, float]:
@@ -31,13 +27,13 @@ class _Actuator:
     """
 
     def __init__(self, case: Case) -> None:
-        """Take the actuator of a case, which has commanded nothing so far."""
+        """Take the actuator of a case, without commands so far."""
         act = case.actuation
         wait, self._share = whole_steps(act.at_most("delay_s"))
         self._commands = [0.0] * (wait + 2)
-        """Those that wait, the oldest first."""
+        """Commands in the dead time, the oldest first."""
         lag_s = act.at_most("lag_s")
-        # What a step leaves of the distance of a from u, at its end and in its mean.
+        # Shares of the distance of a from u that remain at the end of a step, and in its mean.
         self._decay = float(np.exp(-DT_S / lag_s)) if lag_s > 0.0 else 0.0
         self._mean = lag_s / DT_S * (1.0 - self._decay)
         self._power = act.at_most("power_w_per_kg")
@@ -45,25 +41,28 @@ class _Actuator:
         self._a_mps2 = 0.0
         self.is_clipped = False
 
-    def mean_mps2(self, asked_mps2: float, v_mps: float) -> float:
-        """Return the mean acceleration of the next step for a command at a speed."""
-        command = min(max(asked_mps2, self._low_mps2), self._high_mps2)
-        self.is_clipped = abs(asked_mps2 - command) > ROUNDING_MPS2
+    def mean_mps2(self, command_mps2: float, v_mps: float) -> float:
+        """Return the mean acceleration of the next step for a command at a speed.
+
+        Power over speed limits it, at speeds from 0.1 m/s up.
+        """
+        command = min(max(command_mps2, self._low_mps2), self._high_mps2)
+        self.is_clipped = abs(command_mps2 - command) > ROUNDING_MPS2
         self._commands = [*self._commands[1:], command]
         before, now, *_ = self._commands
         u = (1.0 - self._share) * now + self._share * before if self._share > 0.0 else now
         mean = u + (self._a_mps2 - u) * self._mean
         self._a_mps2 = u + (self._a_mps2 - u) * self._decay
-        return min(mean, self._power / max(v_mps, SLOWEST_MPS))
+        return min(mean, self._power / max(v_mps, 0.1))
 
 
 class ActuatedDriver(DriverWrapper):
-    """Drives as another driver commands, through an actuator that the case describes.
+    """Drives by the commands of another driver, through the actuator of the case.
 
-    A command is limited to what the vehicle can do, and waits for the dead time. It then acts
-    through a first-order lag, T a' = u - a with a = 0 at the start. As eq. (4) knows one
-    acceleration per step, a step has the mean of a over it, so that speeds are those of the
-    continuous lag. At last, power over speed limits it.
+    A command is limited to the accelerations of the vehicle, and waits for the dead time. It then
+    acts through a first-order lag, T a' = u - a with a = 0 at the start. Eq. (4) has one
+    acceleration per step: the mean of a over the step, so that speeds are those of the continuous
+    lag. Finally, power over speed limits it.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -75,16 +74,16 @@ class ActuatedDriver(DriverWrapper):
     def begin(self, corridor: int, case: Case) -> None:
         """Take the actuator of a case."""
         self._actuators[corridor] = _Actuator(case)
-        self._driver.begin(corridor, case)
+        super().begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the accelerations of the vehicle, (K,); what is no number is passed on at once."""
+        """Return the accelerations of the vehicle, (K,); NaN and infinity pass at once."""
         answers = np.array(self._driver.act(scene))
         self._clipped[:] = False
         for corridor in np.flatnonzero(scene.active & np.isfinite(answers)).tolist():
-            v_mps, asked_mps2 = float(scene.v_vut_mps[corridor]), float(answers[corridor])
             actuator = self._actuators[corridor]
-            answers[corridor] = actuator.mean_mps2(asked_mps2, v_mps)
+            v_mps, command_mps2 = float(scene.v_vut_mps[corridor]), float(answers[corridor])
+            answers[corridor] = actuator.mean_mps2(command_mps2, v_mps)
             self._clipped[corridor] = actuator.is_clipped
         return answers
 

@@ -7,14 +7,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import POV, VUT
+from merge_sumo.scenario.scenario import POV, US23, VUT, Scenario
 from merge_sumo.scenario.signals import Left
 
 
@@ -26,8 +26,8 @@ class Scene(NamedTuple):
         step: steps since the episode of the corridor began, (K,).
         x_m: distances of the front bumpers to M along their lanes, (A, K), negative before M.
         v_mps: speeds, (A, K).
-        facing: row of the car that counts as POV for who knows one car only, (K,); None for the
-            POV itself everywhere.
+        facing: row of the car that a driver of two-car games takes for the POV, (K,); None for
+            the POV itself everywhere.
         merged: whether the VUT is on the mainline, (K,); None where there is no acceleration lane:
             it then is from M on.
     """
@@ -75,69 +75,74 @@ class Scene(NamedTuple):
         return v_mps
 
     def _facing_of(self, values: FloatArray) -> FloatArray:
-        row: Any = POV if self.facing is None else (self.facing, np.arange(values.shape[1]))
-        found: FloatArray = values[row]
-        return found
+        if self.facing is None:
+            of_pov: FloatArray = values[POV]
+            return of_pov
+        faced: FloatArray = values[self.facing, np.arange(values.shape[1])]
+        return faced
 
     def of_mainline(self) -> Scene:
-        """Return the scene for who drives all C cars of the mainline, each as the POV of its own.
+        """Return the scene for the driver of all C cars of the mainline.
 
-        It has C K corridors: those of the POVs, then those of the cars ahead, of those behind.
+        Each car is the POV of a corridor of its own. So there are C K corridors: those of the POVs,
+        then those of the cars ahead, then those of the cars behind.
         """
         cars = len(self.x_m) - 1
         if cars == 1:
             return self
-        state = np.empty((2, 2, cars, len(self.active)))
-        for pair, values in zip(state, (self.x_m, self.v_mps), strict=True):
-            pair[POV, :VUT], pair[POV, VUT:] = values[:VUT], values[VUT + 1 :]
-            pair[VUT] = values[VUT]
-        active, step = (np.concatenate([each] * cars) for each in (self.active, self.step))
-        merged = None if self.merged is None else np.concatenate([self.merged] * cars)
-        x_m, v_mps = state.reshape(2, 2, -1)
+        pairs = []
+        for values in (self.x_m, self.v_mps):
+            others = np.delete(values, VUT, axis=0)
+            pairs.append(np.stack((others.ravel(), np.tile(values[VUT], cars))))
+        merged = None if self.merged is None else np.tile(self.merged, cars)
+        x_m, v_mps = pairs
+        active, step = np.tile(self.active, cars), np.tile(self.step, cars)
         return Scene(active, step, x_m, v_mps, merged=merged)
 
 
 class VutLostError(Exception):
-    """A driver has lost the state of its corridors: their episodes have to begin again.
-
-    Attributes:
-        reason: what happened.
-    """
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
+    """A driver has lost the state of its corridors: their episodes have to begin again."""
 
 
 class PovLostError(VutLostError):
-    """It was the driver of the POV that lost it."""
+    """The driver of the POV has lost it."""
 
 
-NO_WISH: Final = -1
-STAY: Final = 0
-MERGE: Final = 1
-"""Wishes of a VUT that drives on an acceleration lane. One without a wish only accelerates, and
-merges at M."""
+NO_WISH, STAY, MERGE = -1, 0, 1
+"""Wishes of a VUT on an acceleration lane. One without a wish only accelerates, and merges at M."""
 
 
 class Driver(ABC):
-    """Drives the same vehicle in K corridors at once; the corridors are independent."""
+    """Drives the same vehicle in K corridors at once; the corridors are independent.
 
+    Example:
+        driver = RuleBasedVut(corridors=1, design=DESIGNS["design2"])
+        driver.begin(0, case)
+        a_mps2 = driver.act(scene)
+
+    Attributes:
+        scenario: the scenario of the episodes, which all corridors share.
+    """
+
+    scenario: Scenario = US23
     _wishes: NDArray[np.int8] | None = None
 
     def __init__(self, corridors: int) -> None:
         """Prepare for corridors 0 to `corridors` - 1."""
         self.corridors = corridors
 
-    def begin(self, corridor: int, case: Case) -> None:  # noqa: B027 (most drivers remember nothing)
+    def begin(self, corridor: int, case: Case) -> None:
         """Forget everything about a corridor: a new episode begins there."""
+        self.scenario = case.scenario
 
     @abstractmethod
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,), m/s2, until the next step.
 
-        A value that is not finite ends the episode of its corridor as an error. Raises
-        `VutLostError` where the episodes of all corridors have to begin anew.
+        A value that is not finite ends the episode of its corridor as an error.
+
+        Raises:
+            VutLostError: if the episodes of all corridors have to begin again.
         """
 
     def reason(self, corridor: int) -> str | None:
@@ -152,9 +157,9 @@ class Driver(ABC):
         return self._wishes
 
     def clipped(self) -> NDArray[np.bool_] | None:
-        """Return which of the last answers come of commands outside the limits, (K,).
+        """Return which of the last answers follow from commands outside the limits, (K,).
 
-        None where answers are the commands themselves, and show it.
+        None where the answers are the commands themselves.
         """
         return None
 
@@ -167,11 +172,11 @@ class Driver(ABC):
         return {}
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return the commands of this episode that were accepted, and changed nothing."""
+        """Return the commands of this episode that were accepted but changed nothing."""
         return ()
 
     def files(self) -> tuple[Path, ...]:
-        """Return the files of the user's that have decided on its answers so far."""
+        """Return the user's files that its answers have depended on so far."""
         return ()
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
@@ -182,7 +187,8 @@ class Driver(ABC):
 class Design:
     """Parameters of a driver of this package, with units in their names.
 
-    Raises `UserError` for what is no number from 0 up; subclasses check what else makes no driver.
+    Raises:
+        UserError: for a parameter that is not a number from 0 up. Subclasses check more.
     """
 
     def __post_init__(self) -> None:
@@ -194,13 +200,13 @@ class Design:
 
 @dataclass(frozen=True, slots=True)
 class BuiltInVut:
-    """A VUT that the package brings: a value of `VUTS` in a file of this folder, by its name.
+    """A VUT of this package: a value of `VUTS` in a file of this folder, by its name.
 
     Attributes:
-        make: makes its driver for a number of corridors, by its design where it has one, by a
-            folder of networks where it is learned.
-        design: the parameters that a spec may set, with their values where it does not.
-        network: name of the network by which a learned VUT acts.
+        make: makes its driver for a number of corridors, with its design if it has one, or with a
+            folder of networks if it is learned.
+        design: the parameters that a spec may set, with their defaults.
+        network: name of the network of a learned VUT.
         ramp_only: whether it cannot drive a POV.
     """
 
@@ -211,7 +217,7 @@ class BuiltInVut:
 
 
 class DriverWrapper(Driver):
-    """Drives by another driver, and passes on what it does not change."""
+    """Drives by another driver: a base for drivers that change its input or its output."""
 
     def __init__(self, driver: Driver) -> None:
         super().__init__(driver.corridors)
@@ -219,6 +225,7 @@ class DriverWrapper(Driver):
 
     def begin(self, corridor: int, case: Case) -> None:
         """Begin an episode for the driver."""
+        super().begin(corridor, case)
         self._driver.begin(corridor, case)
 
     def reason(self, corridor: int) -> str | None:
@@ -238,7 +245,7 @@ class DriverWrapper(Driver):
         return self._driver.signals()
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return what the driver commanded in vain."""
+        """Return the driver's commands that changed nothing."""
         return self._driver.in_vain(corridor)
 
     def files(self) -> tuple[Path, ...]:

@@ -1,36 +1,36 @@
-"""Cars of the mainline in traffic: how they follow each other, and which of them the VUT meets.
+"""Traffic on the mainline: how cars follow each other, and which of them the VUT will meet.
 
-Each of them plays its level against the VUT, but never drives faster than is safe behind the car
-ahead of it. "Safe" is the speed of Krauss (1998), SUMO's original car-following model: at it a car
-can still stop behind a leader that brakes as hard as it can, after a reaction time.
+Each car plays its level against the VUT, but drives no faster than is safe behind the car ahead.
 """
 
 from __future__ import annotations
-
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.level0 import level0_time_to
-from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VUT, Scenario
 
-FOLLOWERS: Final = slice(POV, BEHIND + 1, BEHIND - POV)
-LEADERS: Final = slice(AHEAD, None, POV - AHEAD)
-"""The POV and the car behind it, and those that they follow: the car ahead and the POV."""
+FOLLOWERS = slice(POV, BEHIND + 1, BEHIND - POV)
+LEADERS = slice(AHEAD, None, POV - AHEAD)
+"""Rows of the POV and the car behind it, and of the car ahead and the POV, which they follow."""
 
 
 def safe_speed_mps(
-    gap_m: FloatArray,
-    v_leader_mps: FloatArray,
-    decel_mps2: FloatArray | float,
-    tau_s: FloatArray | float,
+    gap_m: FloatArray, v_leader_mps: FloatArray, decel_mps2: float, tau_s: float
 ) -> FloatArray:
-    """Return Krauss' safe speed at a distance behind a leader; arrays of one shape.
+    """Return the safe speed of Krauss behind a leader, SUMO's original car-following model.
 
-    v_safe = -b tau + sqrt((b tau)^2 + v_leader^2 + 2 b gap), S. Krauss, "Microscopic modeling of
-    traffic flow", DLR-FB 98-08 (1998); a gap below 0 counts as 0.
+    At this speed a car can still stop behind a leader that brakes as hard as it can:
+    v_safe = -b tau + sqrt((b tau)^2 + v_leader^2 + 2 b gap). S. Krauss, "Microscopic modeling of
+    traffic flow", DLR-FB 98-08 (1998).
+
+    Args:
+        gap_m: distances from bumper to bumper; a gap below 0 counts as 0.
+        v_leader_mps: speeds of the leaders, of the same shape.
+        decel_mps2: hardest braking b, positive.
+        tau_s: reaction time tau.
     """
     lag = decel_mps2 * tau_s
     room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
@@ -38,66 +38,35 @@ def safe_speed_mps(
     return speed
 
 
-def keep_safe(
-    a_mps2: FloatArray,
-    x_m: FloatArray,
-    v_mps: FloatArray,
-    taken_m: FloatArray | float,
-    decel_mps2: FloatArray | float,
-    tau_s: FloatArray | float,
-) -> None:
-    """Lower accelerations of the cars of the mainline, (A, K), to what is safe in states, (A, K).
+def keep_safe(a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> None:
+    """Lower accelerations of the cars of the mainline to safe ones, in place.
 
-    `taken_m` is what a car and the least gap before it take of the road.
+    Args:
+        a_mps2: accelerations of all vehicles, (A, K).
+        x_m: their positions, (A, K).
+        v_mps: their speeds, (A, K).
+        scenario: gives the length of a car, the least gap, the hardest braking and the reaction
+            time.
     """
-    gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - taken_m
-    safe = safe_speed_mps(gap_m, v_mps[LEADERS], decel_mps2, tau_s)
+    gap_m = x_m[LEADERS] - x_m[FOLLOWERS] - (scenario.pov_length_m + scenario.min_gap_m)
+    safe = safe_speed_mps(gap_m, v_mps[LEADERS], -scenario.a_min_mps2, scenario.tau_s)
     most = (safe - v_mps[FOLLOWERS]) / DT_S
     a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
 
 
-class Following:
-    """Keeps the cars of the mainline in K corridors from driving into each other."""
+def car_met(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[np.int64]:
+    """Return the row of the car that the VUT will meet, (K,).
 
-    def __init__(self, corridors: int) -> None:
-        self._decel = np.ones(corridors)
-        self._tau = np.ones(corridors)
-        self._taken = np.zeros(corridors)
-        self._a_mps2 = np.ones(corridors)
-        self._v_mps = np.ones(corridors)
+    This car would be nearest to M when the VUT is there, if the car kept its speed and the VUT
+    followed the level-0 profile. Of two equally near cars it is the one with the lower row.
 
-    def begin(self, corridor: int, case: Case) -> None:
-        """Take the numbers of a case's scenario."""
-        scenario = case.scenario
-        self._decel[corridor] = -scenario.a_min_mps2
-        self._tau[corridor] = scenario.tau_s
-        self._taken[corridor] = scenario.pov_length_m + scenario.min_gap_m
-        self._a_mps2[corridor] = scenario.level0_a_mps2
-        self._v_mps[corridor] = scenario.level0_v_mps
-
-    def limit(self, a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray) -> None:
-        """Lower accelerations, (A, K), to what is safe in states, (A, K)."""
-        keep_safe(a_mps2, x_m, v_mps, self._taken, self._decel, self._tau)
-
-    def met(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.int64]:
-        """Return the row of the car that the VUT will meet, (K,), in states, (A, K)."""
-        return car_met(x_m, v_mps, self._a_mps2, self._v_mps)
-
-
-def car_met(
-    x_m: FloatArray,
-    v_mps: FloatArray,
-    a_mps2: FloatArray | float,
-    v_cruise_mps: FloatArray | float,
-) -> NDArray[np.int64]:
-    """Return the row of the car that the VUT will meet, (K,), in states, (A, K).
-
-    It is the car that would be nearest to M when the VUT is there, if the car kept its speed and
-    the VUT drove the scenario's level-0 profile; of cars as near the one with the lower row.
+    Args:
+        x_m: positions of all vehicles, (A, K).
+        v_mps: their speeds, (A, K).
+        scenario: the scenario of the profile.
     """
     distance_m = np.maximum(-x_m[VUT], 0.0)
-    t_s = level0_time_to(distance_m, v_mps[VUT], a_mps2, v_cruise_mps)
-    gaps_m = np.abs(x_m + v_mps * t_s)
+    gaps_m = np.abs(x_m + v_mps * level0_time_to(distance_m, v_mps[VUT], scenario))
     gaps_m[VUT] = np.inf
     met: NDArray[np.int64] = gaps_m.argmin(axis=0)
     return met

@@ -2,39 +2,34 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from merge_sumo.drivers.base import BuiltInVut, Driver, Scene
-from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.scenario import DT_S, Scenario
 
 
-def level0_acceleration(
-    v_vut_mps: FloatArray,
-    a_mps2: FloatArray | float,
-    v_cruise_mps: FloatArray | float,
-) -> FloatArray:
-    """Return the level-0 VUT's acceleration, m/s2: `a_mps2` until its speed, which it meets."""
-    return np.minimum(np.maximum((v_cruise_mps - v_vut_mps) / DT_S, 0.0), a_mps2)
+def level0_acceleration(v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
+    """Return the level-0 VUT's acceleration, m/s2: constant until its speed, which it meets."""
+    missing = np.maximum((scenario.level0_v_mps - v_vut_mps) / DT_S, 0.0)
+    return np.minimum(missing, scenario.level0_a_mps2)
 
 
-def level0_time_to(
-    distance_m: FloatArray,
-    v_vut_mps: FloatArray,
-    a_mps2: FloatArray | float,
-    v_cruise_mps: FloatArray | float,
-) -> FloatArray:
+def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
     """Return the seconds that a vehicle needs for a distance on the level-0 profile.
 
-    The profile as eq. (4) drives it: `a_mps2` up to `v_cruise_mps`, then constant; a vehicle that
-    is faster keeps its speed. The steps of eq. (4) lie on the parabola that begins slower by half a
-    step's gain of speed, so this time, and what is predicted with it, does not drift while the
-    vehicle follows the profile. Arrays of one shape, distances not negative.
+    The profile as eq. (4) drives it: `level0_a_mps2` up to `level0_v_mps`, then constant; a vehicle
+    that is faster keeps its speed. The steps of eq. (4) lie on the parabola that begins slower by
+    half a step's gain of speed. So the time does not drift while the vehicle follows the profile.
+
+    Args:
+        distance_m: distances, not negative, of any shape.
+        v_vut_mps: present speeds, of the same shape.
+        scenario: the scenario of the profile.
     """
+    a_mps2 = scenario.level0_a_mps2
     lag, twice_a = (0.5 * DT_S) * a_mps2, 2.0 * a_mps2
-    v_cruise = np.maximum(v_vut_mps, v_cruise_mps)
+    v_cruise = np.maximum(v_vut_mps, scenario.level0_v_mps)
     v_start = v_vut_mps - lag
     v_squared = v_start * v_start
     v_end = np.minimum(np.sqrt(v_squared + twice_a * distance_m), v_cruise - lag)
@@ -52,21 +47,11 @@ class Level0Pov(Driver):
 
 
 class Level0Vut(Driver):
-    """Accelerates as the scenario's level-0 profile says and holds its speed: 1 m/s2 to 28 m/s."""
-
-    def __init__(self, corridors: int) -> None:
-        super().__init__(corridors)
-        self.a_mps2 = np.full(corridors, US23.level0_a_mps2)
-        self.v_cruise_mps = np.full(corridors, US23.level0_v_mps)
-
-    def begin(self, corridor: int, case: Case) -> None:
-        """Take the profile of the case's scenario."""
-        self.a_mps2[corridor] = case.scenario.level0_a_mps2
-        self.v_cruise_mps[corridor] = case.scenario.level0_v_mps
+    """Accelerates by the scenario's level-0 profile and holds its speed: 1 m/s2 to 28 m/s."""
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the level-0 acceleration."""
-        return level0_acceleration(scene.v_vut_mps, self.a_mps2, self.v_cruise_mps)
+        """Return the level-0 acceleration, (K,)."""
+        return level0_acceleration(scene.v_vut_mps, self.scenario)
 
 
-VUTS: Final = {"level0": BuiltInVut(Level0Vut, ramp_only=True)}
+VUTS = {"level0": BuiltInVut(Level0Vut, ramp_only=True)}

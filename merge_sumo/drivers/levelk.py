@@ -148,7 +148,7 @@ def prospects(
     unit = Units.of(scenario)
     horizon_s = _HORIZON_S * unit.time
     distance = np.maximum(-x_vut_m, 0.0)
-    t_level0 = np.minimum(level0_time_to(distance, v_vut_mps, a_level0, v_cruise), horizon_s)
+    t_level0 = np.minimum(level0_time_to(distance, v_vut_mps, scenario), horizon_s)
     t_constant = np.minimum(distance / np.maximum(v_vut_mps, 0.5 * unit.speed), horizon_s)
     t_full = (np.sqrt(v_vut_mps * v_vut_mps + 2.0 * a_max * distance) - v_vut_mps) / a_max
     t_brake = np.minimum(t_level0, v_pov_mps / -a_min)
@@ -297,15 +297,15 @@ class LevelKDriver(Driver):
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
         """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
-        self._scenario: Scenario = US23
         self._limited = network.limited(US23)
-        """The scenario, which all corridors share, with the network's limit of braking."""
+        """The scenario with the network's limit of braking."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the scenario and the social value orientation of the case."""
         self._svo_rad[corridor] = case.svo_rad or 0.0
-        if case.scenario is not self._scenario:
-            self._scenario, self._limited = case.scenario, self.network.limited(case.scenario)
+        if case.scenario is not self.scenario:
+            self._limited = self.network.limited(case.scenario)
+        super().begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the held accelerations, decided anew where a decision is due.

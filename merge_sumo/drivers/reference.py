@@ -46,7 +46,7 @@ from merge_sumo.drivers.safety_models import (
     ttc_s,
 )
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.scenario import DT_S
 
 SLOWEST_MPS: Final = 1e-9
 """A slower vehicle stands."""
@@ -77,9 +77,6 @@ class RampDriver(Level0Vut):
 
     def __init__(self, corridors: int) -> None:
         super().__init__(corridors)
-        self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)
-        self.accel_mps2 = np.full(corridors, US23.a_max_mps2)
-        self.crash_m = np.full(corridors, US23.dx_crash_m)
         self._reacts = np.zeros(corridors, dtype=np.bool_)
         """Whether the driver has left phase 1."""
         self._delay_steps = np.zeros(corridors, dtype=np.int64)
@@ -89,12 +86,8 @@ class RampDriver(Level0Vut):
         self._braking_mps2 = np.zeros(corridors)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Forget; take the limits of the case's scenario."""
+        """Forget the last episode of a corridor."""
         super().begin(corridor, case)
-        hardest_mps2 = -case.scenario.a_min_mps2
-        self.limit_mps2[corridor] = min(hardest_mps2, self.model.hardest_mps2)
-        self.accel_mps2[corridor] = case.scenario.a_max_mps2
-        self.crash_m[corridor] = case.scenario.dx_crash_m
         self.forget(corridor)
 
     def forget(self, corridors: int | Flags) -> None:
@@ -103,6 +96,11 @@ class RampDriver(Level0Vut):
         self._delay_steps[corridors] = 0
         self._conflict_steps[corridors] = 0
         self._braking_mps2[corridors] = 0.0
+
+    @property
+    def limit_mps2(self) -> float:
+        """Hardest deceleration of the model that the scenario allows, positive."""
+        return min(-self.scenario.a_min_mps2, self.model.hardest_mps2)
 
     @abstractmethod
     def is_due(self, scene: Scene, nominal: Plan) -> Flags:
@@ -113,9 +111,10 @@ class RampDriver(Level0Vut):
         calm = super().act(scene)
         v_mps, distance_m = scene.v_vut_mps, np.maximum(-scene.x_vut_m, 0.0)
         # P0: the VUT takes the level-0 profile.
-        t_s = level0_time_to(distance_m, v_mps, self.a_mps2, self.v_cruise_mps)
-        most_mps = np.maximum(v_mps, self.v_cruise_mps)
-        nominal = self._plan(scene, t_s, np.minimum(v_mps + self.a_mps2 * t_s, most_mps))
+        scenario = self.scenario
+        t_s = level0_time_to(distance_m, v_mps, scenario)
+        most_mps = np.maximum(v_mps, scenario.level0_v_mps)
+        nominal = self._plan(scene, t_s, np.minimum(v_mps + scenario.level0_a_mps2 * t_s, most_mps))
         # P1: it keeps its speed.
         moves = (v_mps > SLOWEST_MPS) | (distance_m == 0.0)
         t_s = np.where(moves, distance_m / np.maximum(v_mps, SLOWEST_MPS), np.inf)
@@ -124,7 +123,7 @@ class RampDriver(Level0Vut):
         waits = self._reacts & (self._delay_steps > 0)
         self._delay_steps -= waits
         acts = self._reacts & ~waits & nominal.conflict
-        behind = present.is_rear | self._can_fall_behind(scene, np.zeros(self.corridors))
+        behind = present.is_rear | self._can_fall_behind(scene, 0.0, self.limit_mps2)
         brakes = acts & present.conflict & behind
         harder = self._braking_mps2 + self.model.growth_mps2
         most = np.minimum(self._demand_mps2(scene, present), self.limit_mps2)
@@ -145,7 +144,7 @@ class RampDriver(Level0Vut):
         due = conflict & ~self._reacts & self.is_due(scene, nominal)
         if not due.any():
             return
-        due &= nominal.is_rear | self._can_fall_behind(scene, left_s)
+        due &= nominal.is_rear | self._can_fall_behind(scene, left_s, self.limit_mps2)
         self._reacts |= due
         self._delay_steps = np.where(due, model.delay_steps + missing, self._delay_steps)
 
@@ -154,7 +153,7 @@ class RampDriver(Level0Vut):
         arrives = np.isfinite(t_s)
         dx_m = _x_pov_m(scene) + v_pov_mps * np.where(arrives, t_s, 0.0)
         is_rear = dx_m >= 0.0
-        gap_m = np.where(arrives, np.abs(dx_m) - self.crash_m, np.inf)
+        gap_m = np.where(arrives, np.abs(dx_m) - self.scenario.dx_crash_m, np.inf)
         v_rear = np.where(is_rear, v_vut_mps, v_pov_mps)
         v_front = np.where(is_rear, v_pov_mps, v_vut_mps)
         pair = Pair(gap_m, v_rear, v_front)
@@ -163,21 +162,23 @@ class RampDriver(Level0Vut):
         return Plan(t_s, gap_m, is_rear, v_rear, v_front, conflict)
 
     def _can_fall_behind(
-        self, scene: Scene, delay_s: FloatArray, limit_mps2: FloatArray | None = None
+        self, scene: Scene, delay_s: FloatArray | float, limit_mps2: float
     ) -> Flags:
         """Return whether the VUT can be behind the other vehicle at M, or stop before it, (K,).
 
-        It keeps its speed for `delay_s`, and then brakes by `limit_mps2`.
+        Args:
+            scene: the present state.
+            delay_s: time in which the VUT keeps its speed, (K,) or one.
+            limit_mps2: its deceleration from then on.
         """
-        limit = self.limit_mps2 if limit_mps2 is None else limit_mps2
         v_mps = scene.v_vut_mps
         distance_m = np.maximum(-scene.x_vut_m, 0.0)
         room_m = distance_m - v_mps * delay_s
-        left = v_mps * v_mps - 2.0 * limit * room_m
-        t_s = delay_s + (v_mps - np.sqrt(np.maximum(left, 0.0))) / limit
+        left = v_mps * v_mps - 2.0 * limit_mps2 * room_m
+        t_s = delay_s + (v_mps - np.sqrt(np.maximum(left, 0.0))) / limit_mps2
         t_s = np.where(room_m > 0.0, t_s, distance_m / np.maximum(v_mps, SLOWEST_MPS))
         stops = (room_m > 0.0) & (left <= 0.0)
-        return stops | (_x_pov_m(scene) + scene.v_pov_mps * t_s >= self.crash_m)
+        return stops | (_x_pov_m(scene) + scene.v_pov_mps * t_s >= self.scenario.dx_crash_m)
 
     def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
         """Return the deceleration that the model asks for in P1, (K,)."""
@@ -206,8 +207,8 @@ class FsmVut(RampDriver):
 
     def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
         """Return the deceleration of the model; where bodies would overlap, what it takes."""
-        comfortable = np.minimum(self.model.comfortable_mps2, self.limit_mps2)
-        enough = self._can_fall_behind(scene, np.zeros(self.corridors), comfortable)
+        comfortable = min(self.model.comfortable_mps2, self.limit_mps2)
+        enough = self._can_fall_behind(scene, 0.0, comfortable)
         overlap = np.where(enough, self.model.comfortable_mps2, self.model.hardest_mps2)
         demand = super()._demand_mps2(scene, present)
         return np.where(present.gap_m < 0.0, overlap, demand)
@@ -239,9 +240,9 @@ class RssVut(RampDriver):
         """
         v_mps, limit_mps2 = scene.v_vut_mps, self.limit_mps2
         delay_s = self.model.delay_s + 0.5 * limit_mps2 / JERK_MPS3
-        stops_m = rss_distance_m(
-            v_mps, np.zeros(self.corridors), delay_s, self.accel_mps2, limit_mps2, limit_mps2
-        )
+        standing = np.zeros(self.corridors)
+        limits = delay_s, self.scenario.a_max_mps2, limit_mps2, limit_mps2
+        stops_m = rss_distance_m(v_mps, standing, *limits)
         due: Flags = np.maximum(-scene.x_vut_m, 0.0) < stops_m
         return due
 
@@ -257,25 +258,23 @@ class CarefulPov(Driver):
     def __init__(self, corridors: int) -> None:
         super().__init__(corridors)
         self._reaction = Reaction(corridors, CarefulModel())
-        self.limit_mps2 = np.full(corridors, -US23.a_min_mps2)
-        self.crash_m = np.full(corridors, US23.dx_crash_m)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Forget; take the limits of the case's scenario."""
-        self.limit_mps2[corridor] = min(-case.scenario.a_min_mps2, CarefulModel.hardest_mps2)
-        self.crash_m[corridor] = case.scenario.dx_crash_m
+        """Forget the last episode of a corridor."""
+        super().begin(corridor, case)
         self._reaction.forget(corridor)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration of the POV in each corridor, (K,)."""
-        v_vut, v_pov = scene.v_vut_mps, scene.v_pov_mps
+        v_vut, v_pov, crash_m = scene.v_vut_mps, scene.v_pov_mps, self.scenario.dx_crash_m
+        limit_mps2 = min(-self.scenario.a_min_mps2, CarefulModel.hardest_mps2)
         distance_m = np.maximum(-scene.x_vut_m, 0.0)
         t_s = distance_m / np.maximum(v_vut, SLOWEST_MPS)
         dx_m = _x_pov_m(scene) + v_pov * t_s
-        collides_s = t_s + ttc_s(-dx_m - self.crash_m, v_pov, v_vut)
-        ahead = (scene.x_vut_m > scene.x_pov_m) & (dx_m < self.crash_m)
+        collides_s = t_s + ttc_s(-dx_m - crash_m, v_pov, v_vut)
+        ahead = (scene.x_vut_m > scene.x_pov_m) & (dx_m < crash_m)
         unsafe: Flags = ahead & (collides_s < CarefulModel.critical_ttc_s)
-        return self._reaction.acceleration_mps2(unsafe, self.limit_mps2)
+        return self._reaction.acceleration_mps2(unsafe, limit_mps2)
 
 
 def _x_pov_m(scene: Scene) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, US23
+from merge_sumo.scenario.scenario import DT_S
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,7 +43,7 @@ class RuleBasedDesign(Design):
             raise UserError(f"x2_m is {self.x2_m}: stage 3 cannot begin before stage 2 (x1_m)")
 
 
-DESIGNS: Final = {
+DESIGNS = {
     "design1": RuleBasedDesign(x1_m=96.1, x2_m=30.8, gap_m=13.7, target_m=13.8, kp=0.683, kd=0.252),
     "design2": RuleBasedDesign(
         x1_m=139.1, x2_m=22.3, gap_m=16.2, target_m=9.43, kp=1.4, lag_s=0.355
@@ -54,7 +53,7 @@ DESIGNS: Final = {
 
 
 class RuleBasedVut(Level0Vut):
-    """Follows the level-0 profile, coasts when it will be too close, regulates the gap at last.
+    """Follows the level-0 profile, coasts when it will be too close, finally regulates the gap.
 
     All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
     Before x1 the VUT follows that profile. From x1 to x2 it coasts while |dx| is predicted too
@@ -70,23 +69,19 @@ class RuleBasedVut(Level0Vut):
         self._last_error = np.zeros(corridors)
         self._regulated = np.zeros(corridors, dtype=bool)
         self._actuator = np.zeros(corridors)
-        self._a_min = np.full(corridors, US23.a_min_mps2)
-        self._a_max = np.full(corridors, US23.a_max_mps2)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Reset the PID and the actuator of a corridor; take the limits of its scenario."""
+        """Reset the PID and the actuator of a corridor."""
         super().begin(corridor, case)
-        self._a_min[corridor] = case.scenario.a_min_mps2
-        self._a_max[corridor] = case.scenario.a_max_mps2
         self._regulated[corridor] = False
         self._actuator[corridor] = 0.0
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the commanded acceleration, behind the actuator's lag if there is one."""
+        """Return the commanded acceleration, (K,), after the actuator's lag if there is one."""
         design = self.design
         distance = np.maximum(-scene.x_vut_m, 0.0)
-        t_m = level0_time_to(distance, scene.v_vut_mps, self.a_mps2, self.v_cruise_mps)
-        # Behind M it is the gap that there is.
+        t_m = level0_time_to(distance, scene.v_vut_mps, self.scenario)
+        # After M it is the present gap.
         dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m - np.maximum(scene.x_vut_m, 0.0)
         command = super().act(scene)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
@@ -101,15 +96,16 @@ class RuleBasedVut(Level0Vut):
         return self._actuator
 
     def _pid(self, dx_at_m: FloatArray) -> FloatArray:
-        """Return the PID's acceleration; integral and rate start afresh when it takes over."""
+        """Return the PID's acceleration; integral and rate start at 0 when it takes over."""
         design = self.design
         error = dx_at_m - design.target_m
         self._integral = self._integral * self._regulated + error * DT_S
         rate = (error - self._last_error) * self._regulated / DT_S
         self._last_error = error
         pid = design.kp * error + design.ki * self._integral + design.kd * rate
-        limited: FloatArray = np.minimum(np.maximum(pid, self._a_min), self._a_max)
+        limits = self.scenario.a_min_mps2, self.scenario.a_max_mps2
+        limited: FloatArray = np.clip(pid, *limits)
         return limited
 
 
-VUTS: Final = {name: BuiltInVut(RuleBasedVut, design) for name, design in DESIGNS.items()}
+VUTS = {name: BuiltInVut(RuleBasedVut, design) for name, design in DESIGNS.items()}

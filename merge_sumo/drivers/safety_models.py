@@ -250,7 +250,7 @@ class Reaction:
         self._waited[corridors] = 0
         self._braking_mps2[corridors] = self._model.released_mps2
 
-    def acceleration_mps2(self, unsafe: Flags, demand_mps2: FloatArray) -> FloatArray:
+    def acceleration_mps2(self, unsafe: Flags, demand_mps2: FloatArray | float) -> FloatArray:
         """Return the accelerations of a step, (K,): 0 where it is safe, else 0 or less."""
         waits = unsafe & (self._waited < self._model.delay_steps)
         brakes = unsafe & ~waits

@@ -1,8 +1,6 @@
-"""Imperfect sensors between the road and a VUT: age, noise, dropouts, range, blind stretch."""
+"""Imperfect sensors between the road and a VUT: delay, noise, dropouts, range, occlusion."""
 
 from __future__ import annotations
-
-from typing import Final
 
 import numpy as np
 
@@ -12,14 +10,12 @@ from merge_sumo.drivers.following import car_met
 from merge_sumo.scenario.case import Case, FloatArray, ToldCase
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 
-STREAM: Final = 26
-"""Of the random numbers of a case, which others draw from, too."""
 X, V = range(2)
 """Rows of a state."""
 
 
 def far_m(scenario: Scenario) -> float:
-    """Return the place, out of the way, of a car that a VUT does not see."""
+    """Return the position, out of the way, at which a hidden car is shown."""
     ahead = 1.0 if scenario.mainline == scenario.ramp else -1.0
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
@@ -30,37 +26,37 @@ class _Sensors:
     A state has the positions and the speeds of the A vehicles, (2, A).
     """
 
-    def __init__(self, case: Case, steps_before: int) -> None:
-        """Measure the steps before the start, in which all drove as they start, and the start.
+    def __init__(self, case: Case) -> None:
+        """Measure the start, and the steps before it, in which all keep their first speeds.
 
         Args:
-            case: gives the sensors, and the seed of their random numbers.
-            steps_before: steps before the start that are measured.
+            case: has the sensors and the seed of their random numbers.
         """
         scenario, sense = case.scenario, case.sensing
-        self._before, self._far_m = steps_before, far_m(scenario)
+        self._before = whole_steps(scenario.sense.at_most("delay_s"))[0] + 1
+        self._far_m = far_m(scenario)
         whole, share = whole_steps(sense.at_most("delay_s"))
         self._late_steps = whole + (share > 0.0)
         self._drives_on_s = (1.0 - share) * DT_S if share > 0.0 else 0.0
         self._noise = np.array([[sense.at_most("noise_x_m")], [sense.at_most("noise_v_mps")]])
         self._dropout, self._range_m = sense.at_most("dropout"), sense.at_most("range_m")
         self._occluded_until_m = sense.at_most("occluded_until_m", -np.inf)
-        steps = scenario.max_steps + round(scenario.follow_up_s / DT_S) + steps_before + 1
+        steps = scenario.max_steps + round(scenario.follow_up_s / DT_S) + self._before + 1
         cars = scenario.vehicles
         if scenario.sense.is_random:
-            rng = np.random.default_rng([STREAM, case.seed])
+            rng = np.random.default_rng([26, case.seed])  # a stream of its own
             self._errors = rng.standard_normal((steps, 2, cars))
             self._arrives = rng.random((steps, cars))
         else:
             self._errors, self._arrives = np.zeros((1, 2, cars)), np.zeros((1, cars))
         self._measured: list[FloatArray] = []
         x_m, v_mps = np.array(case.starts()).T
-        for step in range(-steps_before, 1):
+        for step in range(-self._before, 1):
             self.start = np.array((x_m + v_mps * (step * DT_S), v_mps))
             self.measure(step, self.start)
 
     def measure(self, step: int, state: FloatArray) -> None:
-        """Measure a state, with NaN for cars that are not seen."""
+        """Measure a state, with NaN for hidden cars."""
         row = step + self._before
         del self._measured[row:]  # the start is measured again as the first step
         random = min(row, len(self._errors) - 1)
@@ -75,7 +71,7 @@ class _Sensors:
         self._measured.append(seen)
 
     def shown(self, state: FloatArray) -> FloatArray:
-        """Return the state that the VUT sees when the vehicles are in a state, (2, A)."""
+        """Return what the VUT sees when the vehicles are in a state, (2, A) each."""
         shown = self._measured[-1 - self._late_steps].copy()
         shown[X] += shown[V] * self._drives_on_s
         unseen = np.isnan(shown[X])
@@ -85,34 +81,34 @@ class _Sensors:
 
 
 class SensedDriver(DriverWrapper):
-    """Drives a VUT by another driver, which sees other cars as the sensors of the case show them.
+    """Drives a VUT by another driver, which sees other cars through the sensors of the case.
 
-    In each step every car is measured, with noise, or not seen: it is out of range, or the VUT is
-    before the place until which cars are hidden. Of some steps nothing arrives, and the last state
-    stays. After the delay the VUT sees what is left. Between two steps a car drives as eq. (4)
-    says, at the speed of the step; before the start all drove as they start.
+    In each step every car is measured with noise, or it is hidden: out of range, or occluded until
+    the VUT has passed a position. Some measurements are lost, and the last one stays. After the
+    delay the VUT sees the rest. Between two steps, and before the start, a car keeps its speed.
 
-    A car that is not seen is shown where it is in nobody's way, at the speed of the VUT: as far
-    behind the start of the VUT as a car may start before M (on a road of one lane, as far ahead of
-    it). The VUT's own state is exact and of now.
+    A hidden car is shown out of the way, at the speed of the VUT: as far behind the start of the
+    VUT as a car may start before M (on a road of one lane, as far ahead of it). The VUT's own state
+    is exact and has no delay.
     """
 
-    def __init__(self, driver: Driver, scenario: Scenario) -> None:
-        """Take the driver, and the scenario of its cases."""
+    def __init__(self, driver: Driver) -> None:
+        """Take the driver."""
         super().__init__(driver)
-        self._level0 = scenario.level0_a_mps2, scenario.level0_v_mps
-        self._before = whole_steps(scenario.sense.at_most("delay_s"))[0] + 1
         self._sensors: dict[int, _Sensors] = {}
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the sensors of a case; the driver is told the start as they show it."""
-        self._sensors[corridor] = sensors = _Sensors(case, self._before)
-        told = tuple(map(tuple, sensors.shown(sensors.start).T.tolist()))
-        same = {
-            name: getattr(case, name)
-            for name in ("level", "svo_rad", "v_vut0_mps", "draw", "scenario")
-        }
-        self._driver.begin(corridor, ToldCase(told=told, **same))
+        """Take the sensors of a case; the driver begins with the start that they show."""
+        self._sensors[corridor] = sensors = _Sensors(case)
+        shown = ToldCase(
+            told=tuple(map(tuple, sensors.shown(sensors.start).T.tolist())),
+            level=case.level,
+            svo_rad=case.svo_rad,
+            v_vut0_mps=case.v_vut0_mps,
+            draw=case.draw,
+            scenario=case.scenario,
+        )
+        super().begin(corridor, shown)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the driver to what it sees, (K,)."""
@@ -123,5 +119,5 @@ class SensedDriver(DriverWrapper):
             sensors.measure(int(scene.step[corridor]), state)
             x_m[:, corridor], v_mps[:, corridor] = sensors.shown(state)
         if facing is not None:
-            facing = car_met(x_m, v_mps, *self._level0)
+            facing = car_met(x_m, v_mps, self.scenario)
         return self._driver.act(scene._replace(x_m=x_m, v_mps=v_mps, facing=facing))

@@ -92,7 +92,7 @@ class Observation:
         x_pov, v_pov, x_vut, v_vut = x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT]
         traffic = []
         if len(x_m) > 2:
-            conflicting = car_met(x_m, v_mps, scenario.level0_a_mps2, scenario.level0_v_mps)
+            conflicting = car_met(x_m, v_mps, scenario)
             rows = np.arange(len(conflicting))
             x_pov, v_pov = x_m[conflicting, rows], v_mps[conflicting, rows]
             traffic.append(conflicting)
@@ -236,8 +236,7 @@ class ModelRollout:
                         )
             a_mps2[cars] = held_mps2
             if len(cars) > 1:
-                taken_m = scenario.pov_length_m + scenario.min_gap_m
-                keep_safe(a_mps2, x_m, v_mps, taken_m, -scenario.a_min_mps2, scenario.tau_s)
+                keep_safe(a_mps2, x_m, v_mps, scenario)
             parts = np.split(inputs, np.searchsorted(rows, first_rows))
             for_vut = [np.ravel(drive(part)) for drive, part in zip(drives, parts, strict=True)]
             a_mps2[VUT] = np.concatenate(for_vut)

@@ -224,7 +224,7 @@ class PovAdapter(DriverWrapper):
         try:
             return self._driver.act(other)
         except VutLostError as lost:
-            raise PovLostError(lost.reason) from lost
+            raise PovLostError(str(lost)) from lost
 
 
 def seen_from(case: Case, car: int) -> Case:

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
-from merge_sumo.drivers.following import Following
+from merge_sumo.drivers.following import car_met, keep_safe
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
@@ -91,7 +91,7 @@ class Rollout:
         corridors, vehicles = world.corridors, len(world.x_m)
         self.world, self.pov, self.vut = world, pov, vut
         self.mainline = [row for row in range(vehicles) if row != VUT]
-        self.following = Following(corridors) if len(self.mainline) > 1 else None
+        self.has_traffic = len(self.mainline) > 1
         self.queue = enumerate(cases)
         self.suspects: deque[tuple[int, Case]] = deque()
         """Episodes that ran when a process of controllers died: each runs again alone."""
@@ -107,8 +107,6 @@ class Rollout:
         self.errors: dict[int, tuple[End, str]] = {}
         self.raised: str | None = None
         """What the VUT raised instead of its last answer."""
-        self.a_min = np.zeros((vehicles, corridors))
-        self.a_max = np.zeros((vehicles, corridors))
         self.timeout_at = np.full(corridors, NEVER)
         """Rows of the record at which episodes time out."""
         self.next_timeout = NEVER
@@ -189,9 +187,9 @@ class Rollout:
             if self.deaths[episode.index] == MAX_DEATHS:
                 self.unexplained.clear()
                 if isinstance(lost, PovLostError):
-                    self.finish(corridor, End.SIM_ERROR, OF_THE_POV + lost.reason)
+                    self.finish(corridor, End.SIM_ERROR, OF_THE_POV + str(lost))
                 else:
-                    self.finish(corridor, End.VUT_ERROR, lost.reason)
+                    self.finish(corridor, End.VUT_ERROR, str(lost))
             else:
                 self.unexplained.add(episode.index)
                 self.suspects.append((episode.index, episode.case))
@@ -229,18 +227,12 @@ class Rollout:
             self.episodes[corridor] = None
             self.world.park(corridor)
             self.timeout_at[corridor] = NEVER
-            self.a_min[:, corridor] = self.a_max[:, corridor] = 0.0
             return
-        scenario = case.scenario
-        self.a_min[:, corridor] = scenario.a_min_mps2
-        self.a_max[:, corridor] = scenario.a_max_mps2
-        self.timeout_at[corridor] = self.row + scenario.max_steps
+        self.timeout_at[corridor] = self.row + case.scenario.max_steps
         self.episodes[corridor] = _Running(index, case, self.row)
         self.world.place(corridor, case.starts(), own=case.level == OWN)
         for car in range(len(self.mainline)):
             self.pov.begin(car * self.world.corridors + corridor, case)
-        if self.following is not None:
-            self.following.begin(corridor, case)
         try:
             self.vut.begin(corridor, case)
         except WRONGS as error:
@@ -249,7 +241,7 @@ class Rollout:
 
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
-        x_m, v_mps, following = self.world.x_m, self.world.v_mps, self.following
+        x_m, v_mps, scenario = self.world.x_m, self.world.v_mps, self.world.scenario
         # In most steps the sums of squares are enough.
         if not math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)) and not (
             np.isfinite(x_m).all() and np.isfinite(v_mps).all()
@@ -260,8 +252,8 @@ class Rollout:
             merged = self.merging.merged
         scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
-        if following is not None:
-            scene = scene._replace(facing=following.met(x_m, v_mps))
+        if self.has_traffic:
+            scene = scene._replace(facing=car_met(x_m, v_mps, scenario))
         self.raised = None
         try:
             of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
@@ -275,11 +267,12 @@ class Rollout:
         # Before the limits of car following, which would turn an infinite answer into a number.
         if not math.isfinite(np.vdot(answer, answer)):
             answer = self.only_numbers(answer)
-        if following is not None:
-            following.limit(answer, x_m, v_mps)
+        if self.has_traffic:
+            keep_safe(answer, x_m, v_mps, scenario)
         if self.merging is not None:
             self.merging.take(self.vut.wishes(), answer, x_m, v_mps)
-        acceleration: FloatArray = np.minimum(np.maximum(answer, self.a_min), self.a_max)
+        acceleration: FloatArray = np.clip(answer, scenario.a_min_mps2, scenario.a_max_mps2)
+        acceleration[:, ~self.active] = 0.0
         self.now[..., 2] = acceleration.T
         off = answer - acceleration
         # In most steps nobody asks for more than it may.

@@ -60,7 +60,7 @@ class Simulator:
         scenario = plan.scenario
         self.vut = plan.vut.open(world.corridors, sumo)
         if not scenario.sense.is_perfect:
-            self.vut = SensedDriver(self.vut, scenario)
+            self.vut = SensedDriver(self.vut)
         if not scenario.act.is_perfect:
             self.vut = ActuatedDriver(self.vut)
         opened.callback(self.vut.close)

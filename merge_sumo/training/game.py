@@ -77,7 +77,6 @@ class Game:
         """Return the same with the rewards in parts; what is over stands at t1."""
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         of_pov, reward = self.role == "pov", self.reward
-        profile = self.scenario.level0_a_mps2, self.scenario.level0_v_mps
         learned = None
         if self.opponent is not None:
             choices = actions_mps2(self.opponent.limited(self.scenario))
@@ -88,7 +87,7 @@ class Game:
             if learned is not None:
                 other = learned
             elif of_pov:
-                other = level0_acceleration(v_vut, *profile)
+                other = level0_acceleration(v_vut, self.scenario)
             else:
                 other = np.zeros_like(v_vut)
             a_pov, a_vut = (a_mps2, other) if of_pov else (other, a_mps2)
@@ -191,7 +190,7 @@ def exploring_starts(
     drivers there.
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
-    x_vut0, a, v_cruise = scenario.x_vut0_m, scenario.level0_a_mps2, scenario.level0_v_mps
+    x_vut0, a = scenario.x_vut0_m, scenario.level0_a_mps2
     merge = scenario
     (x_low, _), (v_low, v_high) = merge.x_pov0_m, merge.v_pov0_mps
     x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
@@ -212,7 +211,7 @@ def exploring_starts(
     gap = wide_gap * np.where(
         rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n)
     )
-    x_pov = gap - v_pov * level0_time_to(-x_vut, v_vut, a, v_cruise)
+    x_pov = gap - v_pov * level0_time_to(-x_vut, v_vut, scenario)
     x_pov = x_pov.clip(x_low - 80.0 * unit.length, 150.0 * unit.length)
     states = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
     return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng, scenario))

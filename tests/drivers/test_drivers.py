@@ -26,11 +26,7 @@ def scene(x_pov=-250.0, v_pov=30.0, x_vut=-182.0, v_vut=18.0, step=0):
 
 
 def seconds_to_m(distance, v):
-    return float(
-        level0_time_to(np.array([distance]), np.array([v]), US23.level0_a_mps2, US23.level0_v_mps)[
-            0
-        ]
-    )
+    return float(level0_time_to(np.array(distance), np.array(v), US23))
 
 
 def pov_that_meets(gap, x_vut, v_vut, v_pov=30.0):

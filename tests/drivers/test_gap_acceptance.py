@@ -24,7 +24,7 @@ def vut():
 
 def due_s(x_vut_m, v_vut_mps):
     """Return when the VUT is due at M: 1 m/s2 up to 8 m/s."""
-    return float(level0_time_to(np.array(-x_vut_m), np.array(v_vut_mps), 1.0, 8.0))
+    return float(level0_time_to(np.array(-x_vut_m), np.array(v_vut_mps), SCENARIO))
 
 
 def scene(*state):

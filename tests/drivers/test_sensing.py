@@ -43,7 +43,7 @@ def case_with(x_pov0_m=-200.0, v_pov0_mps=30.0, **sense: Any) -> Case:
 def seen_of(case, steps=8, v_vut_mps=18.0):
     """Return the POV as a VUT sees it, (T, 2), as both drive at constant speed; and as it is."""
     inner = Sees()
-    driver = SensedDriver(inner, case.scenario)
+    driver = SensedDriver(inner)
     driver.begin(0, case)
     (x_pov, v_pov), (x_vut, _) = case.starts()
     true = []
@@ -126,7 +126,7 @@ def test_in_traffic_the_car_that_is_met_is_chosen_among_those_that_are_seen():
         scenario=scenario,
     )
     inner = Sees()
-    driver = SensedDriver(inner, scenario)
+    driver = SensedDriver(inner)
     driver.begin(0, case)
     x_m, v_mps = np.array(case.starts()).T[..., None]
     facing = np.array([POV])

@@ -12,7 +12,7 @@ from support.plans import plan_for
 from merge_sumo.controllers.controller import seen_in
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.following import Following, car_met, safe_speed_mps
+from merge_sumo.drivers.following import car_met, keep_safe, safe_speed_mps
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
@@ -99,17 +99,14 @@ class TestCarsOfTheMainline:
             assert Measures(**found.values | same) == expected
 
     def test_brake_behind_one_that_brakes_and_never_touch_it(self):
-        following, rng = Following(50), np.random.default_rng(0)
-        case = cases_of(0, 1)[0]
-        for k in range(50):
-            following.begin(k, case)
+        rng = np.random.default_rng(0)
         v = np.tile(rng.uniform(5.0, 35.0, 50), (4, 1))
         x = np.zeros((4, 50))
         x[AHEAD], x[BEHIND] = rng.uniform(1.1, 2.0, (2, 50)) * [[1.0], [-1.0]] * v[0]
         for step in range(200):
             a = np.full((4, 50), 2.0)
             a[AHEAD] = -4.0 if step > 10 else 0.0
-            following.limit(a, x, v)
+            keep_safe(a, x, v, TRAFFIC)
             a = np.clip(a, -4.0, 2.0)
             x, v = x + v * DT_S, np.maximum(v + a * DT_S, 0.0)
             assert (x[[AHEAD, POV]] - x[[POV, BEHIND]]).min() > TRAFFIC.pov_length_m
@@ -121,10 +118,10 @@ class TestWhatTheVutMeets:
         # At 28 m/s already, the VUT is at M in 5 s; then the cars are at -50, 10 and -40 m.
         x = np.array([[-200.0], [-140.0], [-140.0], [-190.0]])
         v = np.array([[30.0], [28.0], [30.0], [30.0]])
-        assert car_met(x, v, 1.0, 28.0).tolist() == [AHEAD]
-        assert car_met(x, v, 1.0, 28.0 / 1.5).tolist() == [AHEAD]
+        assert car_met(x, v, TRAFFIC).tolist() == [AHEAD]
+        assert car_met(x, v, replace(TRAFFIC, level0_v_mps=28.0 / 1.5)).tolist() == [AHEAD]
         x[AHEAD] = 0.0
-        assert car_met(x, v, 1.0, 28.0).tolist() == [BEHIND]
+        assert car_met(x, v, TRAFFIC).tolist() == [BEHIND]
 
     def test_counts_as_pov_and_all_cars_are_seen_from_the_front_to_the_back(self):
         seen = seen_in(1.5, BEHIND, [-200.0, -140.0, -150.0, -190.0], [30.0, 28.0, 31.0, 29.0])
