@@ -21,8 +21,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
-from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.predictor import Predictor
+from merge_sumo.samplers.base import Predictor, Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import (

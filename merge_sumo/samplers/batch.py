@@ -61,7 +61,7 @@ def near_miss_limit(history: LevelHistory) -> float | None:
 
     With few failures, the nearest misses guide the search, as in subset simulation.
     """
-    if history.ever_failed.sum() >= NEAREST or len(history.points) < PATIENCE:
+    if (history.failures > 0).sum() >= NEAREST or len(history.points) < PATIENCE:
         return None
     return float(np.partition(nearness(history), NEAREST - 1)[NEAREST - 1])
 

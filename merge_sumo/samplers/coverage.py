@@ -13,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from merge_sumo.metrics.outcome import Prediction
-from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import ROUNDS, LevelSearch
 from merge_sumo.samplers.candidates import spread_out
@@ -157,10 +156,9 @@ class CoverageSampler(Sampler):
 
         A level with rare failures has hardly any expected gain before its first failure.
         """
-        proposed = {level: self.proposed(level) for level in self.pool.levels}
         if min(len(self.observed(level)) for level in self.pool.levels) < 2:
-            return even_shares(proposed, n)
-        shares = even_shares(proposed, max(min(n, len(proposed)), n // 2))
+            return self.shares(n)
+        shares = self.shares(max(min(n, len(self.pool.levels)), n // 2))
         for _ in range(n - sum(shares.values())):
             best = max(shares, key=lambda level: proposals[level].gain[shares[level]])
             shares[best] += 1

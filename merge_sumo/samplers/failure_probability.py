@@ -127,7 +127,7 @@ def learned_values(
     units of that at the limit.
     """
     if not history.has_gaps:
-        return np.minimum(history.badness / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
+        return np.minimum((1.0 - history.margin) / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
     gap = np.nan_to_num(history.gap, nan=NO_GAP) / (limit or 1.0)
     return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
 
@@ -151,7 +151,7 @@ def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
 
     Without a trajectory a safe case is of both merging orders.
     """
-    failed = history.ever_failed
+    failed = history.failures > 0
     if not history.has_gaps:
         return [failed, ~failed, ~failed]
     pov_first = np.nan_to_num(history.gap, nan=NO_GAP) >= 0.0

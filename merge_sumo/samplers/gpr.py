@@ -1,51 +1,46 @@
-"""Gaussian-process sampling as published: Wang et al., Algorithm 1."""
+"""Gaussian-process sampling: Wang et al., Algorithm 1."""
 
 from __future__ import annotations
 
 import math
 import warnings
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from merge_sumo.samplers.allocation import last_failure_share, whole_shares
 from merge_sumo.samplers.base import LevelwiseSampler
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.history import LevelHistory, most_informative
 from merge_sumo.scenario.case import FloatArray
 
-QUERIES: Final = 4000
-"""p, the uniform queries among which a batch is chosen."""
-EPSILON0: Final = 0.05
-ALPHA: Final = 0.95
-"""epsilon = EPSILON0 ALPHA^(i-1) is the share of exploring picks in batch i."""
-Z_EXPLOIT: Final = (4.0, 1.0)
-Z_EXPLORE: Final = (1.0, 2.0)
-"""Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance."""
-FLOOR: Final = 1e-3
-"""What a query is worth even where all is covered."""
-XI: Final = 3.0
-"""Greediness of the shares of the levels."""
-NOISE: Final = 1e-2
-"""Variance of the observation noise: the badness has a jump, which a smooth
-surrogate can only take as noise."""
-MAX_LEARNED: Final = 600
-"""Cases that the process learns from; what bounds the time per batch in a long campaign."""
-LENGTH_BOUNDS: Final = (0.035, 5.0)
-"""Bounds of the kernel's length scales in the unit cube. Far below the FMC's radius a surrogate
-explains a jump by forgetting its neighbours."""
+# p, the uniform queries among which a batch is chosen.
+QUERIES = 4000
+# epsilon = EPSILON0 ALPHA^(i-1) is the share of exploring picks in batch i.
+EPSILON0 = 0.05
+ALPHA = 0.95
+# Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance.
+Z_EXPLOIT = (4.0, 1.0)
+Z_EXPLORE = (1.0, 2.0)
+# Value of a query whose ball is covered.
+FLOOR = 1e-3
+# Variance of the observation noise: the badness has a jump, which a smooth surrogate can only fit
+# as noise.
+NOISE = 1e-2
+# Bounds of the kernel's length scales in the unit cube. Far below the FMC's radius a surrogate
+# explains a jump by forgetting its neighbours.
+LENGTH_BOUNDS = (0.035, 5.0)
 
 
 class GprSampler(LevelwiseSampler):
     """Zero-mean Gaussian process with a squared-exponential kernel on the badness, epsilon-greedy.
 
     The badness of a margin m is 1 - m, which is P / lambda under the paper's criterion: the powers
-    of q = mu^z1 Var^z2 need positive numbers. Within a batch the picks are made one after the
-    other, and the variance is conditioned on the earlier ones (it does not depend on their
-    results), so that a batch is spread out instead of piled up on one maximum. A query is worth
-    only the share of its ball (radius rho of the FMC) that no failure and no pick covers yet.
-    `python tools/bench_samplers.py --ablate` measures what the choices are worth.
+    of q = mu^z1 Var^z2 need positive numbers. The picks of a batch follow each other, each with the
+    variance conditioned on the earlier ones (it does not depend on their results): that spreads the
+    batch out. The value of a query is multiplied by the share of its ball (radius rho of the FMC)
+    that no failure and no pick covers. `python tools/bench_samplers.py --ablate` measures the
+    effect of each choice.
     """
 
     about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"
@@ -54,13 +49,20 @@ class GprSampler(LevelwiseSampler):
 
     def allocate(self, n: int) -> dict[int, int]:
         """Return equal shares first, then shares by the softmax of the last failure shares."""
-        outcomes = self.observed()
-        proposed = {level: self.proposed(level) for level in self.pool.levels}
-        # In proportion to exp(xi U_k), U_k the failure share of level k.
-        weights = {
-            level: math.exp(XI * last_failure_share(outcomes, level)) for level in self.pool.levels
-        }
-        return whole_shares(weights, proposed, n)
+        weights = {}
+        for level in self.pool.levels:
+            # In proportion to exp(xi U_k), with xi = 3.
+            weights[level] = math.exp(3.0 * self.failure_share(level))
+        return self.shares(n, weights)
+
+    def failure_share(self, level: int) -> float:
+        """Return U(i, k): the share of failures in the last batch that had cases at level k."""
+        outcomes = self.observed(level)
+        if not outcomes:
+            return 0.0
+        last = max(outcome.batch for outcome in outcomes)
+        verdicts = [outcome.failed for outcome in outcomes if outcome.batch == last]
+        return sum(verdicts) / len(verdicts)
 
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
@@ -69,17 +71,18 @@ class GprSampler(LevelwiseSampler):
         if not len(history.points):
             return rng.random((n, history.dims))
         queries = rng.random((QUERIES, history.dims))
-        batches_before = len(np.unique(history.batch))
-        epsilon = EPSILON0 * ALPHA**batches_before
-        exploring = round(epsilon * n)
+        epsilon = EPSILON0 * ALPHA ** len(np.unique(history.batch))
+        exploiting = n - round(epsilon * n)
         posterior = _Posterior(history, queries, self.pending(level))
-        picks = [posterior.pick(*Z_EXPLOIT) for _ in range(n - exploring)]
-        picks += [posterior.pick(*Z_EXPLORE) for _ in range(exploring)]
+        picks = []
+        for number in range(n):
+            powers = Z_EXPLOIT if number < exploiting else Z_EXPLORE
+            picks.append(posterior.pick(*powers))
         return queries[picks]
 
 
 class _Posterior:
-    """The fitted surrogate at the queries, with a variance that knows the picks of the batch.
+    """The fitted surrogate at the queries, with a variance conditioned on the picks of the batch.
 
     Pending cases, (m, d), are picks of earlier batches.
     """
@@ -89,21 +92,21 @@ class _Posterior:
         queries = np.concatenate([queries, pending])
         self._queries = queries
         failures = history.points[history.failed]
-        history = most_informative(history, MAX_LEARNED)
+        # The most cases to learn from: they bound the time for a batch in a long campaign.
+        history = most_informative(history, 600)
         process = _fit(history)
         self._kernel, self._noise = process.kernel_, float(np.max(_noise(history)))
         cross = self._kernel(history.points, queries)
         self._explained = solve_triangular(process.L_, cross, lower=True)
-        badness = np.maximum(cross.T @ process.alpha_, 0.0)
         # A floor keeps every query reachable where the surrogate predicts no badness at all.
-        self._badness = badness + 1e-6
+        self._badness = np.maximum(cross.T @ process.alpha_, 0.0) + 1e-6
         self._variance = self._kernel.diag(queries) - np.square(self._explained).sum(axis=0)
         self._taken = np.zeros(len(queries), dtype=bool)
         self._grid = CoverageGrid(queries.shape[1], coarse=True)
         self._grid.cover(self._grid.balls(failures), 1.0)
         self._balls = self._grid.balls(queries)
-        for place in range(first, len(queries)):
-            self._take(place)
+        for query in range(first, len(queries)):
+            self._take(query)
 
     def pick(self, z_badness: float, z_variance: float) -> int:
         """Take the query that maximises badness^z variance^z new, and condition on it."""
@@ -116,7 +119,7 @@ class _Posterior:
         return best
 
     def _take(self, best: int) -> None:
-        """Condition on the query at a place, and cover its ball."""
+        """Condition on a query, and cover its ball."""
         variance = max(float(self._variance[best]), 1e-12)
         self._taken[best] = True
         self._grid.cover(self._balls[best], 1.0)
@@ -141,21 +144,22 @@ def _fit(history: LevelHistory) -> Any:
     with threadpool_limits(1), warnings.catch_warnings():
         # A length scale at its bound is expected where P hardly depends on a coordinate.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        return process.fit(history.points, history.badness)
+        return process.fit(history.points, 1.0 - history.margin)
 
 
 def _noise(history: LevelHistory) -> FloatArray | float:
     """Return the variance of the noise of each case, (N,).
 
-    Where runs of a case differ, the variance that cases with several runs have in the mean is that
-    of a single run; more runs lower it.
+    Where runs of a case differ, a run has the mean variance of the cases with several runs; more
+    runs lower it.
     """
     if not history.varies or np.isnan(history.variance).all():
         return NOISE
     of_a_run = float(np.nanmean(history.variance))
-    return np.asarray(NOISE + of_a_run / history.runs, dtype=np.float64)
+    return NOISE + of_a_run / history.runs
 
 
 def predicted_margin(history: LevelHistory, points: FloatArray) -> FloatArray:
     """Return the margin that the surrogate predicts at points, (m, d), as (m,)."""
-    return np.asarray(1.0 - _fit(history).predict(points), dtype=np.float64)
+    margin: FloatArray = 1.0 - _fit(history).predict(points)
+    return margin

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, Final
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.scenario.case import FloatArray
 
-LINEAR: Final = 1.25
-"""Size up to which a margin is learned as it is; the paper's are all within."""
-
 
 def bounded(margin: FloatArray) -> FloatArray:
-    """Return margins, (...), with the large ones drawn in: what a process on them can learn.
+    """Return margins, (...), with the large ones compressed, so that a process can learn them.
 
-    In the same order and with the same signs, continuous with its slope, and within 2.5.
+    They keep their order and signs, are continuous with their slope, and within 2.5.
     """
-    size = np.maximum(np.abs(margin), LINEAR)
-    drawn_in = np.sign(margin) * (2.0 * LINEAR - LINEAR**2 / size)
-    return np.asarray(np.where(size > LINEAR, drawn_in, margin), dtype=np.float64)
+    # Smaller margins stay as they are; the paper's are all smaller.
+    linear = 1.25
+    size = np.maximum(np.abs(margin), linear)
+    compressed = np.sign(margin) * (2.0 * linear - linear**2 / size)
+    return np.where(size > linear, compressed, margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +27,8 @@ class LevelHistory:
     """The outcomes of one POV level: N cases with a verdict, in the order of their first run.
 
     A case that ran several times has one row. Its worst run gives its score and its gap, whatever
-    is tolerated: so a surrogate learns where a case can fail, and from k of n how often it does.
+    share is tolerated: a surrogate learns from it where a case can fail, and how often from
+    `failures` and `runs`.
 
     Attributes:
         points: cases in the unit cube, (N, d).
@@ -39,7 +38,7 @@ class LevelHistory:
             where the VUT never arrived or there is no trajectory.
         batch: batch of the campaign in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
-        failures: number of those that failed, (N,).
+        failures: number of runs that failed, (N,).
         variance: variance of the margin over the runs of a case, (N,); NaN for a single run.
         varies: whether runs of a case have differed, at this level or another.
     """
@@ -60,28 +59,9 @@ class LevelHistory:
         return int(self.points.shape[1])
 
     @property
-    def badness(self) -> FloatArray:
-        """Return how bad each case is, (N,): above 1 for a failure; P / lambda in the paper."""
-        return np.asarray(1.0 - self.margin, dtype=np.float64)
-
-    @property
     def has_gaps(self) -> bool:
         """Return whether the VUT gives trajectories."""
         return not np.isnan(self.gap).all()
-
-    @property
-    def ever_failed(self) -> NDArray[np.bool_]:
-        """Return whether any run of a case failed, (N,)."""
-        return self.failures > 0
-
-    def take(self, places: slice | NDArray[np.int64]) -> LevelHistory:
-        """Return some of the outcomes."""
-        chosen: dict[str, Any] = {}
-        for column in fields(self):
-            values = getattr(self, column.name)
-            if isinstance(values, np.ndarray):
-                chosen[column.name] = values[places]
-        return replace(self, **chosen)
 
 
 def most_informative(history: LevelHistory, most: int) -> LevelHistory:
@@ -92,4 +72,6 @@ def most_informative(history: LevelHistory, most: int) -> LevelHistory:
     half = most // 2
     rest = np.sort(order[half:])
     evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
-    return history.take(np.sort(np.concatenate([order[:half], rest[evenly]])))
+    chosen = np.sort(np.concatenate([order[:half], rest[evenly]]))
+    columns = [getattr(history, column.name)[chosen] for column in fields(history)[:-1]]
+    return LevelHistory(*columns, varies=history.varies)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from merge_sumo.registry import Registry
 
 if TYPE_CHECKING:
-    from merge_sumo.samplers.base import Sampler
-    from merge_sumo.samplers.predictor import Predictor
+    from merge_sumo.samplers.base import Predictor, Sampler
     from merge_sumo.scenario.case import Pool
 
 
@@ -18,7 +17,7 @@ def _is_sampler(item: object) -> bool:
     return isinstance(item, type) and issubclass(item, Sampler)
 
 
-SAMPLERS: Final[Registry[type[Sampler]]] = Registry(
+SAMPLERS: Registry[type[Sampler]] = Registry(
     "merge_sumo.samplers",
     "sampler",
     {
@@ -34,12 +33,15 @@ SAMPLERS: Final[Registry[type[Sampler]]] = Registry(
 
 
 def make_sampler(name: str, pool: Pool, seed: int, predictor: Predictor | None = None) -> Sampler:
-    """Return the sampler of that name; `UserError` for an unknown name.
+    """Return a sampler without outcomes.
 
     Args:
-        name: as in `SAMPLERS`.
-        pool: cases from which it chooses.
-        seed: same seed, same proposals.
+        name: its name in `SAMPLERS`.
+        pool: the cases to choose from.
+        seed: the same seed gives the same proposals.
         predictor: for samplers that use predictions.
+
+    Raises:
+        UserError: there is no sampler of that name.
     """
     return SAMPLERS[name](pool, seed, predictor)

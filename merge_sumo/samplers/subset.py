@@ -1,13 +1,12 @@
 """Subset simulation, a baseline of the paper (Au and Beck, 2001).
 
-Regions F1, F2, ... of ever lower margins end at the failures. The cases of a region are drawn by
-Markov chains that start from the lowest margins of the region before (modified Metropolis).
+Markov chains draw the cases of regions F1, F2, ... of ever lower margins, which end at the
+failures; each region's chains start from the lowest margins of the last one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -15,13 +14,11 @@ from merge_sumo.samplers.base import LevelwiseSampler, reflect
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
 
-STAGE_SIZE: Final = 100
-"""Samples of a stage, that is of one conditional region."""
-SEED_SHARE: Final = 0.2
-"""p0: the share of a stage that is in the next region and starts its chains. With 100 samples
-that is 20 chains, and a batch of 20 moves each of them once."""
-WIDTH0: Final = 0.5
-"""Half width of the moves in the unit cube at the first region; it shrinks with the regions."""
+# Samples of a stage, that is of one conditional region.
+STAGE_SIZE = 100
+# p0: the share of a stage that is in the next region and starts its chains. With 100 samples
+# these are 20 chains, and a batch of 20 moves each of them once.
+SEED_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +26,9 @@ class SubsetState:
     """The state of subset simulation after a history.
 
     Attributes:
-        number: i of the present region; 0 is the whole cube, sampled uniformly.
+        number: i of the current region; 0 is the whole cube, sampled uniformly.
         threshold: the region is where the margin is at or below this; infinite for the cube.
-        chains: present state of each chain, (c, d); none for the cube.
+        chains: state of each chain, (c, d); none for the cube.
         moved: moves made in this region so far.
     """
 
@@ -42,16 +39,15 @@ class SubsetState:
 
 
 def replay(history: LevelHistory) -> SubsetState:
-    """Return where the chains stand after a history of batches proposed by `SubsetSampler`.
+    """Return the state after a history of batches that `SubsetSampler` proposed.
 
-    The k-th move of a stage belongs to chain k modulo their number. A batch may run over the end
-    of a stage by a few samples, which then count for it.
+    The k-th move of a stage belongs to chain k modulo their number. The last batch of a stage may
+    have a few samples more than the stage needs; they count for it.
     """
-    dims = history.points.shape[1]
     number, threshold, moved = 0, np.inf, 0
-    chains, levels = np.empty((0, dims)), np.empty(0)
-    # The samples of the stage: states of the chains, so that a rejected move repeats its state.
-    samples, margins = [np.empty((0, dims))], [np.empty(0)]
+    chains, levels = np.empty((0, history.dims)), np.empty(0)
+    # Samples of the stage are states of the chains: a rejected move repeats its state.
+    samples, margins = chains, levels
     for batch in np.unique(history.batch).tolist():
         points = history.points[history.batch == batch]
         values = history.margin[history.batch == batch]
@@ -65,25 +61,23 @@ def replay(history: LevelHistory) -> SubsetState:
             chains[chain], levels[chain] = points, values
         if threshold < 0.0:
             continue
-        samples.append(points)
-        margins.append(values)
-        population, of_population = np.concatenate(samples), np.concatenate(margins)
-        if len(population) < STAGE_SIZE:
+        samples, margins = np.concatenate([samples, points]), np.append(margins, values)
+        if len(samples) < STAGE_SIZE:
             continue
-        seeds = np.argsort(of_population, kind="stable")[: round(SEED_SHARE * len(population))]
-        threshold = float(of_population[seeds[-1]])
+        seeds = np.argsort(margins, kind="stable")[: round(SEED_SHARE * len(samples))]
+        threshold = float(margins[seeds[-1]])
         if threshold < 0.0:
-            seeds = np.flatnonzero(of_population < 0.0)
+            seeds = np.flatnonzero(margins < 0.0)
             threshold = np.nextafter(0.0, -np.inf)
-        chains, levels = population[seeds], of_population[seeds]
-        # The seeds are samples of the new region too.
-        samples, margins = [chains.copy()], [levels.copy()]
+        # The seeds are samples of the new region, too.
+        samples, margins = samples[seeds], margins[seeds]
+        chains, levels = samples.copy(), margins.copy()
         number, moved = number + 1, 0
     return SubsetState(number, threshold, chains, moved)
 
 
 class SubsetSampler(LevelwiseSampler):
-    """Conditional regions and Markov chains; the last region, the failures, is sampled on and on.
+    """Conditional regions and Markov chains; the last region, the failures, is sampled to the end.
 
     Moves are reflected at the faces of the cube. That keeps them symmetric, so under the uniform
     distribution each is accepted exactly where it stays in the region.
@@ -99,8 +93,8 @@ class SubsetSampler(LevelwiseSampler):
         state = replay(history)
         if state.number == 0:
             return rng.random((n, history.dims))
-        dims = state.chains.shape[1]
         chain = (state.moved + np.arange(n)) % len(state.chains)
-        # A region with p0 of the volume of the one before has p0^(1/d) of its size.
-        width = WIDTH0 * SEED_SHARE ** ((state.number - 1) / dims)
-        return reflect(state.chains[chain] + rng.uniform(-width, width, (n, dims)))
+        # Half width of the moves. A region with p0 of the volume of the last one has p0^(1/d) of
+        # its size.
+        width = 0.5 * SEED_SHARE ** ((state.number - 1) / history.dims)
+        return reflect(state.chains[chain] + rng.uniform(-width, width, (n, history.dims)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from merge_sumo.samplers.allocation import even_shares
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.scenario.case import Case
 
@@ -17,9 +16,8 @@ class UniformSampler(Sampler):
 
     def ask(self, n: int) -> list[Case]:
         """Return the next `n` cases, level by level."""
-        shares = even_shares({level: self.proposed(level) for level in self.pool.levels}, n)
         cases: list[Case] = []
-        for level, share in shares.items():
+        for level, share in self.shares(n).items():
             points = self.rng(level).random((share, len(self.pool.scenario.dimensions(level))))
             cases += self.pool.cases(points, level)
         return cases

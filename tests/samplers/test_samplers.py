@@ -7,6 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
@@ -48,6 +50,38 @@ class TestTheRegistry:
             assert word in str(error.value)
 
 
+class ProposedSampler(SAMPLERS["uniform"]):  # type: ignore[misc]
+    """A sampler of cases that were proposed before."""
+
+    def __init__(self, *proposed: int) -> None:
+        super().__init__(Pool(levels=tuple(range(len(proposed))), scenario=US23), 0)
+        self.before = proposed
+
+    def proposed(self, level=None):
+        return self.before[level]
+
+
+class TestShares:
+    @pytest.mark.parametrize(
+        ("proposed", "n", "expected"),
+        [
+            ((7, 6, 7), 4, {0: 1, 1: 2, 2: 1}),
+            ((7, 6, 5), 5, {0: 1, 1: 2, 2: 2}),
+            ((5, 2, 9), 1, {0: 0, 1: 1, 2: 0}),
+            ((5, 2, 9), 2, {0: 1, 1: 1, 2: 0}),
+        ],
+    )
+    def test_levels_with_the_fewest_cases_come_first(self, proposed, n, expected):
+        assert ProposedSampler(*proposed).shares(n) == expected
+
+    @given(st.lists(st.floats(1e-3, 1e3), min_size=3, max_size=3), st.integers(0, 300))
+    def test_add_up_to_the_batch_and_leave_no_level_out(self, weights, n):
+        shares = ProposedSampler(4, 4, 4).shares(n, dict(enumerate(weights)))
+        assert sum(shares.values()) == n
+        assert list(shares) == [0, 1, 2]
+        assert sum(share > 0 for share in shares.values()) == min(n, 3)
+
+
 def failures_found(name: str, levels: tuple[int, ...], seed: int, batches: int) -> int:
     sampler = make_sampler(name, Pool(levels=levels, scenario=US23), seed)
     return sum(outcome.failed for outcome in play(sampler, batches, 20))
@@ -71,13 +105,14 @@ def test_gpr_finds_more_failures_than_uniform_with_the_same_budget():
     assert gpr > 2 * uniform
 
 
-def test_gpr_gives_more_cases_to_the_level_with_the_failures():
+def test_gpr_shares_by_the_failures_of_the_last_batch_of_each_level():
     sampler = make_sampler("gpr", Pool(levels=(0, 1), scenario=US23), 4)
-    cases = sampler.ask(20)
-    # Level 0 never fails, all of level 1 does.
-    verdicts = [Measures(end=End.MERGED, score=s, t_end_s=8.3) for s in (-5.0, -700.0)]
-    outcomes = [Outcome(index, 0, case, verdicts[case.level]) for index, case in enumerate(cases)]
-    sampler.tell(outcomes)
+    cases = {level: sampler.pool.cases(np.array([[0.5, 0.5]]), level)[0] for level in (0, 1)}
+    # Level, batch and score: half of the last batch of level 1 fails, none of level 0.
+    runs = [(0, 0, -5.0), (1, 0, -5.0), (1, 1, -700.0), (1, 1, -5.0), (0, 2, -5.0)]
+    for index, (level, batch, score) in enumerate(runs):
+        measures = Measures(end=End.MERGED, score=score, t_end_s=8.3)
+        sampler.tell([Outcome(index, batch, cases[level], measures)])
     levels = [case.level for case in sampler.ask(20)]
-    # exp(3) : 1 over 20 cases is 19.05 : 0.95.
-    assert (levels.count(0), levels.count(1)) == (1, 19)
+    # exp(3 / 2) : 1 over 20 cases is 16.35 : 3.65.
+    assert (levels.count(0), levels.count(1)) == (4, 16)
