@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields, replace
 from functools import cache, partial, update_wrapper
-from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
@@ -469,12 +468,6 @@ def check_scenario(config: c.CheckScenario) -> Shown:
 @verb(c.Train)
 def train(config: c.Train) -> PolicyChecks:
     """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
-    for package in ("torch", "gymnasium"):
-        if find_spec(package) is None:
-            raise UserError(
-                f"training needs {package}, which is not installed: run "
-                "`pip install 'merge-sumo[train]'`"
-            )
     from merge_sumo.training.helix import checks_of
 
     scenario = None if config.scenario is None else changed_scenario(config.scenario)

@@ -26,31 +26,31 @@ BRAKING: Final = (1.0, 0.75, 0.5, 0.25)
 """Shares of the hardest braking that a learned driver chooses from,"""
 ACCELERATING: Final = (0.5, 1.0)
 """and of the hardest acceleration; between them it coasts."""
-ACTIONS: Final = len(BRAKING) + 1 + len(ACCELERATING)
+ACTIONS = len(BRAKING) + 1 + len(ACCELERATING)
 DECISION_STEPS: Final = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
 
-BLOCK: Final = 512
+BLOCK = 512
 """Most rows of a product: their hidden units fit into the cache of a core."""
-LEAST_ROWS: Final = 256
-TILE: Final = 16
+LEAST_ROWS = 256
+TILE = 16
 """Fewest rows of a product, and what divides their number: products of fewer rows, or of the rows
 that are left over, round otherwise."""
 
-FEATURES: Final = 26
-SVO_FEATURES: Final = 2
-LEVEL0_GAP_FEATURE: Final = 8
+FEATURES = 26
+SVO_FEATURES = 2
+LEVEL0_GAP_FEATURE = 8
 """Column with the gap at M if the POV keeps its speed and the VUT the level-0 profile, as
 tanh(gap / 25 m)."""
-MANY_ROWS: Final = 40
+MANY_ROWS = 40
 """Rows from which products of whole matrices are quicker than one after the other."""
-SINGLE_ERROR: Final = 1e-3
+SINGLE_ERROR = 1e-3
 """A lead of the best action, as a share of 1 + max |Q|, that float32 cannot turn round. Of 200,000
 states for each of the eight shipped networks the largest error is 1e-5."""
-LIMIT: Final = "a_min_mps2"
+LIMIT = "a_min_mps2"
 """Name of the tensor, (1,), with the hardest braking that a network chooses, where it has one."""
-_HORIZON_S: Final = 20.0
-_GAP_SCALES_M: Final = (80.0, 25.0, 8.0)
+_HORIZON_S = 20.0
+_GAP_SCALES_M = (80.0, 25.0, 8.0)
 
 
 class AccelerationLimits(Protocol):

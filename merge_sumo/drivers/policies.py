@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -17,20 +17,20 @@ from merge_sumo.printable import quoted
 from merge_sumo.records import Record, convert, decode
 from merge_sumo.scenario.scenario import US23, Scenario
 
-MANIFEST: Final = "manifest.json"
-NETWORKS: Final = ("pov1", "vut1", "pov2", "vut2")
+MANIFEST = "manifest.json"
+NETWORKS = ("pov1", "vut1", "pov2", "vut2")
 """In the order of the helix: each is trained against an earlier one, or against level 0."""
-PLAYED: Final = (
+PLAYED = (
     *("x_pov0_m", "v_pov0_mps", "x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2"),
     *("v_hw_min_mps", "v_hw_max_mps", "v_min_mps", "ttc_min_s", "dx_crash_m", "dx_critical_m"),
     *("level0_a_mps2", "level0_v_mps", "timeout_s"),
 )
 """Numbers of a scenario that decide what a driver learns; the road and other cars do not."""
-LIMITS: Final = ("reach_m", "v_start_max_mps")
+LIMITS = ("reach_m", "v_start_max_mps")
 """Of what these numbers may be."""
-MOST_BYTES: Final = 1 << 26
+MOST_BYTES = 1 << 26
 """No network and no manifest is larger."""
-HUMAN: Final = "human"
+HUMAN = "human"
 """Shipped library for `us23` in which no POV brakes harder than people did: it is used by name."""
 
 
@@ -182,7 +182,7 @@ def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelK
     return LevelKDriver(corridors, load_network(name, folder))
 
 
-VUTS: Final = {
+VUTS = {
     f"level{level}": BuiltInVut(partial(load_driver, name), network=name, ramp_only=True)
     for level, name in ((1, "vut1"), (2, "vut2"))
 }

@@ -26,7 +26,7 @@ with a table that was made by another implementation of the rules above.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,7 +48,7 @@ from merge_sumo.drivers.safety_models import (
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 
-SLOWEST_MPS: Final = 1e-9
+SLOWEST_MPS = 1e-9
 """A slower vehicle stands."""
 
 
@@ -283,7 +283,7 @@ def _x_pov_m(scene: Scene) -> FloatArray:
     return x_m
 
 
-REFERENCES: Final[dict[str, type[RampDriver]]] = {
+REFERENCES: dict[str, type[RampDriver]] = {
     "careful": CarefulVut,
     "fsm": FsmVut,
     "reg157": Reg157Vut,
@@ -292,4 +292,4 @@ REFERENCES: Final[dict[str, type[RampDriver]]] = {
 """The reference drivers by name, as VUTs."""
 
 
-VUTS: Final = {name: BuiltInVut(driver) for name, driver in REFERENCES.items()}
+VUTS = {name: BuiltInVut(driver) for name, driver in REFERENCES.items()}

@@ -32,10 +32,10 @@ CHECKED_SHARE: Final = 0.01
 CHUNK: Final = 2500
 """Cases that a worker takes at a time. A number of its own, whatever the workers, so that the same
 cases are checked."""
-CORRIDORS: Final = 512
+CORRIDORS = 512
 """Episodes at a time: enough for the calls of numpy to cost little, and their record fits into the
 cache."""
-ROUNDING: Final = 1e-6
+ROUNDING = 1e-6
 """What the engines may differ in, in m and m/s. Measured: 1e-11."""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from merge_sumo.scenario.scenario import (
 )
 from merge_sumo.sumo.world import World
 
-POLICIES: Final = {1: "pov1", 2: "pov2"}
+POLICIES = {1: "pov1", 2: "pov2"}
 """The learned POVs by their level."""
 
 
@@ -82,8 +82,8 @@ class Povs:
         return min(asked, most // cars)
 
 
-CHOICE: Final = "0, 1, 2, several with commas, all alone, or own with `pov`"
-ONE: Final = "0, 1 or 2, or own with `pov`"
+CHOICE = "0, 1, 2, several with commas, all alone, or own with `pov`"
+ONE = "0, 1 or 2, or own with `pov`"
 
 
 def levels_in(policies: Path, *, own: bool) -> tuple[int, ...]:
@@ -205,7 +205,7 @@ class PovLibrary(Driver):
             driver.close()
 
 
-BEFORE_M: Final = -1e-9
+BEFORE_M = -1e-9
 """A VUT starts before M; a car of the mainline may start there or past it."""
 
 

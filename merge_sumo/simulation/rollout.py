@@ -20,27 +20,27 @@ from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.sumo.world import SimulationError, World
 
-RING_ROWS: Final = round(MAX_EPISODE_S / DT_S) + 2
+RING_ROWS = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
 
 
-ROUNDING_MPS2: Final = 1e-9
+ROUNDING_MPS2 = 1e-9
 """An answer this little outside the limits is a rounding error, not a wish for more."""
 
-WRONGS: Final = (Exception, SystemExit)
+WRONGS = (Exception, SystemExit)
 """A black box may raise anything; only a person's own interruption is not its doing."""
 
-OF_THE_POV: Final = "the POV: "
+OF_THE_POV = "the POV: "
 """Begins the reason of an error that is the doing of a POV."""
 
 MAX_DEATHS: Final = 2
 """A case that ends the process of its controller this often, alone, is at fault: once may have come
 from outside."""
 
-END_OF_ROAD_M: Final = 20.0
+END_OF_ROAD_M = 20.0
 """No vehicle is followed up to where the road ends."""
 
-NEVER: Final = 2**62
+NEVER = 2**62
 """The step at which a corridor without an episode times out."""
 
 

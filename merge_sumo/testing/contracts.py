@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -85,7 +85,7 @@ class MeasureContract:
         assert np.array_equal(before, trajectory.motion)
 
 
-_kept: Final[list[ScratchFolder]] = []
+_kept: list[ScratchFolder] = []
 """Folders that stay until the process ends."""
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -23,18 +22,18 @@ from merge_sumo.drivers.levelk import ACTIONS, LEVEL0_GAP_FEATURE, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.training.game import Game, IntArray, inputs_of
 
-_CHUNK: Final = 16
+_CHUNK = 16
 """Cases that are searched at once."""
-_WAYS: Final = 4096
+_WAYS = 4096
 """Ways to M that are compared in all cases at once."""
-_SAME: Final = 1e-2
+_SAME = 1e-2
 """States nearer than this, in m and m/s, are one: finer than the lattice where the accelerations
 are multiples of 0.2 m/s2."""
-_MOST: Final = 200_000
+_MOST = 200_000
 """Where there are more states, as on a long ramp where the accelerations have no common unit, those
 nearer than twice as much are one, and so on. Nothing was lost by 0.2 m and m/s."""
-_SPEEDS: Final = 1 << 16
-_PLACES: Final = 1 << 20
+_SPEEDS = 1 << 16
+_PLACES = 1 << 20
 """More than there are of them."""
 
 

@@ -24,7 +24,7 @@ from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
 
 CHECK_CASES: Final = 300
-CORRIDORS: Final = 32
+CORRIDORS = 32
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ from merge_sumo.training.game import Game, exploring_starts
 from merge_sumo.training.reward import RewardParts, Role
 
 SQUASH_BELOW: Final = -2.0
-GAMES: Final = 64
+GAMES = 64
 """Games that are played at once."""
 
 

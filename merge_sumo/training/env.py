@@ -7,13 +7,13 @@
 The agent plays the POV or the VUT; its opponent is a driver of this package. Observations are
 [x_POV, v_POV, x_VUT, v_VUT] in m and m/s, and psi for a POV with a social value orientation;
 actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another scenario. With
-`render_mode="rgb_array"` or `"human"` it is drawn from above.
+`render_mode="rgb_array"` it is drawn from above; gymnasium shows that in a window for `"human"`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import gymnasium
 import numpy as np
@@ -29,17 +29,17 @@ from merge_sumo.training.game import Game, of_two, pool_starts
 from merge_sumo.training.picture import GamePicture
 from merge_sumo.training.reward import Reward, RewardWeights, Role
 
-STATE_LOW: Final = np.array([-500.0, 0.0, -200.0, 0.0])
-STATE_HIGH: Final = np.array([1900.0, 100.0, 30.0, 100.0])
+STATE_LOW = np.array([-500.0, 0.0, -200.0, 0.0])
+STATE_HIGH = np.array([1900.0, 100.0, 30.0, 100.0])
 """Bounds of an observation, in the units of the scenario."""
-FPS: Final = round(1.0 / (DECISION_STEPS * DT_S))
+FPS = round(1.0 / (DECISION_STEPS * DT_S))
 """A picture for each decision shows a game in real time."""
 
 
 class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
     """One merging game, `merge_sumo/Merge-v0`."""
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": FPS}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
             svo: psi of a POV of level 2, in rad, or "random" for one drawn for every game; psi is
                 then part of the observation.
             weights: of the reward; by default those of the scenario.
-            render_mode: "rgb_array" for pictures, "human" for a window in real time.
+            render_mode: "rgb_array" for pictures; `gymnasium.make` takes "human" for a window, too.
             scenario: the scenario that is played; its timeout truncates a game.
 
         Raises:
@@ -70,8 +70,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
             raise UserError(f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2")
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(
-                f"there is no render_mode {render_mode!r}: choose 'rgb_array' or 'human', or leave "
-                "it out"
+                f"there is no render_mode {render_mode!r}: choose 'rgb_array', or leave it out"
             )
         reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
         self.game = Game(role, _opponent(role, opponent), reward)
@@ -114,20 +113,10 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         return self._observed(), float(reward[0]), bool(over[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:
-        """Return the picture of the game; nothing where a window shows it, or without a mode."""
-        if self._picture is None or self.render_mode == "human":
-            return None
-        return self._picture.frame(self._state[0])
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._picture is not None:
-            self._picture.close()
+        """Return the picture of the game, (240, 960, 3), or None without a render mode."""
+        return None if self._picture is None else self._picture.frame(self._state[0])
 
     def _observed(self) -> FloatArray:
-        """Return the observation, and show it in the window, if there is one."""
-        if self._picture is not None and self.render_mode == "human":
-            self._picture.show(self._state[0], FPS)
         seen = self._state[0]
         if self.svo is not None:
             seen = np.append(seen, self._svo_rad)

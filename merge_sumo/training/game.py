@@ -168,9 +168,8 @@ def inputs_of(
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
     """Return `n` starting states, (n, 4), uniform over the pool."""
-    merge = scenario
-    x_pov = rng.uniform(*merge.x_pov0_m, n)
-    v_pov = rng.uniform(*merge.v_pov0_mps, n)
+    x_pov = rng.uniform(*scenario.x_pov0_m, n)
+    v_pov = rng.uniform(*scenario.v_pov0_mps, n)
     v_vut = _starting_speeds(n, rng, scenario)
     return np.stack([x_pov, v_pov, np.full(n, scenario.x_vut0_m), v_vut], axis=1)
 
@@ -191,8 +190,7 @@ def exploring_starts(
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
     x_vut0, a = scenario.x_vut0_m, scenario.level0_a_mps2
-    merge = scenario
-    (x_low, _), (v_low, v_high) = merge.x_pov0_m, merge.v_pov0_mps
+    (x_low, _), (v_low, v_high) = scenario.x_pov0_m, scenario.v_pov0_mps
     x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
     v_vut0 = _starting_speeds(n, rng, scenario)
     on_profile = np.sqrt(v_vut0**2 + 2.0 * a * (x_vut - x_vut0)) + rng.normal(

@@ -18,7 +18,7 @@ from functools import partial
 from importlib.metadata import version
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
@@ -56,17 +56,17 @@ from merge_sumo.training.refine import RefineSettings, refine
 from merge_sumo.training.reward import Reward, RewardWeights, Role
 from merge_sumo.workers import leave_signals_to_parent
 
-OPPONENTS: Final[dict[str, tuple[Role, str]]] = {
+OPPONENTS: dict[str, tuple[Role, str]] = {
     "pov1": ("pov", "level0"),
     "vut1": ("vut", "level0"),
     "pov2": ("pov", "vut1"),
     "vut2": ("vut", "pov1"),
 }
 """Role and opponent of each network, in the order of the helix."""
-PAIRS: Final[tuple[tuple[str, ...], ...]] = (NETWORKS[:2], NETWORKS[2:])
+PAIRS: tuple[tuple[str, ...], ...] = (NETWORKS[:2], NETWORKS[2:])
 """The networks of a level, which do not depend on each other."""
-LOG: Final = ".training.jsonl"
-WEIGHTS: Final = ".safetensors"
+LOG = ".training.jsonl"
+WEIGHTS = ".safetensors"
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -78,7 +78,7 @@ class TrainingSettings:
     check_cases: int = CHECK_CASES
 
 
-LEVEL_SETTINGS: Final = {
+LEVEL_SETTINGS = {
     1: TrainingSettings(),
     2: TrainingSettings(
         refine=RefineSettings(rounds=30, starts=2_000, midway=0.05, searched=400, updates=3_000)

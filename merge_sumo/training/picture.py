@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
-import os
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,10 @@ from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import COLOURS, Scenario
 
-ROAD: Final = "#c9c7c1"
-INK: Final = "#1c2228"
-SIZE_PX: Final = (960, 240)
-LANE_M: Final = 3.05
+ROAD = "#c9c7c1"
+INK = "#1c2228"
+SIZE_PX = (960, 240)
+LANE_M = 3.05
 """A lane is 3.2 m wide: what is left free between two lanes is the line between them."""
 
 
@@ -28,7 +27,7 @@ class GamePicture:
     """Draws states of a game on the road of its scenario; raises `UserError` without pygame."""
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the lines of the road; a window is opened when one is asked for."""
+        """Take the lines of the road of a scenario."""
         try:
             self._pygame: Any = importlib.import_module("pygame")
         except ImportError as error:
@@ -39,45 +38,11 @@ class GamePicture:
         self._lengths_m = dict(zip(("POV", "VUT"), scenario.lengths_m, strict=True))
         self._pygame.font.init()
         self._font = self._pygame.font.Font(None, 22)
-        self._window: Any = None
-        self._clock = self._pygame.time.Clock()
 
     def frame(self, state: FloatArray) -> NDArray[np.uint8]:
         """Return the picture of a state, [x_POV, v_POV, x_VUT, v_VUT], as (height, width, 3)."""
         pixels = self._pygame.surfarray.array3d(self._drawn(state))
         return np.ascontiguousarray(pixels.transpose(1, 0, 2))
-
-    def show(self, state: FloatArray, fps: float) -> None:
-        """Show the picture in a window, at most so often a second; `UserError` without a screen."""
-        if self._window is None:
-            self._window = self._opened()
-        self._window.blit(self._drawn(state), (0, 0))
-        self._pygame.event.pump()
-        self._pygame.display.flip()
-        self._clock.tick(fps)
-
-    def _opened(self) -> Any:
-        """Return a new window; `UserError` where it could not be seen."""
-        display = self._pygame.display
-        try:
-            display.init()
-            # Without a screen SDL draws nowhere and says nothing, unless it is told to.
-            is_unseen = display.get_driver() in ("dummy", "offscreen")
-            if is_unseen and "SDL_VIDEODRIVER" not in os.environ:
-                raise self._pygame.error("no display")
-            display.set_caption("merge-sumo")
-            return display.set_mode(SIZE_PX)
-        except self._pygame.error as error:
-            display.quit()
-            raise UserError(
-                f"there is no screen for a window ({error}): take render_mode='rgb_array'"
-            ) from error
-
-    def close(self) -> None:
-        """Close the window, if one is open."""
-        if self._window is not None:
-            self._pygame.display.quit()
-            self._window = None
 
     def _drawn(self, state: FloatArray) -> Any:
         """Return the picture of a state as a surface, in which both cars are."""

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from gymnasium.envs import registration
 
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S
 
-ENV_ID: Final = "merge_sumo/Merge-v0"
+ENV_ID = "merge_sumo/Merge-v0"
 
 # The environments themselves are imported when one is made. They truncate a game by the timeout of
 # its scenario: here stands what no scenario exceeds, for the wrappers that ask for a limit.

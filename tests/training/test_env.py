@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import sys
 
 import gymnasium
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from merge_sumo import training
 from merge_sumo.errors import UserError
 from merge_sumo.reports.pages import TEMPLATES
 from merge_sumo.scenario.scenario import COLOURS
@@ -48,7 +51,7 @@ def test_what_is_no_action_is_refused_in_a_sentence(action):
         ({"opponent": "pov1"}, "cannot play against 'pov1'"),
         ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or 0 up to"),
         ({"opponent": "vut1", "svo": float("nan")}, "svo is .*: choose 'random', or 0 up to"),
-        ({"render_mode": "ansi"}, "no render_mode 'ansi': choose 'rgb_array' or 'human'"),
+        ({"render_mode": "ansi"}, "no render_mode 'ansi': choose 'rgb_array'"),
     ],
 )
 def test_settings_that_make_no_game_are_refused_in_a_sentence(settings, sentence):
@@ -86,34 +89,24 @@ def test_cars_are_drawn_to_scale_where_they_are_in_the_colours_of_the_player():
 
 
 @pytest.mark.usefixtures("no_screen")
-def test_a_window_shows_each_state_in_real_time(monkeypatch):
+@pytest.mark.filterwarnings("ignore:.*HumanRendering")
+def test_gymnasium_shows_the_pictures_in_a_window():
     import pygame
 
-    waited = list[float]()
-    monkeypatch.setattr(pygame.time, "Clock", lambda: type("", (), {"tick": waited.append}))
-    game = MergeEnv("vut", render_mode="human")
+    game = gymnasium.make(ENV_ID, role="vut", render_mode="human")
     game.reset(seed=3)
     shown = pygame.surfarray.array3d(pygame.display.get_surface()).transpose(1, 0, 2)
     drawn = MergeEnv("vut", render_mode="rgb_array")
     drawn.reset(seed=3)
     assert np.array_equal(shown, drawn.render())
-    game.step(5)
-    assert game.render() is None
-    assert waited == [2, 2], "decisions a second"
     game.close()
-    game.close()
-    assert pygame.display.get_surface() is None
 
 
-def test_where_nothing_can_be_drawn_a_sentence_says_so(monkeypatch):
-    game = MergeEnv("vut", render_mode="human")
-    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
-        monkeypatch.delenv(name, raising=False)
-    with pytest.raises(UserError, match=r"no screen for a window .*: take render_mode='rgb_array'"):
-        game.reset(seed=3)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "none-such")
-    with pytest.raises(UserError, match="no screen for a window"):
-        game.reset(seed=3)
-    monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(UserError, match="pictures need pygame: pip install"):
-        MergeEnv("vut", render_mode="rgb_array")
+def test_a_missing_package_is_named_with_its_extra(monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setitem(sys.modules, "pygame", None)
+        with pytest.raises(UserError, match="pictures need pygame: pip install"):
+            MergeEnv("vut", render_mode="rgb_array")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"training needs torch, .*`pip install 'merge-sumo\[train"):
+        importlib.reload(training)
