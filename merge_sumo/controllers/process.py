@@ -32,6 +32,8 @@ LOG = "controller.log"
 """In the folder of a campaign."""
 MOST_BYTES = 4 << 20
 """A longer log loses its older part: a controller may print for ever."""
+LINES = 40
+"""Lines of the end of a log in a report."""
 ENDING_S = 2.0
 """Time that a process has to end by itself."""
 
@@ -89,7 +91,7 @@ def _is_writable_log(log: Path) -> bool:
 
 
 def end_of(log: Path) -> str:
-    """Return the last 40 lines of a log, printable; "" where there is no such file."""
+    """Return the last lines of a log, printable; "" where there is no such file."""
     text = b""
     with suppress(OSError):
         if _is_writable_log(log):
@@ -97,7 +99,7 @@ def end_of(log: Path) -> str:
                 file.seek(max(file.seek(0, os.SEEK_END) - 8000, 0))
                 text = file.read(8000)
     lines = text.decode("utf-8", errors="replace").splitlines()
-    return "\n".join(map(printable, lines[-40:]))
+    return "\n".join(map(printable, lines[-LINES:]))
 
 
 def append(log: Path, content: bytes) -> None:
