@@ -22,7 +22,8 @@ LAYERS = (
 )
 """The rooms, from the ground up: each imports from itself and from those before it."""
 ONLY_IN = {
-    "sumo": {"libsumo", "sumolib", "traci", "sumo"},
+    "road": {"sumolib"},
+    "sumo": {"libsumo", "traci", "sumo"},
     "training": {"torch", "gymnasium"},
     "": {"cyclopts", "merge_sumo.cli", "merge_sumo.console"},
     "nowhere": {"pickle", "cPickle", "dill", "joblib", "shelve", "marshal", "yaml", "xml"},

@@ -19,8 +19,9 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.netfile import Point
 from merge_sumo.scenario.scenario import Bounds
+
+Point = tuple[float, float, float]
 
 DRAWN_MIN_M: Final = 0.1
 """SUMO takes a lane for drawn as long as this when it is drawn shorter, and stops at its end."""

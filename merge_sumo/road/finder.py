@@ -1,9 +1,8 @@
-"""Finding the merge in a net: where two sequences of edges come to one lane.
+"""Finding the merge in a net that sumolib reads: where two sequences of edges come to one lane.
 
-Where the ramp ends in an auxiliary lane from which no connection leads on, the driver changes to
-the lane next to it where the auxiliary lane ends. The path then crosses the junction next to the
-connection of that lane, as if the net had a connection of its own for it, and M is behind the
-junction, where it is in a net that has one. The same holds where the lane of the mainline ends.
+Where a lane ends from which no connection leads on, the driver changes to the lane next to it. The
+path then crosses the junction next to the connection of that lane, as if the net had a connection
+of its own for it, and M is after the junction, where it is in a net that has one.
 
 A scenario with an acceleration lane says where M is along it: the paths become one where the lane
 ends, at a coordinate above 0, and before that they run side by side, on lanes of the same edges.
@@ -11,34 +10,124 @@ ends, at a coordinate above 0, and before that they run side by side, on lanes o
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from functools import cache
-from itertools import pairwise, permutations, product
-from typing import Final, NamedTuple
+from dataclasses import dataclass, replace
+from itertools import chain, pairwise, product
+from pathlib import Path
+from typing import Any, NamedTuple
 
+from lxml import etree
+
+from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.road.corridor import (
     AccelerationLane,
     Approach,
     Corridor,
     LanePath,
     Piece,
+    Point,
     lane_around_m,
 )
-from merge_sumo.road.netfile import Lane, Link, NetFile, Point
+from merge_sumo.road.xml_input import NET_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds
 
-SURROUNDINGS_M: Final = 500.0
+SumoLane = Any
+SumoConnection = Any
+SumoEdge = Any
+"""Classes of sumolib, which has no types."""
+
+FARTHEST_M = 2e7
+"""Largest coordinate and length in a net: half way round the earth, in metres of UTM."""
+SURROUNDINGS_M = 500.0
 """Distance to M up to which lanes next to the paths are drawn."""
-POINT_M: Final = 1e-6
+VISIBILITY = "visibility"
+"""Attribute of a connection: from how far its driver sees the others, in m."""
+POINT_M = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
-FOLLOWED_EDGES: Final = 5
-"""How many edges behind those that a user names are searched for where both paths meet."""
+FOLLOWED_EDGES = 5
+"""How many edges after those that a user names are searched for the merge."""
+SHOWN_EDGES = 12
+"""A net with at most as many edges names them all where one is unknown."""
+MAP_OPTIONS = {"osm": "--osm-files", "OpenDRIVE": "--opendrive-files"}
+"""Options by which netconvert reads a map, by the root of its file."""
+
+
+@dataclass(frozen=True, slots=True)
+class RoadNet:
+    """A net file.
+
+    Attributes:
+        path: the file.
+        sha256: hash of its unpacked bytes: a packed net is the same road.
+        net: its content, a `sumolib.net.Net`.
+    """
+
+    path: Path
+    sha256: str
+    net: Any
+
+    @property
+    def edges(self) -> list[str]:
+        """Ids of the edges outside of junctions."""
+        return sorted(edge.getID() for edge in self.net.getEdges(withInternal=False))
+
+
+def read_net(path: Path, content: bytes | None = None) -> RoadNet:
+    """Read a net with sumolib.
+
+    sumolib gets the elements that `parse_xml` has checked and not the file, of which it would
+    resolve the entities.
+
+    Args:
+        path: the net file.
+        content: its unpacked bytes, where they are read already.
+
+    Raises:
+        UserError: the file cannot be read, is not a SUMO net, or has a missing or wrong value.
+    """
+    from sumolib.net import NetReader  # late: other commands do not need it
+
+    if content is None:
+        content = read_xml(path, "the net")
+    root = parse_xml(content, f"the net {path}", NET_TAGS)
+    if root.tag != "net":
+        option = MAP_OPTIONS.get(root.tag)
+        how = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
+        raise UserError(
+            f"{path} is not a SUMO net: it does not begin with <net>{how if option else ''}"
+        )
+    reader = NetReader(withInternal=True)
+    _feed(reader, root, path)
+    return RoadNet(path, hashlib.sha256(content).hexdigest(), reader.getNet())
+
+
+def _feed(reader: Any, element: etree._Element, path: Path) -> None:
+    """Pass an element and those in it to a reader of sumolib."""
+    try:
+        reader.startElement(element.tag, element.attrib)
+        if element.tag == "connection" and VISIBILITY in element.attrib:
+            # sumolib leaves out this attribute, and keeps parameters.
+            visibility = float(element.attrib[VISIBILITY])
+            reader.startElement("param", {"key": VISIBILITY, "value": visibility})
+        for child in element:
+            _feed(reader, child, path)
+        reader.endElement(element.tag)
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a valid SUMO net: <{element.tag}> in line {element.sourceline} has a "
+            f"missing or wrong value ({error!r:.200})"
+        ) from error
+
+
+class _NeverMeetError(UserError):
+    """Two sequences of edges that do not come to one lane."""
 
 
 def find_corridor(
-    net: NetFile,
+    road_net: RoadNet,
     mainline: Sequence[str],
     ramp: Sequence[str],
     *,
@@ -52,7 +141,7 @@ def find_corridor(
     one path.
 
     Args:
-        net: the net.
+        road_net: the net.
         mainline: edges of the mainline.
         ramp: edges of the ramp.
         room_after_m: where the file ends nearer after M, the last lane is continued straight on.
@@ -64,120 +153,277 @@ def find_corridor(
         UserError: an edge is unknown, a sequence is not connected, the paths never meet, or the
             road has no such lane.
     """
-    meeting, before, onward = _paths(net, tuple(mainline), tuple(ramp), edge_at_m)
-    apart, along = _acceleration_lane(meeting, before)
-    length_m = _length_m(along[0])
-    beside: list[list[Lane]] = [[], []]
-    begin_m = end_m = 0.0
-    if lane_m is not None:
-        begin_m, end_m = _window_m(net, meeting, length_m, lane_m)
-        before, beside, onward = apart, along, [*meeting.mainline.via, *onward]
-    paths = []
-    for own, side in zip(before, beside, strict=True):
-        pieces = _placed(net, own, begin_m - _length_m(own))
-        pieces += _placed(net, side, begin_m, pieces[-1])
-        shared = _placed(net, _continued(onward, room_after_m - end_m), end_m, pieces[-1])
-        paths.append(LanePath((*pieces, *shared)))
-    junction_id, junction_type = net.junction(meeting.ramp.source)
-    mainline_approach, ramp_approach = _approaches(net, meeting, junction_type)
-    used = {piece.lane for path in paths for piece in path.pieces}
-    near = net.lanes_near(shared[0].shape[0], SURROUNDINGS_M)
-    return Corridor(
-        path=net.path,
-        sha256=net.sha256,
-        mainline_edges=tuple(mainline),
-        ramp_edges=tuple(ramp),
-        mainline=paths[0],
-        ramp=paths[1],
-        junction_type=junction_type,
-        junction_id=junction_id,
-        mainline_approach=mainline_approach,
-        ramp_approach=ramp_approach,
-        lane_drop=meeting.drop is not None,
-        drawn_after_m=end_m + _length_m(onward),
-        surroundings=tuple(lane.shape for lane in near if lane.id not in used),
-        lane_m=lane_m and (begin_m, end_m),
-        acceleration_lane=_lane_of_road(net, meeting, along, end_m if lane_m else None),
-    )
+    edges = tuple(mainline), tuple(ramp)
+    try:
+        try:
+            paths = _paths(road_net, *edges, edge_at_m)
+        except _NeverMeetError as error:
+            raise UserError(f"{error}{_suggestion(road_net, *edges)}") from error
+        return _corridor(road_net, edges, paths, room_after_m, lane_m)
+    except UserError as error:
+        raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
 
 
-def _approaches(net: NetFile, meeting: _Meeting, junction_type: str) -> list[Approach]:
-    """Return how mainline and ramp come to the junction."""
-    approaches = []
-    for link, other in permutations((meeting.mainline, meeting.ramp)):
-        if meeting.drop is not None:
-            yields = link is meeting.drop
-        elif junction_type.startswith("traffic_light"):
-            yields = link is meeting.ramp
-        else:
-            yields = net.yields(link, other)
-        approaches.append(Approach(link.state, yields, link.visibility_m))
-    return approaches
+class _Link(NamedTuple):
+    """A connection between lanes of two edges, or the change from a lane that ends."""
+
+    source: SumoLane
+    target: SumoLane
+    via: tuple[Piece, ...]
+    """The internal lanes in between."""
+    state: str
+    """SUMO's letter for the right of way: "M" goes first, "m" yields, "Z" is a zipper."""
+    visibility_m: float | None
+    """From how far its driver sees the others, where the net says so."""
+    connection: SumoConnection = None
 
 
 _Edges = tuple[str, ...]
-_Layer = dict[str, list[Link]]
-"""Lanes of an edge that a path can reach, by their ids, each with the links that lead to it."""
+_Layer = dict[SumoLane, list[_Link]]
+"""Lanes of an edge that a path can reach, each with the links that lead to it."""
 
 
 class _Meeting(NamedTuple):
     """The links by which both paths come to their first common lane."""
 
-    mainline: Link
-    ramp: Link
-    drop: Link | None
+    mainline: _Link
+    ramp: _Link
+    drop: _Link | None
     """The one of them that leaves a lane that ends."""
     place: int
-    """Of the edge of the common lane, among the edges behind the paths' own."""
+    """Of the edge of the common lane, among the edges that follow on both paths."""
 
-    @property
-    def target(self) -> Lane:
-        """The common lane."""
-        return self.ramp.target
+
+class _Paths(NamedTuple):
+    """The lanes of mainline and ramp up to the junction at M, and those of both after it."""
+
+    meeting: _Meeting
+    before: tuple[list[Piece], list[Piece]]
+    onward: list[Piece]
+
+
+def _corridor(
+    road_net: RoadNet,
+    edges: tuple[_Edges, _Edges],
+    paths: _Paths,
+    room_after_m: float,
+    lane_m: Bounds | None,
+) -> Corridor:
+    """Return the corridor of two paths."""
+    meeting, before, onward = paths
+    links = meeting.mainline, meeting.ramp
+    junction = _junction(meeting.ramp.source)
+    apart, along = _acceleration_lane(before)
+    if lane_m is None:
+        begin_m = end_m = 0.0
+        apart = before[0] + [*links[0].via], before[1] + [*links[1].via]
+        side_by_side: tuple[list[Piece], list[Piece]] = [], []
+    else:
+        begin_m, end_m = _window_m(meeting, _length_m(along[0]), lane_m)
+        side_by_side = along
+        onward = [*meeting.mainline.via, *onward]
+    placed = []
+    for own, side in zip(apart, side_by_side, strict=True):
+        pieces = _placed(own, begin_m - _length_m(own))
+        pieces += _placed(side, begin_m, pieces[-1])
+        shared = _placed(_continued(onward, room_after_m - end_m), end_m, pieces[-1])
+        placed.append(LanePath((*pieces, *shared)))
+    used = {piece.lane for path in placed for piece in path.pieces}
+    return Corridor(
+        path=road_net.path,
+        sha256=road_net.sha256,
+        mainline_edges=edges[0],
+        ramp_edges=edges[1],
+        mainline=placed[0],
+        ramp=placed[1],
+        junction_type=junction.getType(),
+        junction_id=junction.getID(),
+        mainline_approach=_approach(meeting, links[0], links[1]),
+        ramp_approach=_approach(meeting, links[1], links[0]),
+        lane_drop=meeting.drop is not None,
+        drawn_after_m=end_m + _length_m(onward),
+        surroundings=_surroundings(road_net.net, shared[0].shape[0], used),
+        lane_m=lane_m and (begin_m, end_m),
+        acceleration_lane=_lane_of_road(road_net.net, meeting, along, end_m if lane_m else None),
+    )
+
+
+def _surroundings(net: Any, place: Point, used: set[str]) -> tuple[tuple[Point, ...], ...]:
+    """Return the shapes of other lanes for vehicles that begin or end near a point."""
+    roads: list[tuple[Point, ...]] = []
+    internal: list[tuple[Point, ...]] = []
+    for edge in net.getEdges(withInternal=True):
+        if edge.getFunction() in ("crossing", "walkingarea"):
+            continue
+        for index, lane in enumerate(edge.getLanes()):
+            ends = lane.getShape3D()[:1] + lane.getShape3D()[-1:]
+            is_near = any(math.dist(end, place) <= SURROUNDINGS_M for end in ends)
+            if is_near and f"{edge.getID()}_{index}" not in used:
+                (internal if edge.isSpecial() else roads).append(_shape(lane))
+    return (*roads, *internal)
+
+
+def _junction(lane: SumoLane) -> Any:
+    """Return the junction at the end of a lane."""
+    junction = lane.getEdge().getToNode()
+    if junction is None or junction.getType() is None:
+        raise UserError(f"there is no junction at the end of lane {lane.getID()}")
+    return junction
+
+
+def _approach(meeting: _Meeting, link: _Link, other: _Link) -> Approach:
+    """Return how the path of a link comes to the junction, where it meets the other one."""
+    junction = _junction(meeting.ramp.source)
+    if meeting.drop is not None:
+        yields = link is meeting.drop
+    elif junction.getType().startswith("traffic_light"):
+        yields = link is meeting.ramp
+    else:
+        try:
+            yields = junction.forbids(other.connection, link.connection)
+        except (IndexError, KeyError) as error:
+            raise UserError(f"junction {junction.getID()} has no right of way") from error
+    return Approach(link.state, yields, link.visibility_m)
 
 
 def _paths(
-    net: NetFile, mainline: _Edges, ramp: _Edges, edge_at_m: str | None = None
-) -> tuple[_Meeting, list[list[Lane]], list[Lane]]:
-    """Return the meeting of the paths, the lanes of both before it, and those behind."""
-    own, tail = _split(net, mainline, ramp, edge_at_m)
-    layers = [_layers(net, edges + tail, len(edges)) for edges in own]
-    meeting = _meeting(net, own, tail, layers)
-    before = [
-        _lanes_before(path[: len(edges) + meeting.place], link)
-        for edges, path, link in zip(own, layers, (meeting.mainline, meeting.ramp), strict=True)
-    ]
-    return meeting, before, _onward(net, meeting.target, tail[meeting.place :])
+    road_net: RoadNet, mainline: _Edges, ramp: _Edges, edge_at_m: str | None = None
+) -> _Paths:
+    """Return the lanes of two sequences of edges, up to where they meet and from there on."""
+    for edge in mainline + ramp:
+        _check_edge(road_net, edge)
+    net = road_net.net
+    (own_main, own_ramp), tail = _split(net, mainline, ramp, edge_at_m)
+    main_layers = _layers(net, own_main + tail, len(own_main))
+    ramp_layers = _layers(net, own_ramp + tail, len(own_ramp))
+    meeting = _meeting(net, tail, main_layers[len(own_main) :], ramp_layers[len(own_ramp) :])
+    before = (
+        _lanes_before(main_layers[: len(own_main) + meeting.place], meeting.mainline),
+        _lanes_before(ramp_layers[: len(own_ramp) + meeting.place], meeting.ramp),
+    )
+    return _Paths(meeting, before, _onward(net, meeting.ramp.target, tail[meeting.place :]))
+
+
+def _check_edge(road_net: RoadNet, name: str) -> None:
+    """Raise `UserError` where a net has no such edge, or cars may not drive there."""
+    net = road_net.net
+    if not net.hasEdge(name) or net.getEdge(name).isSpecial():
+        edges = road_net.edges
+        few = f"it has {', '.join(edges)}" if 0 < len(edges) <= SHOWN_EDGES else ""
+        hint = f"{meant(name, edges, 0.5)}{few}".strip()  # ids of edges are short
+        raise UserError(f"it has no edge {name}{': ' if hint else ''}{hint}")
+    lanes = _lanes(net.getEdge(name))
+    if not lanes:
+        raise UserError(f"no lane of edge {name} is open to cars")
+    for lane in lanes:
+        if len(_corners(_piece(lane).shape)) == 1:
+            raise UserError(f"lane {lane.getID()} has no length")
+
+
+def _allows_cars(found: SumoLane | SumoConnection) -> bool:
+    # To sumolib "all" is one more class.
+    return bool(found.allows("passenger") or found.allows("all"))
+
+
+def _lanes(edge: SumoEdge) -> list[SumoLane]:
+    """Return the lanes of an edge on which cars may drive."""
+    return [lane for lane in edge.getLanes() if _allows_cars(lane)]
+
+
+def _shape(lane: SumoLane) -> tuple[Point, ...]:
+    """Return the shape of a lane, whose numbers are checked."""
+    shape = tuple(lane.getShape3D())
+    for number in chain((lane.getLength(), lane.getSpeed()), *shape):
+        if not abs(number) <= FARTHEST_M:
+            raise UserError(f"lane {lane.getID()} has {number}, not within {FARTHEST_M:g}")
+    return shape
+
+
+def _piece(lane: SumoLane) -> Piece:
+    """Return a lane as a piece of a path, which begins at 0 until it is placed."""
+    shape = _shape(lane)
+    if lane.getLength() <= 0.0 or not shape:
+        raise UserError(f"lane {lane.getID()} has no length")
+    return Piece(lane.getID(), 0.0, lane.getLength(), lane.getSpeed(), shape)
+
+
+def _links(net: Any, source: SumoLane, to_edge: str) -> list[_Link]:
+    """Return the links of a lane to the lanes of an edge, as far as cars may drive there."""
+    links = []
+    for found in source.getOutgoing():
+        target = found.getToLane()
+        if found.getTo().getID() == to_edge and _allows_cars(target) and _allows_cars(found):
+            via, visibility_m = _via(net, found), found.getParam(VISIBILITY)
+            links.append(_Link(source, target, via, found.getState(), visibility_m, found))
+    return links
+
+
+def _via(net: Any, connection: SumoConnection) -> tuple[Piece, ...]:
+    """Return the internal lanes of a connection; there are two where drivers wait inside."""
+    pieces: dict[str, Piece] = {}
+    while (name := connection.getViaLaneID()) and name not in pieces:
+        try:
+            lane = net.getLane(name)
+        except (IndexError, KeyError, ValueError) as error:
+            raise UserError(f"a connection leads over lane {name}, which is not there") from error
+        pieces[name] = _piece(lane)
+        if not lane.getOutgoing():
+            break
+        connection = lane.getOutgoing()[0]
+    return tuple(pieces.values())
+
+
+def _edges_after(lane: SumoLane) -> list[str]:
+    """Return the edges to which cars may drive from a lane, other than by turning back."""
+    names = set()
+    for found in lane.getOutgoing():
+        is_open = _allows_cars(found) and _allows_cars(found.getToLane())
+        turns_back = found.getDirection() in ("t", "T")
+        if is_open and not turns_back and not found.getTo().isSpecial():
+            names.add(found.getTo().getID())
+    return sorted(names)
+
+
+def _edges_before(net: Any, edge: str) -> list[str]:
+    """Return the edges from which cars may drive to an edge, other than by turning back."""
+    names = []
+    for source in net.getEdge(edge).getIncoming():
+        if not source.isSpecial() and any(edge in _edges_after(lane) for lane in _lanes(source)):
+            names.append(source.getID())
+    return sorted(names)
 
 
 def _acceleration_lane(
-    meeting: _Meeting, before: list[list[Lane]]
-) -> tuple[list[list[Lane]], list[list[Lane]]]:
+    before: tuple[list[Piece], list[Piece]],
+) -> tuple[tuple[list[Piece], list[Piece]], tuple[list[Piece], list[Piece]]]:
     """Return the lanes of both paths before an acceleration lane, and those side by side along it.
 
     There are none of the second kind where the paths come to M without such a lane. The ramp's get
     the length of the mainline's, from which they differ a little inside of junctions and where a
     net says so: both have one coordinate.
     """
-    main, ramp = (
-        lanes[: len(lanes) - len(link.via)]
-        for lanes, link in zip(before, (meeting.mainline, meeting.ramp), strict=True)
-    )
-    roads = [[n for n, lane in enumerate(lanes) if not lane.is_internal] for lanes in (main, ramp)]
+    main, ramp = before
     on_main, on_ramp = len(main), len(ramp)
-    for one, other in zip(*map(reversed, roads), strict=False):
-        if main[one].edge != ramp[other].edge or abs(main[one].index - ramp[other].index) != 1:
+    for one, other in zip(_roads(main), _roads(ramp), strict=False):
+        main_edge, _, main_index = main[one].lane.rpartition("_")
+        ramp_edge, _, ramp_index = ramp[other].lane.rpartition("_")
+        if main_edge != ramp_edge or abs(int(main_index) - int(ramp_index)) != 1:
             break
         on_main, on_ramp = one, other
-    beside = main[on_main:], ramp[on_ramp:]
-    if beside[1]:
-        stretch = _length_m(beside[0]) / _length_m(beside[1])
-        beside[1][:] = [replace(lane, length_m=lane.length_m * stretch) for lane in beside[1]]
-    return [main[:on_main], ramp[:on_ramp]], [*beside]
+    along_main, along_ramp = main[on_main:], ramp[on_ramp:]
+    if along_ramp:
+        stretch = _length_m(along_main) / _length_m(along_ramp)
+        along_ramp = [replace(lane, length_m=lane.length_m * stretch) for lane in along_ramp]
+    return (main[:on_main], ramp[:on_ramp]), (along_main, along_ramp)
+
+
+def _roads(pieces: list[Piece]) -> list[int]:
+    """Return the numbers of the pieces outside of junctions, the last one first."""
+    return [number for number, piece in reversed([*enumerate(pieces)]) if not piece.is_internal]
 
 
 def _lane_of_road(
-    net: NetFile, meeting: _Meeting, along: list[list[Lane]], end_m: float | None
+    net: Any, meeting: _Meeting, along: tuple[list[Piece], list[Piece]], end_m: float | None
 ) -> AccelerationLane | None:
     """Return the acceleration lane of a road; by default it ends before the junction at M."""
     main, ramp = along
@@ -185,30 +431,30 @@ def _lane_of_road(
         return None
     if end_m is None:
         end_m = -_length_m(meeting.ramp.via)
+    lanes = [net.getLane(piece.lane) for piece in ramp]
+    after = _edges_after(lanes[-1])
     return AccelerationLane(
         begin_m=end_m - _length_m(main),
         end_m=end_m,
-        lanes=tuple(lane.id for lane in ramp if not lane.is_internal),
-        beside=tuple(lane.id for lane in main if not lane.is_internal),
-        is_marked=any(lane.is_marked for lane in ramp),
-        exits=tuple(edge for edge in net.edges_from(ramp[-1]) if edge != meeting.target.edge),
+        lanes=tuple(piece.lane for piece in ramp if not piece.is_internal),
+        beside=tuple(piece.lane for piece in main if not piece.is_internal),
+        is_marked=any(lane.isAccelerationLane() for lane in lanes),
+        exits=tuple(edge for edge in after if edge != meeting.ramp.target.getEdge().getID()),
     )
 
 
-def _window_m(net: NetFile, meeting: _Meeting, length_m: float, lane_m: Bounds) -> Bounds:
+def _window_m(meeting: _Meeting, length_m: float, lane_m: Bounds) -> Bounds:
     """Return begin and end of a lane, if that of a scenario, `lane_m`, is on it."""
     if meeting.drop is meeting.mainline:
-        raise net.broken(
-            "the lane that ends is that of the mainline, and lane_m is one of the ramp"
-        )
+        raise UserError("the lane that ends is that of the mainline, and lane_m is one of the ramp")
     if length_m == 0.0:
-        raise net.broken(
+        raise UserError(
             "ramp and mainline meet in one point, without a lane side by side: leave lane_m out"
         )
     begin_m, end_m = lane_m
     if begin_m < end_m - length_m:
         low, high = lane_around_m(length_m)
-        raise net.broken(
+        raise UserError(
             f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, and the acceleration lane "
             f"is {length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
         )
@@ -216,263 +462,209 @@ def _window_m(net: NetFile, meeting: _Meeting, length_m: float, lane_m: Bounds) 
 
 
 def _split(
-    net: NetFile, mainline: _Edges, ramp: _Edges, edge_at_m: str | None
+    net: Any, mainline: _Edges, ramp: _Edges, edge_at_m: str | None
 ) -> tuple[tuple[_Edges, _Edges], _Edges]:
     """Return the edges that each path has for itself, and those that follow on both."""
-    for edge in mainline + ramp:
-        net.lanes(edge)
     if mainline == ramp and len(ramp) > 1:
         before = ramp.index(edge_at_m or ramp[-1])
         return (ramp[:before], ramp[:before]), ramp[before:]
     common = next((edge for edge in ramp if edge in mainline), None)
     if common is None:
-        raise net.broken(
+        raise _NeverMeetError(
             f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet"
-            f"{_how_they_meet(net, mainline, ramp)}"
         )
     # A mainline may go round a ring and come by the edge again.
-    again = common in mainline[1:]
-    at = mainline.index(common, 1) if again else 0, ramp.index(common)
-    tails = mainline[at[0] :], ramp[at[1] :]
+    on_main = mainline.index(common, 1 if common in mainline[1:] else 0)
+    on_ramp = ramp.index(common)
+    tails = mainline[on_main:], ramp[on_ramp:]
     for own, other in zip(*tails, strict=False):
         if own != other:
-            raise net.broken(
-                f"behind edge {common} the mainline goes to {own} and the ramp to {other}; name "
-                "the same edges behind the merge point"
+            raise UserError(
+                f"after edge {common} the mainline goes to {own} and the ramp to {other}; name "
+                "the same edges after the merge point"
             )
-    if 0 in at:
-        who = "mainline" if at[0] == 0 else "ramp"
-        raise net.broken(
-            f"the {who} begins with edge {common}, which the other path uses too; "
-            f"{_edges_before(net, common, mainline + ramp)}"
+    if on_main == 0 or on_ramp == 0:
+        free = [name for name in _edges_before(net, common) if name not in mainline + ramp]
+        raise UserError(
+            f"the {'mainline' if on_main == 0 else 'ramp'} begins with edge {common}, which the "
+            f"other path uses too; name an edge before it: {' or '.join(free) or 'there is none'}"
         )
-    return (mainline[: at[0]], ramp[: at[1]]), max(tails, key=len)
+    return (mainline[:on_main], ramp[:on_ramp]), max(tails, key=len)
 
 
-def _how_they_meet(net: NetFile, mainline: _Edges, ramp: _Edges) -> str:
-    """Return what to name instead of two paths that never meet: few edges more, if that helps."""
-    onward: list[dict[str, _Edges]] = []
-    for path in (mainline, ramp):
-        reached = dict.fromkeys(path[1:], path)  # the merge is behind the first one
-        latest = [path] if path else []
-        for _ in range(FOLLOWED_EDGES):
-            latest = [(*edges, name) for edges in latest for name in _following(net, edges[-1])]
-            latest = [edges for edges in latest if edges[-1] not in reached]
-            reached = {edges[-1]: edges for edges in reversed(latest)} | reached
-        onward.append(reached)
-    mainlines, ramps = onward
+def _suggestion(road_net: RoadNet, mainline: _Edges, ramp: _Edges) -> str:
+    """Return what to name instead of two paths that never meet: a few edges more, if that helps."""
+    mainlines, ramps = _lengthened(road_net.net, mainline), _lengthened(road_net.net, ramp)
     pairs = [(mainlines[edge], ramps[edge]) for edge in mainlines if edge in ramps]
-    # A path that begins with the common edge has no lane before the merge.
-    both = [pair for pair in pairs if not {path[0] for path in pair} & set(pair[0]) & set(pair[1])]
-    if both:
-        mainline, ramp = min(both, key=lambda pair: (len(pair[0]) + len(pair[1]), pair))
-        edge = next(edge for edge in ramp if edge in mainline)
-        return f'; both lead to edge {edge}: name "{" ".join(mainline)}" and "{" ".join(ramp)}"'
-    for who, path, other, reached in (
-        ("mainline", mainline, "ramp", ramps),
-        ("ramp", ramp, "mainline", mainlines),
-    ):
-        if path and path[0] in reached:
-            return (
-                f"; the {other} leads to edge {path[0]}, with which the {who} begins: "
-                f"{_edges_before(net, path[0], reached[path[0]])}"
-            )
+    for longer in sorted(pairs, key=lambda pair: (len(pair[0]) + len(pair[1]), pair)):
+        try:
+            meeting = _paths(road_net, *longer).meeting
+        except _NeverMeetError:
+            continue
+        except UserError as error:
+            return f"; {error}"
+        # A lane of the mainline that leads elsewhere does not end.
+        if meeting.drop is not meeting.mainline or not _edges_after(meeting.mainline.source):
+            return f'; name "{" ".join(longer[0])}" and "{" ".join(longer[1])}"'
     return (
-        f", nor do they within {FOLLOWED_EDGES} edges more: name the edge behind the merge point "
-        "as the last one of both"
+        f", nor do they within {FOLLOWED_EDGES} edges more: name the edge after the merge point as "
+        "the last one of both"
     )
 
 
-def _edges_before(net: NetFile, edge: str, used: _Edges) -> str:
-    """Return which edges to name before one: those that lead to it and are in no path yet."""
-    free = [name for name in net.edges_into(edge) if name not in used]
-    return f"name an edge before it: {' or '.join(free) or 'the net has no other'}"
+def _lengthened(net: Any, path: _Edges) -> dict[str, _Edges]:
+    """Return the edges that a path comes to, each with the path that leads there."""
+    reached = dict.fromkeys(path, path)
+    latest = [path] if path else []
+    for _ in range(FOLLOWED_EDGES):
+        longer = []
+        for edges in latest:
+            for lane in _lanes(net.getEdge(edges[-1])):
+                for name in _edges_after(lane):
+                    if name not in reached:
+                        reached[name] = (*edges, name)
+                        longer.append(reached[name])
+        latest = longer
+    return reached
 
 
-def _following(net: NetFile, edge: str) -> list[str]:
-    """Return the edges to which lanes of an edge lead that cars may drive on."""
-    names = {name for lane in net.lanes(edge) for name in net.edges_from(lane)}
-    return sorted(name for name in names if net.is_open_to_cars(name))
-
-
-def _layers(net: NetFile, edges: _Edges, common: int) -> list[_Layer]:
+def _layers(net: Any, edges: _Edges, common: int) -> list[_Layer]:
     """Return the lanes that a path can reach on each of its edges.
 
-    A lane of its own must lead to edge number `common`; behind that its lanes may end.
+    A lane of its own must lead to edge number `common`; after that its lanes may end.
     """
-    lanes = {lane.id: lane for lane in net.lanes(edges[0])}
-    layers: list[_Layer] = [{name: [] for name in lanes}]
+    layers: list[_Layer] = [{lane: [] for lane in _lanes(net.getEdge(edges[0]))}]
     for number, (edge, following) in enumerate(pairwise(edges), start=1):
         layer: _Layer = {}
-        for lane in lanes.values():
-            for link in net.links(lane, following):
-                layer.setdefault(link.target.id, []).append(link)
+        for lane in layers[-1]:
+            for link in _links(net, lane, following):
+                layer.setdefault(link.target, []).append(link)
         if not layer and number <= common:
-            into = [name for name in net.edges_into(following) if name != edge]
-            does = "does" if len(into) == 1 else "do"
-            hint = f"; {' and '.join(into)} {does}" if into else ""
-            raise net.broken(f"edge {edge} does not lead to edge {following}{hint}")
-        lanes = {links[0].target.id: links[0].target for links in layer.values()}
+            into = [name for name in _edges_before(net, following) if name != edge]
+            hint = f"; name {' or '.join(into)} before it" if into else ""
+            raise UserError(f"edge {edge} does not lead to edge {following}{hint}")
         layers.append(layer)
     return layers
 
 
-def _meeting(
-    net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
-) -> _Meeting:
-    """Return the meeting of the paths; where they have none, say what follows on them."""
-    if (found := _met(net, own, tail, layers)) is not None:
-        return found
-    last, reason = tail[-1], "mainline and ramp have no lane in common up to the end of edge"
-    ends = {lane.id: lane for lane in net.lanes(last)}
-    main_to, ramp_to = (
-        " or ".join(sorted({name for id_ in path[-1] for name in net.edges_from(ends[id_])}))
-        for path in layers
-    )
-    leads = (
-        f"the ramp's lane leads to {ramp_to or 'no edge'} and the mainline's to "
-        f"{main_to or 'no edge'}"
-    )
-    onward: list[_Edges] = [()]
-    for _ in range(FOLLOWED_EDGES):
-        onward = [
-            (*edges, name) for edges in onward for name in _following(net, (last, *edges)[-1])
-        ]
-        for edges in onward:
-            whole = [_layers(net, one + tail + edges, len(one)) for one in own]
-            found = _met(net, own, tail + edges, whole)
-            if found is not None and not (
-                # Where the mainline leads elsewhere, its lane does not end.
-                found.drop is found.mainline and net.edges_from(found.mainline.source)
-            ):
-                what = "the edge that follows" if len(edges) == 1 else "the edges that follow"
-                raise net.broken(
-                    f"{reason} {last}: {leads}; name {what} on both: {' '.join(edges)}"
-                )
-    raise net.broken(
-        f"{reason} {last}: {leads}, and up to {FOLLOWED_EDGES} edges on they come to no common "
-        "lane, so no merge is needed there"
-    )
+def _meeting(net: Any, tail: _Edges, mainline: list[_Layer], ramp: list[_Layer]) -> _Meeting:
+    """Return the meeting of the paths: by connections, or where a lane of one of them ends.
 
+    Args:
+        net: the net.
+        tail: the edges that follow on both paths.
+        mainline: for each of these the lanes that the mainline can reach.
+        ramp: those that the ramp can reach.
 
-def _met(
-    net: NetFile, own: tuple[_Edges, _Edges], tail: _Edges, layers: list[list[_Layer]]
-) -> _Meeting | None:
-    """Return the meeting of the paths: by connections, or where a lane of one of them ends."""
-    mainline, ramp = (path[len(edges) :] for path, edges in zip(layers, own, strict=True))
+    Raises:
+        UserError: they have no lane in common.
+    """
     for place, edge in enumerate(tail):
-        common = mainline[place].keys() & ramp[place].keys()
-        both = [lane.id for lane in net.lanes(edge) if lane.id in common]
-        if both:
-            to_both = [min(path[place][both[0]], key=_swerve) for path in (mainline, ramp)]
-            return _Meeting(to_both[0], to_both[1], drop=None, place=place)
-        if place + 1 == len(tail) or mainline[place + 1].keys() & ramp[place + 1].keys():
-            continue
-        links = _lane_drop(net, mainline[place], ramp[place], tail[place : place + 2])
-        if links is not None:
-            return _Meeting(*links, place=place + 1)
-    return None
+        for lane in _lanes(net.getEdge(edge)):
+            if lane in mainline[place] and lane in ramp[place]:
+                to_both = [
+                    min(layer[lane], key=_swerve) for layer in (mainline[place], ramp[place])
+                ]
+                return _Meeting(to_both[0], to_both[1], drop=None, place=place)
+        if place + 1 < len(tail) and not mainline[place + 1].keys() & ramp[place + 1].keys():
+            found = _lane_drop(net, mainline[place], ramp[place], tail[place + 1])
+            if found is not None:
+                return _Meeting(*found, place=place + 1)
+    raise _NeverMeetError(
+        f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}"
+    )
 
 
 def _lane_drop(
-    net: NetFile, mainline: _Layer, ramp: _Layer, edges: _Edges
-) -> tuple[Link, Link, Link] | None:
+    net: Any, mainline: _Layer, ramp: _Layer, following: str
+) -> tuple[_Link, _Link, _Link] | None:
     """Return the links of both paths where a lane of one ends next to a lane of the other.
 
-    The third one is the link, of these two, of the path whose lane ends. `edges` are the edge on
-    which it ends and the one that follows; None where no such lane ends.
+    The third one is the link, of these two, of the path whose lane ends. `following` is the edge
+    after that on which it ends; None where no such lane ends.
     """
-    lanes = {lane.id: lane for lane in net.lanes(edges[0])}
     for ending, going in ((ramp, mainline), (mainline, ramp)):
-        for last, beside in product([lanes[id_] for id_ in ending], [lanes[id_] for id_ in going]):
-            onward = net.links(beside, edges[1])
-            if onward and not net.links(last, edges[1]) and abs(last.index - beside.index) == 1:
-                drop = _drop(net, last, onward[0])
+        for last, beside in product(ending, going):
+            onward = _links(net, beside, following)
+            is_next = abs(last.getIndex() - beside.getIndex()) == 1
+            if is_next and onward and not _links(net, last, following):
+                drop = _drop(last, onward[0])
                 return (onward[0], drop, drop) if ending is ramp else (drop, onward[0], drop)
     return None
 
 
-def _drop(net: NetFile, last: Lane, beside: Link) -> Link:
+def _drop(last: SumoLane, beside: _Link) -> _Link:
     """Return the link from a lane that ends to the target of a link of the lane next to it."""
-    via: tuple[Lane, ...] = ()
+    via: tuple[Piece, ...] = ()
     if beside.via:
-        crossing = replace(
-            beside.via[0],
-            length_m=_length_m(beside.via),
-            shape=(last.shape[-1], beside.target.shape[0]),
-        )
-        via = (crossing,)
-    state = "Z" if net.junction(last)[1] == "zipper" else "m"
+        ends = last.getShape3D()[-1], beside.target.getShape3D()[0]
+        via = (replace(beside.via[0], length_m=_length_m(beside.via), shape=ends),)
+    state = "Z" if _junction(last).getType() == "zipper" else "m"
     # A driver on it sees all along the lane next to it.
-    return Link(last, beside.target, via, state, visibility_m=last.length_m)
+    return _Link(last, beside.target, via, state, visibility_m=last.getLength())
 
 
-def _swerve(link: Link) -> tuple[int, int]:
+def _swerve(link: _Link) -> tuple[int, int]:
     """Order links: straight ones first, then from the right."""
-    return abs(link.source.index - link.target.index), link.source.index
+    index = link.source.getIndex()
+    return abs(index - link.target.getIndex()), index
 
 
-def _lanes_before(layers: list[_Layer], last: Link) -> list[Lane]:
-    """Return the lanes that lead over a link, from the first edge to before its target."""
-    lanes = [*reversed(last.via), last.source]
+def _lanes_before(layers: list[_Layer], last: _Link) -> list[Piece]:
+    """Return the lanes from the first edge to the source of a link."""
+    lane = last.source
+    pieces = [_piece(lane)]
     for layer in layers[:0:-1]:
-        link = min(layer[lanes[-1].id], key=_swerve)
-        lanes += [*reversed(link.via), link.source]
-    return lanes[::-1]
+        link = min(layer[lane], key=_swerve)
+        lane = link.source
+        pieces = [_piece(lane), *link.via, *pieces]
+    return pieces
 
 
-def _onward(net: NetFile, first: Lane, edges: _Edges) -> list[Lane]:
+def _onward(net: Any, lane: SumoLane, edges: _Edges) -> list[Piece]:
     """Return the lanes from one on along edges, the first of which it is on, as far as they go."""
-
-    @cache
-    def longest(lane: Lane, place: int) -> tuple[Lane, ...]:
-        following: tuple[Lane, ...] = ()
-        links = net.links(lane, edges[place + 1]) if place + 1 < len(edges) else []
-        for link in sorted(links, key=lambda link: abs(link.source.index - link.target.index)):
-            lanes = (*link.via, *longest(link.target, place + 1))
-            following = max(following, lanes, key=len)
-        return (lane, *following)
-
-    return list(longest(first, 0))
+    longest: list[Piece] = []
+    links = _links(net, lane, edges[1]) if len(edges) > 1 else []
+    for link in sorted(links, key=lambda link: _swerve(link)[0]):
+        pieces = [*link.via, *_onward(net, link.target, edges[1:])]
+        longest = max(longest, pieces, key=len)
+    return [_piece(lane), *longest]
 
 
-def _continued(lanes: list[Lane], length_m: float) -> list[Lane]:
+def _continued(pieces: list[Piece], length_m: float) -> list[Piece]:
     """Return lanes with the last one continued straight on to a length of all of them."""
-    missing_m = length_m - _length_m(lanes)
+    missing_m = length_m - _length_m(pieces)
     if missing_m <= 0.0:
-        return lanes
-    last = lanes[-1]
+        return pieces
+    last = pieces[-1]
     before, end = _corners(last.shape)[-2:]
     # As SUMO draws the lane: a metre of it is this long in the plane.
-    drawn_m = missing_m * last.drawn_m / last.length_m
+    drawn_m = missing_m * sum(math.dist(a, b) for a, b in pairwise(last.shape)) / last.length_m
     share = drawn_m / math.dist(before, end)
     x, y, z = (e + share * (e - b) for b, e in zip(before, end, strict=True))
     longer = replace(last, length_m=last.length_m + missing_m, shape=(*last.shape, (x, y, z)))
-    return [*lanes[:-1], longer]
+    return [*pieces[:-1], longer]
 
 
-def _length_m(lanes: Iterable[Lane]) -> float:
-    return math.fsum(lane.length_m for lane in lanes)
+def _length_m(pieces: Iterable[Piece]) -> float:
+    return math.fsum(piece.length_m for piece in pieces)
 
 
-def _placed(
-    net: NetFile, lanes: Iterable[Lane], start_m: float, behind: Piece | None = None
-) -> list[Piece]:
-    """Return lanes as pieces of a path that begins at a coordinate, behind another piece."""
-    pieces = [] if behind is None else [behind]
-    for lane in lanes:
-        shape = _corners(lane.shape)
-        if lane.length_m <= 0.0 or not shape:
-            raise net.broken(f"lane {lane.id} has no length")
-        if len(shape) == 1:
+def _placed(pieces: Iterable[Piece], start_m: float, behind: Piece | None = None) -> list[Piece]:
+    """Return pieces that begin at a coordinate, one after the other, behind another piece."""
+    placed = []
+    for piece in pieces:
+        shape = _corners(piece.shape)
+        if len(shape) == 1 and behind is not None:
             # Drawn as a point, as some lanes inside of junctions: it points where the last one did.
-            before, end = pieces[-1].shape[-2:]
-            ahead = POINT_M / math.dist(before, end)
-            (x, y, z), (dx, dy) = shape[0], (end[0] - before[0], end[1] - before[1])
-            shape = (*shape, (x + ahead * dx, y + ahead * dy, z))
-        pieces.append(Piece(lane.id, start_m, lane.length_m, lane.speed_limit_mps, shape))
-        start_m += lane.length_m
-    return pieces if behind is None else pieces[1:]
+            (x0, y0, _), (x1, y1, _) = behind.shape[-2:]
+            ahead = POINT_M / math.dist(*behind.shape[-2:])
+            x, y, z = shape[0]
+            shape = (*shape, (x + ahead * (x1 - x0), y + ahead * (y1 - y0), z))
+        behind = replace(piece, start_m=start_m, shape=shape)
+        placed.append(behind)
+        start_m += piece.length_m
+    return placed
 
 
 def _corners(shape: tuple[Point, ...]) -> tuple[Point, ...]:

@@ -12,8 +12,7 @@ import numpy as np
 from merge_sumo.files import resource
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.road.finder import find_corridor
-from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
@@ -56,7 +55,7 @@ def road_of(
     edges = tuple(mainline), tuple(ramp)
     key = (path, hashlib.sha256(content).hexdigest(), *edges, room_after_m, lane_m)
     if key not in _found:
-        net_file = NetFile(path, content)
+        net_file = read_net(path, content)
         _found[key] = find_corridor(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
     return _found[key]
 

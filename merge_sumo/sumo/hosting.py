@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from lxml import etree
 
-from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece
-from merge_sumo.road.netfile import Point
+from merge_sumo.road.corridor import Approach, Corridor, LanePath, Piece, Point
 from merge_sumo.scenario.scenario import Bounds
 
 COPY = "@"

@@ -26,8 +26,8 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record, convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.finder import FARTHEST_M
 from merge_sumo.road.merge import road_of
-from merge_sumo.road.netfile import FARTHEST_M
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import (

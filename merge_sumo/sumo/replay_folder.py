@@ -24,9 +24,8 @@ from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
 from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
-from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
@@ -135,7 +134,7 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
     Raises:
         UserError: the net has no such corridor.
     """
-    net = NetFile(path, content)
+    net = read_net(path, content)
     numbered: dict[str, dict[int, str]] = {"main": {}, "ramp": {}, "out": {}}
     for name in net.edges:
         if found := re.fullmatch(r"(main|ramp|out)([0-9]{1,4})[.]0", name):

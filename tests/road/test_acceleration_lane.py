@@ -14,9 +14,8 @@ from support.foreign_nets import FOREIGN, LANE_M, LANES, lane_corridor_of, lane_
 from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.finder import find_corridor
+from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.road.merge import road_for
-from merge_sumo.road.netfile import NetFile
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import Scenario
 
@@ -74,14 +73,14 @@ class TestTheWindow:
         ],
     )
     def test_that_is_longer_than_the_lane_is_refused(self, tmp_path, lane_m, said):
-        net = NetFile(lane_drop(tmp_path))
+        net = read_net(lane_drop(tmp_path))
         with pytest.raises(UserError, match=said) as error:
             find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=lane_m)
         assert "\n" not in str(error.value)
 
     def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
         build, mainline, ramp = FOREIGN["priority"]
-        net = NetFile(build(tmp_path))
+        net = read_net(build(tmp_path))
         with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
             find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
 

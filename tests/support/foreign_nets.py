@@ -6,8 +6,7 @@ import math
 import subprocess
 from pathlib import Path
 
-from merge_sumo.road.finder import find_corridor
-from merge_sumo.road.netfile import NetFile
+from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.sumo.binding import sumo_program
 
 
@@ -173,11 +172,11 @@ LANE_M = (-30.0, 60.0)
 def corridor_of(name: str, folder: Path):
     """Build a net and find its merge."""
     build, mainline, ramp = FOREIGN[name]
-    return find_corridor(NetFile(build(folder)), mainline.split(), ramp.split())
+    return find_corridor(read_net(build(folder)), mainline.split(), ramp.split())
 
 
 def lane_corridor_of(name: str, folder: Path):
     """Return the merge in one of `LANES`, with its acceleration lane."""
     build, mainline, ramp = LANES[name]
-    net = NetFile(build(folder))
+    net = read_net(build(folder))
     return find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
