@@ -1,1 +1,1 @@
-"""SUMO as the host: the only part of the project that imports libsumo, sumo or sumolib."""
+"""SUMO as the host: the only part of the project that imports libsumo or sumo."""
