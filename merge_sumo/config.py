@@ -37,6 +37,9 @@ else:  # Types of the values that a command line has; the others take time to im
     Indices = tuple[int, ...]
     Outcome = Any
 
+MOST_CASES = 800
+"""Maximum number of cases of a campaign that ends when its search has converged."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Policies:

@@ -17,7 +17,7 @@ from statistics import median
 from bench_record import add_record_option, append_record
 
 import merge_sumo as ms
-from merge_sumo.campaigns.stopping import coverage_by_level, has_converged
+from merge_sumo.campaigns.run import coverage_by_level, has_converged
 from merge_sumo.metrics.outcome import Outcome
 
 VUTS = (

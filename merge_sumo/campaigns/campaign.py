@@ -110,7 +110,7 @@ def run_campaign(
             history=history,
         )
         loop.run(on_groups)
-        done = Run(folder, outcomes)
+        done = Run(folder)
         if plan.earlier is not None:
             repeat(Run(folder / AGAINST), settings.earlier, plan.earlier, available)
         repeat(done, settings, replace(plan, against=None), available)

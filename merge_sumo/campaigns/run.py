@@ -9,11 +9,12 @@ against/                  the same of the earlier version, where a campaign is a
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -21,60 +22,66 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.stopping import has_converged
-from merge_sumo.config import Search
+from merge_sumo.config import MOST_CASES, Search
 from merge_sumo.errors import UserError
 from merge_sumo.files import regular
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.fmc import regions
+from merge_sumo.metrics.fmc import fmc, regions
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.metrics.summary import one_per_case
+from merge_sumo.metrics.summary import failing_cases, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import RecordError, convert, decode, read_arrays
-from merge_sumo.scenario.case import FloatArray, to_unit
+from merge_sumo.scenario.case import Case, FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 
-SETTINGS: Final = "campaign.json"
-OUTCOMES: Final = "outcomes.jsonl"
-TRAJECTORIES: Final = "trajectories"
-AGAINST: Final = "against"
-"""Folder of the earlier version, and the key of `campaign.json` that names that."""
-NAME_CHARACTERS: Final = 300
-"""Of the name of a VUT, where it is shown."""
-RAN_AGAIN: Final = "ran_again"
-"""Key of `campaign.json`: how many cases ran again because a process had died or was stopped."""
-IN_VAIN: Final = "in_vain"
-"""Key of `campaign.json`: in how many cases the VUT gave a command that changed nothing."""
-TALLIES: Final = (RAN_AGAIN, IN_VAIN)
-"""What is counted as cases end, and no setting."""
-FILES: Final = ("vut_files", "pov_files")
-"""Keys of `campaign.json`: what the VUT and the user's own POV have loaded."""
-CHECKSUM: Final = "sha256"
-"""Key of `campaign.json` of earlier versions, which is not read."""
-FARTHEST: Final = 1e9
-"""No position, speed or acceleration of ours, in m, m/s and m/s2, is as large."""
+SETTINGS = "campaign.json"
+OUTCOMES = "outcomes.jsonl"
+TRAJECTORIES = "trajectories"
+AGAINST = "against"
+"""Folder of the earlier version, and the key of `campaign.json` that names it."""
+NAME_CHARACTERS = 300
+"""Maximum length of the name of a VUT in a sentence."""
+RAN_AGAIN = "ran_again"
+"""Key of `campaign.json`: number of cases that ran again after the death of a process."""
+IN_VAIN = "in_vain"
+"""Key of `campaign.json`: for each command of the VUT without effect, the number of cases."""
+TALLIES = (RAN_AGAIN, IN_VAIN)
+"""Counted as cases end: these keys are no settings."""
+FILES = ("vut_files", "pov_files")
+"""Keys of `campaign.json`: files that the VUT and the user's own POV have loaded."""
+FARTHEST = 1e9
+"""Bound of each position, speed and acceleration in a trajectory, in m, m/s and m/s2."""
+WINDOW: Final = 100
+"""Cases of all levels together whose new coverage decides whether a search has converged."""
+MIN_GROWTH: Final = 0.01
+"""Relative growth of the coverage over the window below which a search has converged."""
 
 
 class LostError(UserError):
-    """A trajectory that is gone, or in a file that cannot be read any more."""
+    """A trajectory is missing, or its file cannot be read."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedSettings(Search):
-    """What a reader needs of `campaign.json`; a campaign that does not say had the default."""
+class SharedSettings(Search):
+    """Settings that a campaign needs to run and a reader needs to show it."""
 
     vut: str = "None"
+    levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
+    cases: int = MOST_CASES
     pov: str | None = None
     against: str | None = None
-    levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
-    tolerated: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.0
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
-    cases: int = 0
-    ran_again: Annotated[int, Meta(ge=0)] = 0
-    in_vain: dict[str, Annotated[int, Meta(ge=1)]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedSettings(SharedSettings):
+    """The part of `campaign.json` that a reader needs; a missing key has its default."""
+
+    ran_again: int = 0
+    in_vain: dict[str, int] = field(default_factory=dict)
     net_sha256: str | None = None
     vut_files: dict[str, str] | None = None
     pov_files: dict[str, str] | None = None
@@ -96,20 +103,17 @@ class Run:
     is not as it was written.
     """
 
-    def __init__(self, folder: Path, outcomes: list[Outcome] | None = None) -> None:
-        """Read settings and outcomes, where the writer of the folder has none in memory."""
+    def __init__(self, folder: Path) -> None:
+        """Read settings and outcomes."""
         self._take(folder, read_settings(folder), folder / SETTINGS)
         try:
             self.criterion = Criterion(self.settings.fail_when, self.settings.require)
-            if outcomes is None:
-                self._read()
-            else:
-                self.outcomes, self.torn = outcomes, False
+            self._read()
         except UserError as error:
             if absent := _absent_packages(self.record):
                 raise UserError(
-                    f"{folder} was recorded with {absent}, which is not installed here, and cannot "
-                    "be read without it"
+                    f"{folder} was recorded with {absent}, which is not installed: install it to "
+                    "read the campaign"
                 ) from error
             raise
 
@@ -120,27 +124,26 @@ class Run:
         self._batches: dict[int, dict[int, FloatArray]] = {}
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
+        names = {field.name for field in fields(RecordedSettings)}
+        known = {name: value for name, value in record.items() if name in names}
         try:
-            # No reader needs `repeat`, which was auto in some campaigns of earlier versions.
-            names = {field.name for field in fields(RecordedSettings)} - {"repeat"}
-            known = {name: value for name, value in self.record.items() if name in names}
             self.settings = convert(known, RecordedSettings)
         except UserError as error:
-            raise UserError(f"{place} is no campaign's: {error}") from error
+            raise UserError(f"{place} is not that of a campaign: {error}") from error
 
     def _read(self) -> None:
-        folder = self.folder
+        path = self.folder / OUTCOMES
         try:
-            text = regular(folder / OUTCOMES).read_bytes()
+            text = regular(path).read_bytes()
         except OSError as error:
-            raise _no_campaign(folder, error) from error
-        self.outcomes, self.torn = read_outcomes(text, str(folder / OUTCOMES), self.scenario)
+            raise _no_campaign(self.folder, error) from error
+        self.outcomes, self.torn = read_outcomes(text, str(path), self.scenario)
         for outcome in self.outcomes:
             needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
             if needs == outcome.is_by_score and not self.criterion.speaks_of_score:
                 raise UserError(
-                    f"case {outcome.index} in {folder / OUTCOMES} is not judged by the criterion "
-                    f"that {SETTINGS} names, {self.criterion.text}"
+                    f"case {outcome.index} in {path} is not judged by the criterion of {SETTINGS}, "
+                    f"{self.criterion.text}"
                 )
 
     @property
@@ -176,29 +179,30 @@ class Run:
 
     @property
     def simulated_s(self) -> float:
-        """Simulated time of all cases with the follow-up; up to M where the motion is lost."""
-        steps = {one.index: round(one.measures.t_end_s / DT_S) for one in self.outcomes}
-        for batch in {one.batch for one in self.outcomes}:
-            with suppress(RecordError):
-                read = read_arrays(batch_file(self.folder, batch), "index", "rows")
-                ran = np.maximum(read["rows"], 1) - 1
-                whole = dict(zip(read["index"].tolist(), ran.tolist(), strict=True))
-                steps |= {one: int(whole[one]) for one in steps.keys() & whole}
-        return round(sum(steps.values()) * DT_S, 1)
+        """Simulated time of all cases with the follow-up; without it where the motion is lost."""
+        steps = 0
+        for batch, group in groupby(self.outcomes, key=lambda outcome: outcome.batch):
+            try:
+                rows = read_arrays(batch_file(self.folder, batch), "rows")["rows"]
+                steps += int((rows - 1).sum())
+            except RecordError:
+                steps += sum(round(one.measures.t_end_s / DT_S) for one in group)
+        return round(steps * DT_S, 1)
 
     @property
     def interruption(self) -> str:
-        """A sentence on a campaign that has fewer cases than it was to have; empty for others."""
+        """A sentence on a campaign that has fewer cases than its settings; empty for others."""
         fewer = len(self.outcomes) < self.settings.cases and not self.settings.stop_when_converged
         if not (self.torn or fewer):
             return ""
         torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
-        return f"This campaign was interrupted, and what is shown is of the cases that ran{torn}."
+        return f"This campaign was interrupted; the results are those of the finished cases{torn}."
 
     @property
     def ran_again_in_words(self) -> str:
         """A sentence on the cases that ran again; empty where none did."""
-        if not (number := self.settings.ran_again):
+        number = self.settings.ran_again
+        if not number:
             return ""
         return (
             f"{counted(number, 'case')} ran again, because a process was killed or stopped; the "
@@ -294,12 +298,11 @@ class Run:
             except RecordError as error:
                 raise LostError(f"cannot read the trajectories in {path}: {error}") from error
             try:
-                arrays.pop("lines_sha256", None)
-                text = arrays.pop("signals", None)
-                motion = _motion_by_case(self.scenario.vehicles, **arrays)
-                self._signals |= {} if text is None else _signals_by_case(text, motion)
+                motion = _motion_by_case(self.scenario.vehicles, arrays)
+                if "signals" in arrays:
+                    self._signals |= _signals_by_case(arrays["signals"], motion)
                 self._batches[batch] = motion
-            except (ValueError, TypeError, UserError) as error:
+            except (KeyError, ValueError, TypeError, UserError) as error:
                 raise UserError(
                     f"{path} is not as it was written: {error}; take it from a copy"
                 ) from error
@@ -307,15 +310,14 @@ class Run:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Return what `campaign.json` says; `UserError` when it is no campaign's."""
+    """Return the content of `campaign.json`; `UserError` where it is not that of a campaign."""
     path = folder / SETTINGS
     try:
         settings: dict[str, Any] = decode(regular(path).read_bytes(), dict[str, Any])
     except OSError as error:
         raise _no_campaign(folder, error) from error
     except UserError as error:
-        raise UserError(f"{path} is no campaign's: {error}") from error
-    settings.pop(CHECKSUM, None)
+        raise UserError(f"{path} is not that of a campaign: {error}") from error
     return settings
 
 
@@ -377,12 +379,14 @@ def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
 
 def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
     """Return the region (`fmc.regions`) of each failure within its level, by index of the case."""
-    failing = failures(outcomes)
+    by_level: defaultdict[int, list[Outcome]] = defaultdict(list)
+    for outcome in failures(outcomes):
+        by_level[outcome.case.level].append(outcome)
     region: dict[int, int] = {}
-    for level in sorted({outcome.case.level for outcome in failing}):
-        own = [outcome for outcome in failing if outcome.case.level == level]
-        points = to_unit((outcome.case for outcome in own), level, own[0].case.scenario)
-        region |= zip((o.index for o in own), regions(points).tolist(), strict=True)
+    for level, group in by_level.items():
+        points = to_unit((outcome.case for outcome in group), level, group[0].case.scenario)
+        for outcome, number in zip(group, regions(points).tolist(), strict=True):
+            region[outcome.index] = number
     return region
 
 
@@ -391,12 +395,39 @@ def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     worst_first = failures(outcomes)
     region = regions_of(worst_first)
     before: Counter[tuple[int, int]] = Counter()
-    turns = []
+    turns: dict[int, int] = {}
     for outcome in worst_first:
         own = outcome.case.level, region[outcome.index]
-        turns.append(before[own])
+        turns[outcome.index] = before[own]
         before[own] += 1
-    return [o for _, o in sorted(zip(turns, worst_first, strict=True), key=lambda pair: pair[0])]
+    return sorted(worst_first, key=lambda outcome: turns[outcome.index])
+
+
+def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
+    """Return whether the last cases added little to the coverage of all levels together.
+
+    This is a pure function of the outcomes in the order of their index, so a resumed campaign ends
+    where it would have ended. A search without a failure continues. A region of failures without a
+    case near it is in no coverage: the rule saves cases and proves nothing
+    (`python tools/bench_stopping.py` shows where it stops).
+
+    Args:
+        outcomes: the outcomes.
+        tolerated: the share of its runs in which a case may fail.
+    """
+    before = sum(coverage_by_level(outcomes[:-WINDOW], tolerated).values())
+    return sum(coverage_by_level(outcomes, tolerated).values()) < (1.0 + MIN_GROWTH) * before
+
+
+def coverage_by_level(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> dict[int, float]:
+    """Return the failure mode coverage of each level with failures."""
+    by_level: defaultdict[int, list[Case]] = defaultdict(list)
+    for outcome in failing_cases(outcomes, tolerated):
+        by_level[outcome.case.level].append(outcome.case)
+    coverage = {}
+    for level, cases in by_level.items():
+        coverage[level] = fmc(to_unit(cases, level, cases[0].scenario))
+    return coverage
 
 
 def batch_file(folder: Path, batch: int) -> Path:
@@ -405,24 +436,22 @@ def batch_file(folder: Path, batch: int) -> Path:
 
 
 def _no_campaign(folder: Path, error: OSError) -> UserError:
-    if not folder.exists():
-        return UserError(f"there is no folder {folder}: name one that a campaign has written")
-    if isinstance(error, FileNotFoundError | NotADirectoryError):
-        return UserError(
-            f"{folder} is not a campaign: there is no {error.filename}; name a folder that "
-            "`merge-sumo campaign` has written"
-        )
-    return UserError(f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror})")
+    return UserError(
+        f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror}); name a "
+        "folder that `merge-sumo campaign` has written"
+    )
 
 
-def _motion_by_case(
-    vehicles: int, index: NDArray[np.int64], rows: NDArray[np.int64], motion: FloatArray
-) -> dict[int, FloatArray]:
-    """Return the motion of each case, (T + 1, A, 3); ValueError or TypeError for a misfit."""
+def _motion_by_case(vehicles: int, arrays: Mapping[str, NDArray[Any]]) -> dict[int, FloatArray]:
+    """Return the motion of each case, (T + 1, A, 3), from the arrays of a batch.
+
+    Raises KeyError, ValueError or TypeError where they do not fit each other.
+    """
+    index, rows, motion = arrays["index"], arrays["rows"], arrays["motion"]
     if motion.dtype != np.float64 or motion.ndim != 2 or motion.shape[1] != 3 * vehicles:
         raise ValueError(f"the motion is {motion.dtype} of shape {motion.shape}")
     if not (np.abs(motion) < FARTHEST).all():
-        raise ValueError("the motion has numbers that are not finite, or none of a road")
+        raise ValueError("the motion has numbers that are too large or not finite")
     within = rows.dtype.kind == "i" and ((rows >= 1) & (rows <= len(motion))).all()
     if not within or rows.ndim != 1 or rows.sum() != len(motion):
         raise ValueError("the rows of the cases are not those of the motion")

@@ -8,15 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from merge_sumo.campaigns.run import SETTINGS, scenario_of
-from merge_sumo.campaigns.stopping import has_converged
+from merge_sumo.campaigns.run import SETTINGS, SharedSettings, has_converged, scenario_of
 from merge_sumo.config import Search, changed
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_in, policies_name
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
@@ -38,20 +37,15 @@ from merge_sumo.simulation.povs import POLICIES
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignSettings(Search):
-    """Everything that decides what a campaign does; `UserError` for values that make none."""
+class CampaignSettings(SharedSettings):
+    """Everything that decides the outcomes of a campaign; `UserError` for wrong values."""
 
     vut: str
     levels: tuple[int, ...]
-    cases: int = 800
+    scenario: Scenario
+    policies: str | None = None
     deadline_s: float = DEADLINE_S
     vut_memory_gib: float = MEMORY_GIB
-    policies: str | None = None
-    pov: str | None = None
-    against: str | None = None
-    scenario: Scenario
-    fail_when: str = PAPER_CRITERION.fail_when
-    require: str | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import replace
 from typing import Any
@@ -15,7 +14,6 @@ from support.campaigning import run_campaign
 from merge_sumo import api
 from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.errors import UserError
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import by_case, failing_cases
 from merge_sumo.printable import counted
@@ -105,15 +103,6 @@ class TestACampaign:
         gate = opened.gates[0]
         counts = f"{counted(opened.summary.failures, 'failure')} and {opened.summary.undecided}"
         assert (gate.met, gate.found) == (True, f"{counts} undecided")
-
-    def test_of_an_earlier_version_with_auto_is_read_and_does_not_go_on(self, tmp_path):
-        run = run_campaign(self.settings(tmp_path, cases=6, batch=6), tmp_path / "run")
-        file = run.folder / "campaign.json"
-        record = json.loads(file.read_text()) | {"repeat": "auto"}
-        file.write_text(json.dumps({k: v for k, v in record.items() if k != "sha256"}))
-        assert len(api.open_run(run.folder).cases) == 6
-        with pytest.raises(UserError, match="repeat is 'auto': it must be a whole number"):
-            api.resume(run.folder, vut=f"{tmp_path}/seeded.py:Vut", cases=12)
 
 
 def test_nothing_is_tolerated_where_all_runs_of_a_case_are_the_same():

@@ -169,7 +169,7 @@ def test_a_run_with_measures_of_an_absent_package_names_the_package(tmp_path):
     Run(tmp_path / "run")
     path = tmp_path / "run" / OUTCOMES
     path.write_bytes(path.read_bytes().replace(b'"error"', b'"mean_speed_mps": 1.0, "error"'))
-    with pytest.raises(UserError, match=r"with speedy 1\.0, which is not installed here"):
+    with pytest.raises(UserError, match=r"with speedy 1\.0, which is not installed"):
         Run(tmp_path / "run")
 
 

@@ -71,7 +71,7 @@ class TestTheCommand:
             (("--vut", "design2", "--level", "2", "--x", "-300", "--v", "34"), "--psi"),
             (("--vut", "design9", *SAFE), "design9"),
             (("--vut", "design2", "--x", "-300", "--v", "34", "--level", "all"), "--level all"),
-            (("--case", "nowhere", "3"), "there is no folder"),
+            (("--case", "nowhere", "3"), "is not a campaign: cannot read"),
         ],
     )
     def test_is_refused_in_a_sentence(self, command_line, arguments, part):

@@ -9,9 +9,9 @@ import pytest
 from support.campaigning import run_campaign
 
 from merge_sumo import api
-from merge_sumo.campaigns import stopping
+from merge_sumo.campaigns import run as campaign_folder
+from merge_sumo.campaigns.run import WINDOW, has_converged
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.stopping import WINDOW, has_converged
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case
@@ -51,7 +51,7 @@ class TestTheRule:
 def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(stopping, "WINDOW", 20)
+    monkeypatch.setattr(campaign_folder, "WINDOW", 20)
     plan: dict[str, Any] = {"vut": "design1", "levels": (0,), "cases": 120, "scenario": US23}
     plan["sampler"] = "annealing"
     whole = run_campaign(CampaignSettings(**plan), tmp_path / "whole")
@@ -65,7 +65,7 @@ def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(
 def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may_go_on(
     tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(stopping, "WINDOW", 20)
+    monkeypatch.setattr(campaign_folder, "WINDOW", 20)
     plan: dict[str, Any] = {"level": 0, "sampler": "annealing", "progress": False}
     run = api.campaign("design1", **plan, out=tmp_path / "run")
     assert run.converged
