@@ -108,7 +108,7 @@ from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.workers import open_workers
+from merge_sumo.workers import Workers, open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
@@ -586,14 +586,8 @@ def run_and_report(
                 begin=partial(bars.begin, title),
             )
             result = CampaignRun(done, config.gates)
-            plan = replace(plan, against=None)
-            on_part = partial(bars.counted, "careful drivers", unit="failures")
-            known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
-            if known:
-                AVOIDANCE.write_lines(folder, known)
-            on_part = partial(bars.counted, "uniform starts", unit="cases")
-            note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
-            note_explanation(done, plan, check)
+            search_s = perf_counter() - begun_s
+            _study(done, replace(plan, against=None), workers, search_s, check, bars)
             link_latest(folder)
             on_part = partial(bars.counted, "surrogates of the report", unit="levels")
             write_report(done, result.summary, on_part)
@@ -607,6 +601,33 @@ def run_and_report(
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
+
+
+def _study(
+    run: Run,
+    plan: SimulationPlan,
+    workers: Workers,
+    search_s: float,
+    check: Callable[[], None],
+    bars: CampaignBars,
+) -> None:
+    """Write what a report has besides the cases: avoidance, share of failures, an explanation.
+
+    Args:
+        run: the campaign.
+        plan: how its cases run, without an earlier version.
+        workers: where they run.
+        search_s: duration of the search in s.
+        check: called between cases; may raise to stop.
+        bars: show the progress.
+    """
+    on_part = partial(bars.counted, "careful drivers", unit="failures")
+    known = avoidance(run, plan, workers=workers, check=check, on_part=on_part)
+    if known:
+        AVOIDANCE.write_lines(run.folder, known)
+    on_part = partial(bars.counted, "uniform starts", unit="cases")
+    note_shares(run, plan, workers, search_s, check, on_part)
+    note_explanation(run, plan, check)
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
