@@ -16,14 +16,14 @@ import math
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import Bounds
 
 Point = tuple[float, float, float]
 
-DRAWN_MIN_M: Final = 0.1
+DRAWN_MIN_M = 0.1
 """SUMO takes a lane for drawn as long as this when it is drawn shorter, and stops at its end."""
 
 
@@ -140,12 +140,12 @@ class Approach:
     visibility_m: float | None
 
 
-EXPECTED_SHARE: Final = 0.35
+EXPECTED_SHARE = 0.35
 """Of an acceleration lane, up to M: on three German ramps with lanes of 186 to 199 m cars merge
 after a mean share of .32, .46 and .33 (Li et al. 2023, arXiv 2303.11531, 3,430 merges)."""
-MIN_LANE_M: Final = 50.0
+MIN_LANE_M = 50.0
 """A shorter lane that the net does not mark leaves no choice: 2 s at 25 m/s."""
-MAX_LANE_M: Final = 2000.0
+MAX_LANE_M = 2000.0
 """A longer lane is one of the mainline that ends somewhere."""
 
 

@@ -584,24 +584,24 @@ def _lane_drop(
     after that on which it ends; None where no such lane ends.
     """
     for ending, going in ((ramp, mainline), (mainline, ramp)):
-        for last, beside in product(ending, going):
-            onward = _links(net, beside, following)
-            is_next = abs(last.getIndex() - beside.getIndex()) == 1
+        for last, neighbour in product(ending, going):
+            onward = _links(net, neighbour, following)
+            is_next = abs(last.getIndex() - neighbour.getIndex()) == 1
             if is_next and onward and not _links(net, last, following):
                 drop = _drop(last, onward[0])
                 return (onward[0], drop, drop) if ending is ramp else (drop, onward[0], drop)
     return None
 
 
-def _drop(last: SumoLane, beside: _Link) -> _Link:
+def _drop(last: SumoLane, neighbour: _Link) -> _Link:
     """Return the link from a lane that ends to the target of a link of the lane next to it."""
     via: tuple[Piece, ...] = ()
-    if beside.via:
-        ends = last.getShape3D()[-1], beside.target.getShape3D()[0]
-        via = (replace(beside.via[0], length_m=_length_m(beside.via), shape=ends),)
+    if neighbour.via:
+        ends = last.getShape3D()[-1], neighbour.target.getShape3D()[0]
+        via = (replace(neighbour.via[0], length_m=_length_m(neighbour.via), shape=ends),)
     state = "Z" if _junction(last).getType() == "zipper" else "m"
     # A driver on it sees all along the lane next to it.
-    return _Link(last, beside.target, via, state, visibility_m=last.getLength())
+    return _Link(last, neighbour.target, via, state, visibility_m=last.getLength())
 
 
 def _swerve(link: _Link) -> tuple[int, int]:
@@ -650,19 +650,19 @@ def _length_m(pieces: Iterable[Piece]) -> float:
     return math.fsum(piece.length_m for piece in pieces)
 
 
-def _placed(pieces: Iterable[Piece], start_m: float, behind: Piece | None = None) -> list[Piece]:
-    """Return pieces that begin at a coordinate, one after the other, behind another piece."""
+def _placed(pieces: Iterable[Piece], start_m: float, before: Piece | None = None) -> list[Piece]:
+    """Return pieces one after the other from a coordinate on; `before` is the piece before them."""
     placed = []
     for piece in pieces:
         shape = _corners(piece.shape)
-        if len(shape) == 1 and behind is not None:
+        if len(shape) == 1 and before is not None:
             # Drawn as a point, as some lanes inside of junctions: it points where the last one did.
-            (x0, y0, _), (x1, y1, _) = behind.shape[-2:]
-            ahead = POINT_M / math.dist(*behind.shape[-2:])
+            (x0, y0, _), (x1, y1, _) = before.shape[-2:]
+            ahead = POINT_M / math.dist(*before.shape[-2:])
             x, y, z = shape[0]
             shape = (*shape, (x + ahead * (x1 - x0), y + ahead * (y1 - y0), z))
-        behind = replace(piece, start_m=start_m, shape=shape)
-        placed.append(behind)
+        before = replace(piece, start_m=start_m, shape=shape)
+        placed.append(before)
         start_m += piece.length_m
     return placed
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 
@@ -17,8 +16,8 @@ from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
 
-MAINLINE_EDGES: Final = ("main_in", "main_out")
-RAMP_EDGES: Final = ("ramp", "main_out")
+MAINLINE_EDGES = ("main_in", "main_out")
+RAMP_EDGES = ("ramp", "main_out")
 """Of the shipped net."""
 
 _found: dict[tuple[object, ...], Corridor] = {}

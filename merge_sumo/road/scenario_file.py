@@ -13,7 +13,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
@@ -21,7 +20,7 @@ from merge_sumo.printable import meant
 from merge_sumo.records import convert, read_toml, toml_value
 from merge_sumo.scenario.scenario import US23, Scenario
 
-SUFFIX: Final = ".toml"
+SUFFIX = ".toml"
 
 
 def shipped_scenarios() -> list[str]:
@@ -82,7 +81,7 @@ def _line(text: str, sentence: str) -> str:
     return ""
 
 
-COMMENTS: Final = {
+COMMENTS = {
     "net": "the SUMO net, next to this file",
     "mainline": "edges of the mainline in driving order, past the merge point M",
     "ramp": "edges of the ramp in driving order, past M",

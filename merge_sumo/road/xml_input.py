@@ -12,28 +12,27 @@ import io
 import re
 import zlib
 from pathlib import Path
-from typing import Final
 
 from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import read_limited
 
-MAX_BYTES: Final = 2**28
+MAX_BYTES = 2**28
 """Of a file, unpacked: the net of a city has 50 MB."""
-MAX_ELEMENTS: Final = 4_000_000
+MAX_ELEMENTS = 4_000_000
 """Of a file: the net of a city has 500,000."""
-GZIP: Final = b"\x1f\x8b"
+GZIP = b"\x1f\x8b"
 """First bytes of a gzip file."""
-NET_TAGS: Final = frozenset(
+NET_TAGS = frozenset(
     {
         *("net", "location", "edge", "lane", "junction", "request", "connection", "roundabout"),
         *("tlLogic", "phase"),
     }
 )
 """Elements of a net that describe the road. None of them names a file but a projection."""
-RECORD_TAGS: Final = frozenset(("fcd-export", "timestep", "vehicle"))
-PROJECTION: Final = re.compile(
+RECORD_TAGS = frozenset(("fcd-export", "timestep", "vehicle"))
+PROJECTION = re.compile(
     r"[!.-]|(\+(no_defs|south|(proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
     r"|x_0|y_0|type|towgs84)=[\w.,-]{1,80})( |$))+",
     re.ASCII,

@@ -71,7 +71,7 @@ class Imperfection:
 
     @classmethod
     def parsed(cls, text: str, option: str) -> Self:
-        """Return what a person writes after an option: "delay_s=0.3,noise_x_m=0..0.5".
+        """Return the text of an option: "delay_s=0.3,noise_x_m=0..0.5".
 
         Raises `UserError`, with the option's name, for what it does not have.
         """
@@ -116,7 +116,7 @@ class Sensing(Imperfection):
 
     Attributes:
         delay_s: age of what it sees.
-        noise_x_m: standard deviation of the error of a position, in each step anew.
+        noise_x_m: standard deviation of the error of a position, drawn again in each step.
         noise_v_mps: standard deviation of the error of a speed.
         dropout: share of the steps in which nothing new arrives of a car; the last state is kept.
         range_m: a car farther away than this, between front bumpers, is not seen.

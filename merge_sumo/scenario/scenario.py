@@ -35,7 +35,7 @@ DT_S: Final = 0.1
 LEVELS: Final = (0, 1, 2)
 """Levels of reasoning of the POV."""
 OWN: Final = 3
-"""Stands for a level where a person's own controller is the POV; people write and read "own"."""
+"""Stands for a level where a user's own controller is the POV; users write and read "own"."""
 ALL_LEVELS: Final = (*LEVELS, OWN)
 DEADLINE_S: Final = 5.0
 """A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
@@ -45,10 +45,10 @@ MAX_EPISODE_S: Final = 120.0
 """No scenario lets an episode last longer."""
 
 MAX_FOLLOW_UP_S: Final = 30.0
-"""None follows vehicles for longer behind M."""
+"""Longest follow-up of vehicles after M."""
 
 ROOM_AFTER_M: Final = 2000.0
-"""Length behind M that the road has at least."""
+"""Minimum length of the road after M."""
 
 Bounds = tuple[float, float]
 Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in ["e1", "e2"]')]
@@ -63,7 +63,7 @@ AnyLevels = int | str | Iterable[int | str]
 
 
 def names_of_levels(asked: AnyLevels) -> tuple[str, ...]:
-    """Return the names of the levels that a person lists, in a text with commas."""
+    """Return the names of the levels that a user lists, in a text with commas."""
     listed = asked if isinstance(asked, Iterable) else [asked]
     parts = asked.split(",") if isinstance(asked, str) else listed
     return tuple(dict.fromkeys(str(part).strip() for part in parts)) or ("",)
@@ -316,7 +316,7 @@ class Scenario:
 
     @property
     def goal(self) -> str:
-        """What the VUT reaches in an episode that is no TIMEOUT."""
+        """Words for the place that the VUT must reach before the timeout."""
         return "the merge point" if self.lane_m is None else "the mainline"
 
     @property

@@ -1,6 +1,6 @@
 """Signals: named numbers and words that a controller leaves for each step, such as its mode.
 
-They decide nothing. They are kept with the motion of a case, drawn beside it, and exported. Names
+They decide nothing. They are kept with the motion of a case, drawn next to it, and exported. Names
 and words come from the user's code: they are bounded, and made printable.
 """
 
@@ -61,7 +61,7 @@ def _word(text: str) -> str:
 
 
 def series(left: Iterable[tuple[int, Left]], rows: int) -> Signals | None:
-    """Return the signals of a case of so many rows, from what was left: (row, by name).
+    """Return the signals of a case by its number of rows and the values left: (row, by name).
 
     None where nothing was left. Of more than `MOST_NAMES`, the first ones.
     """
@@ -94,7 +94,7 @@ SignalRuns = Annotated[
 
 
 def from_runs(runs: SignalRuns, rows: int) -> Signals:
-    """Return the signals of a case of so many rows; `UserError` where they are not as written."""
+    """Return the signals of a case by its number of rows; `UserError` where they are invalid."""
     signals: Signals = {}
     for name, pairs in runs.items():
         if sum(count for count, _ in pairs) != rows:

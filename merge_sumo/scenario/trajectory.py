@@ -57,9 +57,9 @@ class Trajectory:
 
     `end` is MERGED whenever the VUT arrived at M: how near the bodies came is its severity
     (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
-    the simulation did wrong, in a case that MERGED behind M. `clipped_steps` counts the answers of
+    the simulation did wrong, in a case that MERGED after M. `clipped_steps` counts the answers of
     the VUT that were outside the limits of acceleration and were clipped. `after` is the motion
-    behind M where the scenario has it followed up, its first row that of the merge. `signals` are
+    after M where the scenario has it followed up, its first row that of the merge. `signals` are
     what the VUT left for each row of both, where it left any. `in_vain` names the commands of the
     VUT that were accepted, and changed nothing.
     """
@@ -80,7 +80,7 @@ class Trajectory:
 
     @property
     def whole(self) -> FloatArray:
-        """The motion up to M and behind it, (T + 1, A, 3)."""
+        """The motion up to M and after it, (T + 1, A, 3)."""
         if self.after is None:
             return self.motion
         return np.concatenate((self.motion[:-1], self.after))
@@ -134,7 +134,7 @@ class Trajectory:
 
 
 def cut_at(whole: FloatArray, row: int) -> tuple[FloatArray, FloatArray | None]:
-    """Return the motion up to the row of the merge, and that behind it; None where it ends there.
+    """Return the motion up to the row of the merge, and that after it; None where it ends there.
 
     The acceleration in the last row of a motion is 0.
     """

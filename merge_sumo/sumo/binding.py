@@ -13,24 +13,24 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.scenario import DT_S
 
-DEBIAN_PACKAGES: Final = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
+DEBIAN_PACKAGES = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 """Shared libraries that SUMO's wheels load, even without a window."""
-LOADER_FAILED: Final = 127
+LOADER_FAILED = 127
 """Exit code of a program whose shared libraries are missing."""
-SUMO_VERSION: Final = "1.28.0"
+SUMO_VERSION = "1.28.0"
 """The one whose motions are known; pyproject.toml pins the same."""
-PROGRAM_LIMIT_S: Final = 15.0
+PROGRAM_LIMIT_S = 15.0
 """Time that SUMO has for an episode; it needs a tenth of a second."""
 
-SPEED_MODE_COMMANDED: Final = 32
+SPEED_MODE_COMMANDED = 32
 """All of SUMO's own checks off: the vehicle drives at the speed that it is given."""
-SUMO_OPTIONS: Final = (
+SUMO_OPTIONS = (
     *("--step-length", str(DT_S)),
     *("--insertion-checks", "none"),
     *("--time-to-teleport", "-1"),
@@ -41,9 +41,9 @@ SUMO_OPTIONS: Final = (
     *("--duration-log.disable", "true"),
 )
 """Of every simulation, besides what it does about collisions."""
-NO_COLLISIONS: Final = ("--collision.action", "none")
+NO_COLLISIONS = ("--collision.action", "none")
 """SUMO looks for none: measures say which vehicles touch."""
-NOT_A_NAME: Final = re.compile(r"[,:%\ud800-\udfff]|\$\{")
+NOT_A_NAME = re.compile(r"[,:%\ud800-\udfff]|\$\{")
 """To SUMO a comma parts names, a colon parts host and port, and the others stand for something."""
 
 
@@ -124,7 +124,7 @@ def sumo_environment() -> dict[str, str]:
     return {**others, "SUMO_HOME": str(Path(sumo_program("sumo")).parents[1])}
 
 
-ENDS_WITH_US: Final = """
+ENDS_WITH_US = """
 import ctypes, os, sys
 ctypes.CDLL(None).prctl(1, 9)  # PR_SET_PDEATHSIG, SIGKILL
 if os.getppid() == int(sys.argv[1]):

@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Iterator
 from itertools import groupby, pairwise
-from typing import Final
 
 from lxml import etree
 
@@ -15,13 +14,13 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.xml_input import harmless_net, read_xml, to_bytes
 from merge_sumo.sumo.binding import run_program, scratch_folder
 
-NET: Final = "road.net.xml"
-ROAD: Final = "road.xodr"
-ENTRY: Final = "entry"
+NET = "road.net.xml"
+ROAD = "road.xodr"
+ENTRY = "entry"
 """OpenDRIVE's type of an acceleration lane."""
-CONVERSION_LIMIT_S: Final = 180.0
+CONVERSION_LIMIT_S = 180.0
 """Time that netconvert has for a net; it needs 10 s for that of a city."""
-SAME_M: Final = 0.5
+SAME_M = 0.5
 """Distance of the ends of one lane in SUMO and in OpenDRIVE, at most."""
 
 

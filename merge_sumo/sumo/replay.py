@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from msgspec import Meta
@@ -57,10 +57,10 @@ from merge_sumo.sumo.replay_folder import (
     motion_record,
 )
 
-REPLAYED: Final = "replayed.fcd.xml"
-TOLERANCE: Final = 1e-6
+REPLAYED = "replayed.fcd.xml"
+TOLERANCE = 1e-6
 """Metres and m/s; the record is written with nine digits."""
-MAX_TIMESTEPS: Final = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
+MAX_TIMESTEPS = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -106,7 +106,7 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
     record, so these must agree with its x and y, too.
 
     Args:
-        folder: the replay folder, which may be of another person.
+        folder: the replay folder, which may have been received.
         from_s: SUMO begins so long before the first conflict, in the state that it has there in
             the whole replay.
 
@@ -142,7 +142,7 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
     """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code.
 
     Args:
-        folder: the replay folder, which may be of another person.
+        folder: the replay folder, which may have been received.
         from_s: as in `replay`.
         silent: whether no notice says when it begins.
 
@@ -193,7 +193,7 @@ class _Episode:
 
 
 def _read(folder: Path) -> _Episode:
-    """Read case, record and net of a folder that may be of another person."""
+    """Read case, record and net of a folder that may have been received."""
     if not folder.is_dir():
         raise UserError(
             f"there is no folder {folder}: name a replay folder, or a campaign and a case"

@@ -2,7 +2,7 @@
 
 On the shipped road it is played in the shipped net. Of any other road the folder has the net that
 hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
-reader can check, and where the road goes on behind the end of the file, so does that net. A VUT on
+reader can check, and where the road continues after the end of the file, so does that net. A VUT on
 an acceleration lane is on the lane of the mainline from the row in which it has merged. Labels
 stand at fixed places above the road, as points of interest with a text: names at the cars would lie
 on each other at M, where a reader looks.
@@ -14,7 +14,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
 
 from lxml import etree
 
@@ -32,31 +31,31 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
 
-CONFIG: Final = "replay.sumocfg"
-NET: Final = "us23.net.xml"
+CONFIG = "replay.sumocfg"
+NET = "us23.net.xml"
 """The net of the shipped road."""
-HOSTED_NET: Final = "road.net.xml"
+HOSTED_NET = "road.net.xml"
 """The net of any other road."""
-LANE_EDGE: Final = LANE.replace(COPY, ".0")
+LANE_EDGE = LANE.replace(COPY, ".0")
 """Edge of that net with an acceleration lane and the mainline next to it."""
-TYPES: Final = "vehicles.add.xml"
-LABELS: Final = "labels.add.xml"
-RECORD: Final = "episode.fcd.xml"
-VIEW: Final = "view.settings.xml"
-CASE: Final = "case.json"
-SCENARIO: Final = "scenario"
+TYPES = "vehicles.add.xml"
+LABELS = "labels.add.xml"
+RECORD = "episode.fcd.xml"
+VIEW = "view.settings.xml"
+CASE = "case.json"
+SCENARIO = "scenario"
 """Key of the scenario in that file, next to those of the outcome."""
-SHAPE: Final = 614.0 / 1270.0
+SHAPE = 614.0 / 1270.0
 """Height of the picture in the window of sumo-gui, as a share of its width."""
-REAL_TIME_MS: Final = "1000"
+REAL_TIME_MS = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
-HOLD_STEPS: Final = 10
+HOLD_STEPS = 10
 """Steps for which the last picture stays, so that one sees how it ended."""
-NAMES: Final = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
-TEXT: Final = "text"
+NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
+TEXT = "text"
 """Parameter of a point of interest that is shown."""
-PALE: Final = "0.93,0.93,0.90"
-INK: Final = "0.1,0.1,0.1"
+PALE = "0.93,0.93,0.90"
+INK = "0.1,0.1,0.1"
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import compress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 from lxml import etree
@@ -46,20 +46,20 @@ from merge_sumo.sumo.binding import (
 )
 from merge_sumo.sumo.hosting import hosted_net, hosted_paths
 
-PARKING_M: Final = 182.0
+PARKING_M = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
-EXACT_M: Final = 1e-9
+EXACT_M = 1e-9
 """Largest difference of SUMO from eq. (4) in a step; more is a position on another lane."""
-MAX_SPEED_MPS: Final = 200.0
+MAX_SPEED_MPS = 200.0
 """Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
 
-CAR: Final = "car"
-COMMANDED_VUT: Final = "commanded"
-VUT_TYPE: Final = "vut"
-OWN_CAR: Final = "own"
+CAR = "car"
+COMMANDED_VUT = "commanded"
+VUT_TYPE = "vut"
+OWN_CAR = "own"
 """Ids of the vTypes of the cars of the mainline and of VUTs that hold the speed that they are told,
 and of VUTs and of cars of the mainline that SUMO drives."""
-SLOWEST_MPS: Final = 0.1
+SLOWEST_MPS = 0.1
 """SUMO has no driver who wants to stand."""
 
 
@@ -205,7 +205,7 @@ class World:
             renewed = by_sumo or not self._obeys[row, corridor] or self._lane_changes
             if renewed:
                 # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
-                # model what it told the cars beside it.
+                # model what it told the cars next to it.
                 self._remove(name)
                 self._enter(name, (VUT_TYPE if row == VUT else OWN_CAR) if by_sumo else CAR)
                 self._obeys[row, corridor] = not by_sumo
