@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,66 +16,114 @@ from merge_sumo.samplers.candidates import (
     spread_out,
     surrogate_candidates,
 )
+from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.failure_probability import FailureProbability, nearness
-from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, Proposal, covered_grid, greedy
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.predictor import disagreement, failure_probability
 from merge_sumo.scenario.case import FloatArray
 
-FEWEST: Final = 2
-"""Fewest cases for a surrogate."""
-NEAREST: Final = 3
-"""Fewest failures to aim at failures alone; otherwise as many nearest cases stand in for them."""
-PATIENCE: Final = 40
-"""Cases before near misses stand in for failures."""
-BEST: Final = 150
-REFINED_QUERIES: Final = 600
-SHORTLIST: Final = 2000
-"""Of the surrogate alone: the best candidates, others around these, and those to choose from."""
-ANYWHERE: Final = 1000
-ANYWHERE_ABOVE_3D: Final = 5000
-ON_FACES: Final = 0.15
-NEAR: Final = 300
-BETWEEN: Final = 200
-"""Candidates that one member screens: uniform with a share on the faces, near failures, and
-between safe cases of the two merging orders. With more than three coordinates, where failures leave
-many gaps, more are uniform (measured with design 2 on us23-traffic, one seed: after 400 and 800
-cases a covered share of .86 and .98 at level 1, .89 and .95 at level 2; with 1,000 it is .77 and
-.90, .78 and .88)."""
-SURROGATE_CANDIDATES: Final = 1500
-"""Candidates that the surrogate screens."""
-SCREENED: Final = 80
-OF_SURROGATE: Final = 40
-AT_RANDOM: Final = 20
-"""Candidates that all members predict: the best of one member, the best of the surrogate, and
-uniform ones."""
-ROUNDS: Final = 3
-REFINED: Final = 60
-"""Rounds of candidates around the best ones and around the batch that would be picked."""
-EXPLORES_FROM: Final = 5
-"""Size of a batch from which its last case is the most informative one."""
+# Fewest failures to aim at failures alone; otherwise the nearest cases stand in for them, after
+# PATIENCE cases.
+NEAREST = 3
+PATIENCE = 40
+# Least covered share of the ball of a pick for the later picks of the batch, and covered share of
+# the ball of a pending case.
+PICKED = 0.8
+# Value of a covered ball: likely failures are still preferred.
+EVEN_IF_COVERED = 1e-3
 
 
 def near_miss_limit(history: LevelHistory) -> float | None:
-    """Return the gap, or the margin, that the search aims at; None for that of a failure.
+    """Return the gap (or margin) that the search counts as a failure; None for the true limit.
 
     With few failures, the nearest misses guide the search, as in subset simulation.
     """
     if (history.failures > 0).sum() >= NEAREST or len(history.points) < PATIENCE:
         return None
-    return float(np.partition(nearness(history), NEAREST - 1)[NEAREST - 1])
+    return float(np.sort(nearness(history))[NEAREST - 1])
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A batch, the most valuable case first.
+
+    Attributes:
+        points: cases in the unit cube, (n, d).
+        gain: expected new coverage of each, in balls, (n,).
+    """
+
+    points: FloatArray
+    gain: FloatArray
+
+
+def covered_grid(history: LevelHistory, pending: FloatArray) -> CoverageGrid:
+    """Return the grid that is covered by the failures of a history, and by pending cases, (m, d).
+
+    A pending case is a pick of an earlier batch: most of its ball counts as covered.
+    """
+    grid = CoverageGrid(history.dims)
+    grid.cover(grid.balls(history.points[history.failed]), 1.0)
+    if len(pending):
+        for ball in grid.balls(pending):
+            grid.cover(ball, PICKED)
+    return grid
+
+
+def greedy(
+    grid: CoverageGrid,
+    points: FloatArray,
+    aim: FloatArray,
+    probability: FloatArray,
+    n: int,
+    last: FloatArray | None = None,
+) -> tuple[list[int], FloatArray]:
+    """Choose `n` candidates: each adds the most expected coverage to those before it.
+
+    Most of the ball of a pick counts as covered for the later picks: if the pick fails, the ball is
+    covered, and if it does not, its neighbours would probably not have failed either. The aim may
+    include near misses, but only a failure is a gain.
+
+    Args:
+        grid: coverage before the batch; changed in place.
+        points: candidates, (m, d).
+        aim: worth of the ball of each, (m,).
+        probability: P(fail) of each, (m,).
+        n: number of picks.
+        last: worth that replaces `aim` for the last pick, (m,).
+
+    Returns:
+        Indices of the picks, and their gains, (n,).
+    """
+    picks: list[int] = []
+    gains: list[float] = []
+    free = np.ones(len(points), dtype=bool)
+    balls = grid.balls(points)
+    new = grid.new(balls)
+    for number in range(n):
+        target = aim
+        if last is not None and number == n - 1:
+            target = last
+        worth = np.where(free, target * (new + EVEN_IF_COVERED), -1.0)
+        best = int(np.argmax(worth))
+        free[best] = False
+        picks.append(best)
+        gains.append(float(probability[best] * new[best]))
+        grid.cover(balls[best], max(PICKED, float(aim[best])))
+        near = np.linalg.norm(points - points[best], axis=1) <= grid.overlap
+        new[near] = grid.new(balls[near])
+    return picks, np.array(gains)
 
 
 class LevelSearch:
     """Search for the batch of a level: candidates with P(fail), and a greedy choice among them.
 
-    The model of the controller rolls the candidates of all levels out together, so the sampler asks
-    it, and a search takes its answers.
+    The model of the controller rolls the candidates of all levels out together: the sampler calls
+    it and passes its predictions to the searches.
 
     Attributes:
         history: outcomes of the level.
         pending: cases that run and have no outcome yet, (m, d).
-        surrogate: P(fail) by the outcomes of the level; None with fewer than `FEWEST`.
+        surrogate: P(fail) by the outcomes of the level; None with fewer than two.
         points: candidates, (m, d).
         gaps: gaps of the candidates that the members of the model predict, (M, m).
         chance: P(fail) of the candidates, (m,).
@@ -93,7 +141,7 @@ class LevelSearch:
             rng: generator of the candidates.
         """
         self.history, self.pending = history, pending
-        self.surrogate = FailureProbability(history) if len(history.points) >= FEWEST else None
+        self.surrogate = FailureProbability(history) if len(history.points) >= 2 else None
         self._weight, self._rng = weight, rng
         self._grid = covered_grid(history, pending)
         self.points: FloatArray = np.empty((0, history.dims))
@@ -116,13 +164,16 @@ class LevelSearch:
     def screened(self) -> FloatArray:
         """Return candidates, (m, d), for one member of the model."""
         history, rng = self.history, self._rng
-        count = ANYWHERE_ABOVE_3D if history.dims > 3 else ANYWHERE
-        screened = [anywhere(count, history.dims, ON_FACES, rng)]
+        # With more than three coordinates failures leave many gaps, so more candidates are uniform.
+        # Measured with design 2 on us23-traffic, one seed, after 400 and 800 cases: a covered share
+        # of .86 and .98 at level 1, .89 and .95 at level 2; with 1,000 .77 and .90, .78 and .88.
+        count = 5000 if history.dims > 3 else 1000
+        screened = [anywhere(count, history.dims, 0.15, rng)]
         if self.surrogate is not None:
-            screened.append(between(self.surrogate, BETWEEN, rng))
+            screened.append(between(self.surrogate, 200, rng))
         failing = history.points[history.failed]
         if len(failing):
-            screened.append(around(failing, NEAR, LOCAL_REACH * radius_for(history.dims), rng))
+            screened.append(around(failing, 300, LOCAL_REACH * radius_for(history.dims), rng))
         return np.concatenate(screened)
 
     def first(self, screened: FloatArray, gaps: FloatArray, n: int) -> FloatArray:
@@ -133,12 +184,12 @@ class LevelSearch:
             gaps: its predictions, (1, k).
             n: size of the batch.
         """
-        best = self._ranked(screened, failure_probability(gaps), SCREENED)
-        chosen = [screened[:AT_RANDOM], screened[best]]
+        # 20 uniform ones, the best 80 of the member, and the best 40 of the surrogate.
+        best = self._ranked(screened, failure_probability(gaps), 80)
+        chosen = [screened[:20], screened[best]]
         if self.surrogate is not None:
-            own = self._rng.permutation(surrogate_candidates(self.surrogate, n, self._rng))
-            own = own[:SURROGATE_CANDIDATES]
-            chosen.append(own[self._ranked(own, self.surrogate.predict(own), OF_SURROGATE)])
+            own = self._rng.permutation(surrogate_candidates(self.surrogate, n, self._rng))[:1500]
+            chosen.append(own[self._ranked(own, self.surrogate.predict(own), 40)])
         return np.concatenate(chosen)
 
     def add(self, points: FloatArray, gaps: FloatArray) -> None:
@@ -155,7 +206,7 @@ class LevelSearch:
         picks, _ = greedy(self._grid.copy(), self.points, self.chance, self.chance, n)
         best = self._ranked(self.points, self.chance, n)
         centres = self.points[np.concatenate([best, picks])]
-        return around(centres, REFINED, REFINED_REACH * radius_for(self.history.dims), self._rng)
+        return around(centres, 60, REFINED_REACH * radius_for(self.history.dims), self._rng)
 
     def batch(self, n: int) -> Proposal:
         """Return the batch of `n` candidates; without a surrogate half is spread over the cube."""
@@ -163,7 +214,8 @@ class LevelSearch:
         if self.surrogate is None:
             spread = spread_out(n - n // 2, self.history.dims, self._rng)
             self._grid.cover(self._grid.balls(spread), PICKED)
-        last = disagreement(self.gaps) if n >= EXPLORES_FROM else None
+        # The last case of a batch of five and more is the most informative one.
+        last = disagreement(self.gaps) if n >= 5 else None
         picks, gain = greedy(
             self._grid, self.points, self.chance, self.chance, n - len(spread), last
         )
@@ -177,15 +229,16 @@ class LevelSearch:
         history, surrogate = self.history, self.surrogate
         assert surrogate is not None, "there are outcomes"  # noqa: S101
         limit = near_miss_limit(history)
-        aimed = surrogate if limit is None else FailureProbability(history, limit)
+        aimed = surrogate
+        if limit is not None:
+            aimed = FailureProbability(history, limit)
         points = surrogate_candidates(aimed, n, self._rng)
         aim = aimed.predict(points)
-        best = points[self._ranked(points, aim, BEST)]
-        reach = REFINED_REACH * radius_for(history.dims)
-        refined = around(best, REFINED_QUERIES, reach, self._rng)
+        best = points[self._ranked(points, aim, 150)]
+        refined = around(best, 600, REFINED_REACH * radius_for(history.dims), self._rng)
         points = np.concatenate([points, refined])
         aim = np.concatenate([aim, aimed.predict(refined)])
-        shortlist = self._ranked(points, aim, max(SHORTLIST, n))
+        shortlist = self._ranked(points, aim, max(2000, n))
         points, aim = points[shortlist], aim[shortlist]
         chance = aim if limit is None else surrogate.predict(points)
         picks, gain = greedy(self._grid, points, aim, chance, n)

@@ -1,37 +1,22 @@
 """The default sampler: each batch maximises the expected new failure mode coverage.
 
-A case is worth P(fail) times the share of its ball (radius rho of the FMC) that is
-not covered yet. Candidates are uniform, near failures, and near where the merging order changes;
-the batch is picked from them greedily.
+The expected gain of a case is P(fail) times the uncovered share of its ball (radius rho of the
+FMC). A batch is chosen greedily among uniform candidates, candidates near failures, and candidates
+near changes of the merging order.
 """
 
 from __future__ import annotations
 
-import math
-from typing import Final
+from collections.abc import Mapping
 
 import numpy as np
 
 from merge_sumo.metrics.outcome import Prediction
 from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.batch import ROUNDS, LevelSearch
+from merge_sumo.samplers.batch import LevelSearch, Proposal
 from merge_sumo.samplers.candidates import spread_out
-from merge_sumo.samplers.greedy import Proposal
 from merge_sumo.samplers.predictor import gain_factor, model_weight
 from merge_sumo.scenario.case import Case, FloatArray
-
-FIRST_BATCH: Final = 10
-YOUNG: Final = 60
-YOUNG_BATCH: Final = 5
-"""Cases of the first batch; cases of a level up to which its batches are small, and their size: the
-first outcomes change the next proposals most."""
-BATCHES: Final = ((100, 10, 5), (400, 20, 10), (math.inf, 40, 20))
-"""Later batches: cases up to which a size holds, the size, and the least number per level."""
-WORTHLESS: Final = 0.05
-JUDGED_FROM: Final = 40
-"""A model with less weight than that, after so many cases, proposes no candidates."""
-EMPTY_FROM: Final = 20
-"""Cases without a failure at a level from which every second one is of a space-filling sequence."""
 
 
 class CoverageSampler(Sampler):
@@ -53,17 +38,14 @@ class CoverageSampler(Sampler):
         # One thread: rounding must not depend on the number of cores.
         with threadpool_limits(1):
             weight = model_weight(self.observed()) if self.predictor is not None else 0.0
-            searches = {
-                level: LevelSearch(
-                    self.history(level), self.pending(level), weight, self.rng(level)
-                )
-                for level in self.pool.levels
-            }
+            searches = {}
+            for level in self.pool.levels:
+                history, pending = self.history(level), self.pending(level)
+                searches[level] = LevelSearch(history, pending, weight, self.rng(level))
             proposals = self._proposals(searches, weight, n)
-            chosen = {
-                level: proposals[level].points[:share]
-                for level, share in self._shares(proposals, n).items()
-            }
+            chosen = {}
+            for level, share in self._shares(proposals, n).items():
+                chosen[level] = proposals[level].points[:share]
             self._predictions = self._predicted(searches, chosen)
         cases: list[Case] = []
         for level, points in chosen.items():
@@ -78,17 +60,21 @@ class CoverageSampler(Sampler):
         """Return the size of the next batch: small while each outcome changes the model most."""
         proposed, levels = self.proposed(), len(self.pool.levels)
         if not proposed:
-            return max(FIRST_BATCH, YOUNG_BATCH * levels)
-        if proposed < YOUNG * levels:
-            return YOUNG_BATCH * levels
-        most, a_level = next(sizes for until, *sizes in BATCHES if proposed < until)
-        return max(most, a_level * levels)
+            return max(10, 5 * levels)
+        if proposed < 60 * levels:
+            return 5 * levels
+        if proposed < 100:
+            return max(10, 5 * levels)
+        if proposed < 400:
+            return max(20, 10 * levels)
+        return max(40, 20 * levels)
 
     def _proposals(
         self, searches: dict[int, LevelSearch], weight: float, n: int
     ) -> dict[int, Proposal]:
         """Return a batch of `n` cases for each level."""
-        worthless = weight < WORTHLESS and len(self.observed()) >= JUDGED_FROM
+        # A model whose predictions did not come true proposes no candidates.
+        worthless = weight < 0.05 and len(self.observed()) >= 40
         guided = {}
         for level, search in searches.items():
             if self._is_modelled(level) and not (worthless and search.surrogate is not None):
@@ -108,7 +94,8 @@ class CoverageSampler(Sampler):
                 proposals[level] = Proposal(points, np.ones(n))
                 continue
             outcomes, points = self.observed(level), proposal.points
-            if len(outcomes) >= EMPTY_FROM and not any(outcome.failed for outcome in outcomes):
+            if len(outcomes) >= 20 and not any(outcome.failed for outcome in outcomes):
+                # Every second case is of a space-filling sequence until one fails.
                 begun, points = self.proposed(level), points.copy()
                 rng = np.random.default_rng([self.seed, level])
                 points[1::2] = spread_out(begun + n // 2, search.history.dims, rng)[begun:]
@@ -123,12 +110,13 @@ class CoverageSampler(Sampler):
         gaps = self.predictor.predict(points, self.proposed() % self.predictor.members)
         for level, search in searches.items():
             points[level] = search.first(points[level], gaps[level], n)
-        for round_ in range(1 + ROUNDS):
-            if round_:
-                points = {level: search.refined(n) for level, search in searches.items()}
+        # Three rounds of candidates around the best ones follow.
+        for rounds_left in (3, 2, 1, 0):
             gaps = self.predictor.predict(points)
             for level, search in searches.items():
                 search.add(points[level], gaps[level])
+                if rounds_left:
+                    points[level] = search.refined(n)
 
     def _is_modelled(self, level: int) -> bool:
         return self.predictor is not None and self.predictor.can_predict(level)
@@ -137,8 +125,13 @@ class CoverageSampler(Sampler):
         self, searches: dict[int, LevelSearch], chosen: dict[int, FloatArray]
     ) -> list[Prediction | None]:
         """Return the predictions of chosen cases by level, (n, d) each, as they are recorded."""
-        points = {level: of for level, of in chosen.items() if len(of) and self._is_modelled(level)}
-        gaps = self.predictor.predict(points) if self.predictor is not None and points else {}
+        points = {}
+        for level, of_level in chosen.items():
+            if len(of_level) and self._is_modelled(level):
+                points[level] = of_level
+        gaps: Mapping[int, FloatArray] = {}
+        if self.predictor is not None and points:
+            gaps = self.predictor.predict(points)
         predictions: list[Prediction | None] = []
         for level, of_level in chosen.items():
             if level not in points:

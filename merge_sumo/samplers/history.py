@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,5 +74,7 @@ def most_informative(history: LevelHistory, most: int) -> LevelHistory:
     rest = np.sort(order[half:])
     evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
     chosen = np.sort(np.concatenate([order[:half], rest[evenly]]))
-    columns = [getattr(history, column.name)[chosen] for column in fields(history)[:-1]]
-    return LevelHistory(*columns, varies=history.varies)
+    columns: dict[str, Any] = {}
+    for column in fields(history)[:-1]:
+        columns[column.name] = getattr(history, column.name)[chosen]
+    return replace(history, **columns)

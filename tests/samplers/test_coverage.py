@@ -18,9 +18,12 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import (
+    EVEN_IF_COVERED,
     NEAREST,
     PATIENCE,
+    PICKED,
     LevelSearch,
+    greedy,
     near_miss_limit,
 )
 from merge_sumo.samplers.coverage_grid import CoverageGrid
@@ -29,7 +32,6 @@ from merge_sumo.samplers.failure_probability import (
     fit_logistic,
     learned_values,
 )
-from merge_sumo.samplers.greedy import EVEN_IF_COVERED, PICKED, greedy
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23

@@ -14,6 +14,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -50,7 +51,7 @@ class TestTheRegistry:
             assert word in str(error.value)
 
 
-class ProposedSampler(SAMPLERS["uniform"]):  # type: ignore[misc]
+class ProposedSampler(UniformSampler):
     """A sampler of cases that were proposed before."""
 
     def __init__(self, *proposed: int) -> None:
