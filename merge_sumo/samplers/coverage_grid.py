@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from functools import lru_cache
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -18,15 +18,8 @@ from scipy.spatial import cKDTree
 from merge_sumo.metrics.fmc import RADIUS, IntArray, ball_volume, radius_for
 from merge_sumo.scenario.case import FloatArray
 
-CELL: Final = {2: 0.01, 3: 0.0125}
-"""Spacing of the grid, by the number of dimensions."""
-FINE_CELL: Final = {**CELL, 2: 0.0025}
-"""Spacing that resolves slivers, which are the gain of a case late in a search; in two dimensions
-such a grid is cheap."""
-PLACES_PER_BALL: Final = 64
-"""Nodes in a ball without a grid."""
-MARGIN: Final = 1.1
-"""Margin of nodes around the unit cube, in radii."""
+# Nodes in a ball without a grid.
+NODES_PER_BALL = 64
 
 
 class CoverageGrid:
@@ -41,15 +34,18 @@ class CoverageGrid:
 
         Args:
             dims: number of dimensions.
-            coarse: whether the grid is of CELL, and a ball of more than three dimensions as large,
-                by volume, as one of three.
+            coarse: whether the nodes are .01 apart in two dimensions, and a ball of more than three
+                has the volume of one of three.
         """
-        cell, radius = (CELL if coarse else FINE_CELL).get(dims), radius_for(dims)
+        # A fine grid resolves slivers, the gain of a case late in a search. It is cheap in two
+        # dimensions.
+        cell = {2: 0.01 if coarse else 0.0025, 3: 0.0125}.get(dims)
+        radius = radius_for(dims)
         if coarse and dims > 3:
             radius = (RADIUS**3 * ball_volume(3) / ball_volume(dims)) ** (1.0 / dims)
-        self._places = _places(dims, cell, radius)
-        self.overlap: Final = self._places.overlap
-        self._open = np.ones(self._places.count, dtype=np.float32)
+        self._nodes = _nodes(dims, cell, radius)
+        self.overlap = self._nodes.overlap
+        self._open = np.ones(self._nodes.count, dtype=np.float32)
 
     def copy(self) -> Self:
         """Return a grid that is covered as this one is."""
@@ -59,7 +55,7 @@ class CoverageGrid:
 
     def balls(self, points: FloatArray) -> IntArray:
         """Return the nodes of the ball around each point, (n, nodes)."""
-        return self._places.balls(points)
+        return self._nodes.balls(points)
 
     def new(self, balls: IntArray) -> FloatArray:
         """Return the expected share of each ball that is not covered, (n,)."""
@@ -97,16 +93,17 @@ class _Scattered:
         from scipy.stats.qmc import Halton
 
         self.overlap = math.inf
-        margin = MARGIN * radius
-        density = PLACES_PER_BALL / (ball_volume(dims) * radius**dims)
+        # Margin of nodes around the unit cube.
+        margin = 1.1 * radius
+        density = NODES_PER_BALL / (ball_volume(dims) * radius**dims)
         self.count = round(density * (1.0 + 2.0 * margin) ** dims)
         sequence = Halton(dims, seed=np.random.default_rng(dims)).random(self.count)
         self._tree = cKDTree(sequence * (1.0 + 2.0 * margin) - margin)
 
     def balls(self, points: FloatArray) -> IntArray:
-        return np.asarray(self._tree.query(points, k=PLACES_PER_BALL)[1], dtype=np.int64)
+        return np.asarray(self._tree.query(points, k=NODES_PER_BALL)[1], dtype=np.int64)
 
 
 @lru_cache
-def _places(dims: int, cell: float | None, radius: float) -> _Grid | _Scattered:
+def _nodes(dims: int, cell: float | None, radius: float) -> _Grid | _Scattered:
     return _Scattered(dims, radius) if cell is None else _Grid(dims, cell)

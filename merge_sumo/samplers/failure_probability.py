@@ -1,26 +1,12 @@
-"""Failure probability model of `coverage`: P(fail) of a case, from the outcomes so far.
+"""The surrogate of `coverage`: P(fail) of a case, learned from the outcomes.
 
-A case fails where the signed gap at M, in units of the scenario's limit, is within 1. Failures lie
-where the gap changes its sign, that is, where the merging order changes. There the gap may also
-jump, so that no case between the two sides fails.
-
-Two Gaussian processes on the gap (or on the margin, of a VUT that gives no trajectory), a smooth
-and a rough one, predict each case from all others, and are weighted by how well they do. Two
-corrections are fitted to these predictions. First, P(fail) of a case that is bracketed, with the
-nearest safe case of either merging order nearer than any failure, is multiplied by h / (h + w): h
-is the width of the bracket, w the typical width of what fails. That bisects the curve where the
-order changes, and gives up where the gap jumps. Then a logistic regression corrects the odds by the
-distances to the nearest failure and to that curve.
-
-Where runs of a case differ, P(fail) is that of a run: the processes learn a noise, too, and the
-corrections are fitted to k failures of n runs.
+A case fails where the signed gap at M, in units of the scenario's limit, is within 1.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,29 +19,39 @@ from merge_sumo.samplers.gaussian_process import GaussianProcess
 from merge_sumo.samplers.history import LevelHistory, most_informative
 from merge_sumo.scenario.case import FloatArray
 
-MAX_LEARNED: Final = 500
-"""Cases that the process learns from; bounds the time per batch in a long campaign. The FMC
-after 1,100 cases of design2 at level 2 is .0207 and .0209 (seeds 1, 2); with 1000 .0208, .0214."""
-NEAR: Final = 0.005
-"""Distances below this count as this."""
-PRIOR_WEIGHTS: Final = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
-"""Prior mean and standard deviation of the weights of the log odds, of 1, and of the log distances
-to the nearest failure and to the curve."""
-NEWTON_STEPS: Final = 6
-WIDTHS: Final = np.geomspace(0.001, 0.5, 25)
-LOG_PRIOR_WIDTH: Final = (np.log(0.02), 1.5)
-"""Widths w that are tried, and prior mean and standard deviation of log w."""
-SURE: Final = 1e-3
-"""Probabilities are clipped this far from 0 and 1; also the smallest Newton step."""
-JUDGED_FROM: Final = 3
-"""Fewest failures, and fewest safe cases, for a published P(fail)."""
+# Prior mean and standard deviation of the weights of the log odds, of 1, and of the log distances
+# to the nearest failure and to the curve where the merging order changes.
+PRIOR_WEIGHTS = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
+# Candidate widths w of failing intervals.
+WIDTHS = np.geomspace(0.001, 0.5, 25)
+# Distance of probabilities from 0 and 1, at least; also the smallest Newton step.
+SURE = 1e-3
+# Fewest failures, and fewest safe cases, for a published P(fail).
+JUDGED_FROM = 3
 
 
 class FailureProbability:
     """P(fail) of the cases of a level.
 
+    Failures lie where the gap changes its sign, that is, where the merging order changes. There the
+    gap may also jump, so that no case between the two sides fails.
+
+    Two Gaussian processes learn the gap (or the margin, of a VUT without trajectories): a smooth
+    and a rough one, weighted by their predictions of each case from all others. Two corrections are
+    fitted to these predictions:
+
+    - A case is bracketed where the nearest safe case of either merging order is nearer than any
+      failure. Its P(fail) is multiplied by h / (h + w), with the width h of the bracket and the
+      typical width w of failing intervals. That bisects the curve where the order changes, and
+      leaves it where the gap jumps.
+    - A logistic regression corrects the odds by the distances to the nearest failure and to that
+      curve.
+
+    Where runs of a case differ, P(fail) is that of a run: the processes learn a noise, too, and the
+    corrections are fitted to k failures of n runs.
+
     Attributes:
-        history: what it was learned from.
+        history: the outcomes.
         groups: which cases failed, and which safe ones are of either merging order, each (N,).
         slope: mean slope of the gap, or of the margin, (d,), of length 1.
     """
@@ -72,10 +68,12 @@ class FailureProbability:
             history = replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
         self.history = history
         self.groups = _groups(history)
-        learned = most_informative(history, MAX_LEARNED)
+        # 500 cases bound the time for a batch in a long campaign. The FMC after 1,100 cases of
+        # design2 at level 2 is .0207 and .0209 (seeds 1, 2); with 1,000 .0208 and .0214.
+        learned = most_informative(history, 500)
         values, *self._interval = learned_values(learned, limit)
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
-        log_prior = -0.5 * ((np.log(WIDTHS) - LOG_PRIOR_WIDTH[0]) / LOG_PRIOR_WIDTH[1]) ** 2
+        log_prior = -0.5 * (np.log(WIDTHS / 0.02) / 1.5) ** 2
         self._fitted: list[tuple[GaussianProcess, float, FloatArray]] = []
         posteriors = []
         for rough in (False, True):
@@ -91,13 +89,12 @@ class FailureProbability:
 
     def predict(self, points: FloatArray) -> FloatArray:
         """Return P(fail) of a run of cases, (m, d), as (m,)."""
-        known = self.history.points
-        distances = [nearest(points, known[group]) for group in self.groups]
+        distances = [nearest(points, self.history.points[group]) for group in self.groups]
         chances = []
         for process, width, weights in self._fitted:
             chance = _lowered(self._within(*process.predict(points)), distances, width)
             chances.append(expit(_evidence(chance, distances, self.history.dims) @ weights))
-        return np.asarray(np.average(chances, axis=0, weights=self._weights), dtype=np.float64)
+        return np.average(chances, axis=0, weights=self._weights)
 
     def _within(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
         """Return the probability that a normal value is in the failing interval, (m,)."""
@@ -120,11 +117,10 @@ def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | 
 def learned_values(
     history: LevelHistory, limit: float | None = None
 ) -> tuple[FloatArray, float, float]:
-    """Return what is learned, (N,), and the interval of it that means failure.
+    """Return the values to learn, (N,), and the interval of them that means failure.
 
-    The signed gap in units of the limit, compressed like a logarithm where it is large: a
-    gap of 100 m says little more about failures than one of 50 m. Without gaps, the badness in
-    units of that at the limit.
+    They are the signed gaps in units of the limit, compressed like a logarithm: a gap of 100 m says
+    little more about failures than one of 50 m. Without gaps they follow from the margins.
     """
     if not history.has_gaps:
         return np.minimum((1.0 - history.margin) / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
@@ -133,7 +129,7 @@ def learned_values(
 
 
 def nearness(history: LevelHistory) -> FloatArray:
-    """Return the size of the gap, or else the margin, (N,): the less, the nearer to a failure."""
+    """Return the size of the gap, or else the margin, (N,): a failure has a small one."""
     if not history.has_gaps:
         return history.margin
     return np.abs(np.nan_to_num(history.gap, nan=NO_GAP))
@@ -143,7 +139,8 @@ def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
     """Return the distance of each point to the nearest of the others; 1 where there is none."""
     if not len(others):
         return np.ones(len(points))
-    return np.asarray(cKDTree(others).query(points)[0], dtype=np.float64)
+    distance: FloatArray = cKDTree(others).query(points)[0]
+    return distance
 
 
 def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
@@ -185,7 +182,8 @@ def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> Flo
     odds = logit(np.clip(chance, SURE, 1.0 - SURE))
     columns = [odds, np.ones_like(odds)]
     for distance in (to_failing, np.maximum(before, behind)):
-        log_distance = np.log((distance + NEAR) / (radius + NEAR))
+        # Smaller distances than .005 hardly differ.
+        log_distance = np.log((distance + 0.005) / (radius + 0.005))
         columns.append(np.broadcast_to(log_distance, odds.shape))
     return np.stack(columns, axis=-1)
 
@@ -197,8 +195,8 @@ def fit_logistic(
 
     Args:
         evidence: inputs of each regression, (W, N, 4).
-        failures: number of failures, (N,), in so many
-        runs: (N,).
+        failures: number of failures of each case, (N,).
+        runs: number of its runs, (N,).
 
     Returns:
         Weights, (W, 4), and log posterior densities, (W,).
@@ -209,19 +207,23 @@ def fit_logistic(
         prior = -0.5 * np.square((weights - mean) / deviation).sum(axis=1)
         odds = (evidence @ weights[..., None])[..., 0]
         likelihood = failures * log_expit(odds) + (runs - failures) * log_expit(-odds)
-        return np.asarray(likelihood.sum(axis=1) + prior, dtype=np.float64)
+        density: FloatArray = likelihood.sum(axis=1) + prior
+        return density
 
     weights = np.tile(mean, (len(evidence), 1))
     best = posterior(evidence, weights)
     active = np.arange(len(evidence))
-    for _ in range(NEWTON_STEPS):
+    for _ in range(6):
         inputs, now = evidence[active], weights[active]
         chance = expit((inputs @ now[..., None])[..., 0])
         slope = ((failures - runs * chance)[:, None] @ inputs)[:, 0] - (now - mean) / deviation**2
         spread = (inputs * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ inputs
         step = np.linalg.solve(spread + np.diag(deviation**-2.0), slope[..., None])[..., 0]
         reached = posterior(inputs, now + step)
-        while (worse := (reached < best[active]) & (np.abs(step).max(axis=1) > SURE)).any():
+        while True:
+            worse = (reached < best[active]) & (np.abs(step).max(axis=1) > SURE)
+            if not worse.any():
+                break
             step[worse] *= 0.5
             reached[worse] = posterior(inputs[worse], now[worse] + step[worse])
         better = reached > best[active]
