@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, fields
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from cyclopts import App, CycloptsError, Group, Parameter, Token
+from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliTokensError
 
 import merge_sumo as ms
 from merge_sumo import config as c
@@ -41,13 +41,13 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-OPTIONS: Final = Group.create_ordered("Options")
-TESTED: Final = Group.create_ordered("What is tested")
-FAILURE: Final = Group.create_ordered("What counts as a failure")
-CASES: Final = Group.create_ordered("Which cases run")
-PLACE: Final = Group.create_ordered("Where it runs")
-DRIVERS: Final = Group.create_ordered("Drivers and limits")
-GROUPS: Final[Mapping[type[Any], Group]] = {
+OPTIONS = Group.create_ordered("Options")
+TESTED = Group.create_ordered("What is tested")
+FAILURE = Group.create_ordered("What counts as a failure")
+CASES = Group.create_ordered("Which cases run")
+PLACE = Group.create_ordered("Where it runs")
+DRIVERS = Group.create_ordered("Drivers and limits")
+GROUPS: Mapping[type[Any], Group] = {
     c.Test: TESTED,
     c.ScenarioChanges: TESTED,
     c.Levels: TESTED,
@@ -60,7 +60,7 @@ GROUPS: Final[Mapping[type[Any], Group]] = {
     c.Policies: DRIVERS,
 }
 """Groups of options in help, by the class that declares the field."""
-FIELDS: Final[Mapping[str, Parameter]] = {
+FIELDS: Mapping[str, Parameter] = {
     "progress": Parameter(negative=("--quiet", "-q")),
     "workers": Parameter(show_default=False),
     # Edges of nets of OpenDRIVE and OSM begin with a hyphen.
@@ -71,7 +71,7 @@ FIELDS: Final[Mapping[str, Parameter]] = {
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
     Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
 )
-GONE: Final[Mapping[str, str]] = {
+GONE: Mapping[str, str] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
     "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
@@ -83,7 +83,7 @@ GONE: Final[Mapping[str, str]] = {
     "bounds how much of the pool can fail",
 }
 """What replaces a command of an earlier version, by its name."""
-FAULT: Final = 70
+FAULT = 70
 """Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
 
 Options = Annotated[T, Parameter(name="*")]
@@ -234,7 +234,10 @@ def run(
     *,
     at: Annotated[
         list[str] | None,
-        Parameter(help="Any coordinate of the case, by its name in outcomes.jsonl: NAME=NUMBER."),
+        Parameter(
+            consume_multiple=True,
+            help="Any coordinates of the case, by their names in outcomes.jsonl: NAME=NUMBER.",
+        ),
     ] = None,
     json: Json = False,
 ) -> int:
@@ -254,8 +257,11 @@ def _coordinates(words: Sequence[str]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in words:
         name, _, number = text.partition("=")
+        name = name.strip()
+        if name in values:
+            raise UserError(f"--at has {name} twice: give the coordinate once")
         try:
-            values[name.strip()] = float(number)
+            values[name] = float(number)
         except ValueError:
             raise UserError(f"--at {text}: give NAME=NUMBER, as x_pov0_m=-250") from None
     return values
@@ -388,6 +394,11 @@ def execute(words: Sequence[str]) -> int:
     try:
         with notices_printed():
             return app(words) or 0
+    except UnusedCliTokensError as error:
+        unused = " ".join(map(quoted, error.unused_tokens or ()))
+        raise UserError(
+            f"too many arguments: {unused}; `merge-sumo {words[0]} --help` lists them"
+        ) from error
     except CycloptsError as error:
         raise UserError(str(error)) from error
     except SystemExit as ended:

@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from io import TextIOWrapper
-from typing import TYPE_CHECKING, Any, Final, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from merge_sumo import config
 from merge_sumo.errors import Notice, UserError, WorkersLostError
@@ -25,7 +25,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 if TYPE_CHECKING:
     from merge_sumo.result import Result
 
-FLAGS: Final[Mapping[str, str]] = {
+FLAGS: Mapping[str, str] = {
     "deadline_s": "--deadline",
     "vut_memory_gib": "--vut-memory",
     "follow_up_s": "--follow-up",

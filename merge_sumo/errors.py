@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 import warnings
 from types import FrameType
-from typing import Final
 
-MOST_CHARACTERS: Final = 10_000
+MOST_CHARACTERS = 10_000
 """Maximum length of a sentence: it may quote a received file."""
 
 

@@ -27,26 +27,26 @@ from datetime import datetime
 from functools import cache, lru_cache
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import BinaryIO
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable, quoted
 
-TEMPORARY: Final = ".merge-sumo-"
+TEMPORARY = ".merge-sumo-"
 """Begin of the names under which files are written."""
-LONG_NAME: Final = "x" * 64
+LONG_NAME = "x" * 64
 """As long as the name of a file that is written into a new folder."""
-GENERATOR: Final = b'<meta name="generator" content="merge-sumo">'
-DEFAULT: Final = Path("runs")
+GENERATOR = b'<meta name="generator" content="merge-sumo">'
+DEFAULT = Path("runs")
 """Folder of runs without a name."""
-LATEST: Final = "latest"
-CACHE: Final = "MERGE_SUMO_CACHE"
-DATED: Final = re.compile(r"[\w.-]*-[0-9]{8}-[0-9]{6}(-[0-9]+)?")
+LATEST = "latest"
+CACHE = "MERGE_SUMO_CACHE"
+DATED = re.compile(r"[\w.-]*-[0-9]{8}-[0-9]{6}(-[0-9]+)?")
 """The names that `dated` gives."""
-_HERE: Final = hashlib.sha256(platform.node().encode(errors="replace")).hexdigest()[:8]
+_HERE = hashlib.sha256(platform.node().encode(errors="replace")).hexdigest()[:8]
 """This machine: a lock in a folder that several machines share may mean nothing to the others."""
-PREFIX: Final = f"merge-sumo-{_HERE}-"
-YOUNG_S: Final = 60.0
+PREFIX = f"merge-sumo-{_HERE}-"
+YOUNG_S = 60.0
 """Age, in s, from which on a folder without a lock is one of a process that is gone."""
 
 

@@ -13,13 +13,13 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
-from typing import Any, Final, Self
+from typing import Any, Self
 
-SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-ENDING: Final = ("SIGTERM", "SIGHUP")
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+ENDING = ("SIGTERM", "SIGHUP")
 """SIGHUP comes when a terminal is closed; not every platform has it."""
-STDERR: Final = 2
-PATIENCE_S: Final = 5.0
+STDERR = 2
+PATIENCE_S = 5.0
 """Seconds after SIGTERM in which what is running may end."""
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import errno
 from contextlib import suppress
-from typing import Final
 
 from merge_sumo.errors import UserError
 
-ADDRESS_SPACE_GIB: Final = 2.0
+ADDRESS_SPACE_GIB = 2.0
 """Below this SUMO, or the libraries of linear algebra, end the process without a word."""
-EXHAUSTED: Final = {
+EXHAUSTED = {
     errno.EMFILE: "too many files are open: raise the limit (`ulimit -n`)",
     errno.ENFILE: "too many files are open in the whole system: close some of its programs",
     errno.EAGAIN: "the system starts no more processes or threads: raise the limit (`ulimit -u`)",

@@ -24,7 +24,6 @@ from typing import (
     Annotated,
     Any,
     ClassVar,
-    Final,
     Literal,
     TypeVar,
     Union,
@@ -44,7 +43,7 @@ from merge_sumo.printable import meant
 
 T = TypeVar("T")
 
-WORDS: Final[dict[Any, str]] = {
+WORDS: dict[Any, str] = {
     bool: "True or False",
     int: "a whole number",
     float: "a number",
@@ -55,11 +54,11 @@ WORDS: Final[dict[Any, str]] = {
     tuple[str, ...]: "a list of texts",
 }
 """Types of fields in words; another type is a table of names and values."""
-MAX_RECORD_BYTES: Final = 1 << 28
+MAX_RECORD_BYTES = 1 << 28
 """A larger JSON file is not read."""
-MAX_TOML_BYTES: Final = 1 << 20
+MAX_TOML_BYTES = 1 << 20
 """A larger file is not read, and so not written: some 6,000 cases."""
-_NAMED: Final = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
+_NAMED = re.compile(r"Object (missing required|contains unknown) field `(.*?)`", re.DOTALL)
 
 
 class RecordError(UserError):

@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Final, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
 
 T = TypeVar("T")
 
-OURS: Final = "merge-sumo"
+OURS = "merge-sumo"
 
 
 class Registry(Mapping[str, T], Generic[T]):

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from functools import cached_property
 from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
@@ -39,15 +39,15 @@ from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-MOST_ROWS: Final = 20
+MOST_ROWS = 20
 """Rows that a notebook shows of a table."""
-PLACE: Final = ("index", "level")
-VERDICT: Final = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
+PLACE = ("index", "level")
+VERDICT = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
 """Columns that it shows before and behind the coordinates of the case; the rows hold all of
 `outcomes.jsonl`."""
 
 
-FACTS: Final = ("cases that ran more than once",)
+FACTS = ("cases that ran more than once",)
 """Facts that the terminal lists with the headline, where there are any."""
 
 

@@ -13,16 +13,16 @@ import signal
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any
 
-BOOT: Final = (
+BOOT = (
     "import json, sys; settings = json.loads(sys.argv[-1]); sys.path[:] = settings['path']; "
     f"from {__name__} import named; named(settings['main'])(settings)"
 )
-NAMES: Final = ("__file__", "__spec__")
+NAMES = ("__file__", "__spec__")
 """By which `multiprocessing` finds the main module."""
-SAFE_PATH: Final = "PYTHONSAFEPATH"
-OURS: Final = "merge-sumo"
+SAFE_PATH = "PYTHONSAFEPATH"
+OURS = "merge-sumo"
 """Its value where we have set it: any text does."""
 
 

@@ -22,20 +22,20 @@ from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from numbers import Integral
-from typing import Any, Final, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from merge_sumo.errors import UserError, WorkersLostError, notice
 from merge_sumo.files import ScratchFolder
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 
-MAX_CHUNK: Final = 500
+MAX_CHUNK = 500
 """Items that a worker takes at a time; what bounds its memory."""
-DASK_TIMEOUT_S: Final = 30.0
-CHUNKS_AHEAD: Final = 16
+DASK_TIMEOUT_S = 30.0
+CHUNKS_AHEAD = 16
 """Chunks for each worker that `Workers.run` submits before it collects the first."""
-POLL_S: Final = 5.0
+POLL_S = 5.0
 """Time between two looks at the connection while a result is waited for."""
-LOST: Final = "lost the connection to the Dask workers; check the cluster"
+LOST = "lost the connection to the Dask workers; check the cluster"
 
 T = TypeVar("T")
 R = TypeVar("R")

@@ -12,7 +12,7 @@ import sysconfig
 from collections.abc import Iterator, Mapping, Sequence
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import parse
@@ -23,8 +23,8 @@ from merge_sumo.printable import quoted
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import US23, Scenario
 
-CONTROLLERS: Final = ("vut", "pov", "against")
-OPTIONS: Final = {"run": ("run", "case"), "resume": ("campaign", "resume")}
+CONTROLLERS = ("vut", "pov", "against")
+OPTIONS = {"run": ("run", "case"), "resume": ("campaign", "resume")}
 """Verbs of a recorded campaign that are a command with an option."""
 
 Argument = str | Path | int | float | Sequence[int] | Mapping[str, float]

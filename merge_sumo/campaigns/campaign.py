@@ -29,8 +29,8 @@ from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
 from merge_sumo.workers import Workers, workers_or_here
 
-EXPORTED_FAILURES: Final = 10
-SCENARIOS: Final = "scenarios"
+EXPORTED_FAILURES = 10
+SCENARIOS = "scenarios"
 FIRST_BATCH: Final = 5
 """Cases of each level in the first batch where models of two versions predict, which they do from
 four cases on. Measured with design2 and design2?x1_m=120 at level 2, seeds 0 to 4: after 40 cases

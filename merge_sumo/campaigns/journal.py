@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import to_json
 from merge_sumo.scenario.signals import to_record
 
-MOST_SYNCS: Final = 8
+MOST_SYNCS = 8
 """Files that are synced at the same time."""
 
 

@@ -33,7 +33,7 @@ GROUPS: Final = 3
 """Groups in flight: the sampler is asked for one while the cases of others keep workers busy."""
 AGE: Final = 16
 """Cases for each of which one more may be in flight than the sampler wants in a batch."""
-AHEAD_S: Final = 0.5
+AHEAD_S = 0.5
 """Seconds of work for each worker that are submitted together, where the sampler does not learn."""
 
 Groups = list[list[Episode]]

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo import config as c
 from merge_sumo.campaigns.run import Run
@@ -24,7 +24,7 @@ from merge_sumo.scenario.scenario import US23, Scenario, level_name
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.povs import Povs, one_level, own_pov, parse_levels, policies_folder
 
-DEBUG_DEADLINE_S: Final = 86_400.0
+DEBUG_DEADLINE_S = 86_400.0
 """Deadline of a step while a user debugs."""
 
 
@@ -139,7 +139,7 @@ def _new_settings(fields: dict[str, Any]) -> CampaignSettings:
     return CampaignSettings(**fields)
 
 
-ONE: Final[dict[str, Any]] = {
+ONE: dict[str, Any] = {
     "cases": 1,
     "batch": 1,
     "in_flight": None,
@@ -176,10 +176,14 @@ def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, 
     values = {}
     for dimension in settings.scenario.dimensions(level):
         values[dimension.field] = row.get(dimension.field)
+    named = dict(config.at or {})
     for name in c.COORDINATES:
-        if getattr(config, name) is not None:
-            values[name] = getattr(config, name)
-    case = case_of(settings.scenario, level, {**values, **(config.at or {})})
+        value = getattr(config, name)
+        if value is not None and named.setdefault(name, value) != value:
+            raise UserError(
+                f"`{name}` is {value} and `at` has {name}={named[name]}: give the coordinate once"
+            )
+    case = case_of(settings.scenario, level, values | named)
     draw = row.get("draw")
     if draw is None or draw != draw:  # noqa: PLR0124 (NaN of a data frame: the first)
         return settings, case

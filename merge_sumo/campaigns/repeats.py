@@ -34,7 +34,7 @@ from merge_sumo.simulation.evaluate import close_simulator, simulate, submit_cas
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
-REPEATS: Final = "repeats.jsonl"
+REPEATS = "repeats.jsonl"
 MOST: Final = 20
 """Cases that run twice at the end of a campaign, at most,"""
 ONE_IN: Final = 8

@@ -18,7 +18,7 @@ MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""
 SLOWEST: Final = 0.7
 """Of the speed limit: the mainline drives at least so fast."""
-SAME_M: Final = 0.05
+SAME_M = 0.05
 """Coordinates that differ by less are written alike."""
 ROOM: Final = 0.98
 """Of the length of a path that is used."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.campaigns.run import SETTINGS, SharedSettings, has_converged, scenario_of
 from merge_sumo.config import Search, changed
@@ -159,7 +159,7 @@ class CampaignSettings(SharedSettings):
         return Pool(levels=self.levels, scenario=self.scenario)
 
 
-RECORDED_BY_DEFAULT: Final = {
+RECORDED_BY_DEFAULT = {
     **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
     "scenario": US23.to_record(),
 }
@@ -202,7 +202,7 @@ def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
     return same_name and all(one[key] == other[key] for key in deciding)
 
 
-MOST_SHOWN: Final = 200
+MOST_SHOWN = 200
 """Characters of a spec in a message."""
 
 
