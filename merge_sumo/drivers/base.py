@@ -49,7 +49,16 @@ class Scene(NamedTuple):
         x_vut_m: FloatArray,
         v_vut_mps: FloatArray,
     ) -> Scene:
-        """Return the scene of a POV and a VUT, every array of shape (K,)."""
+        """Return the scene of a POV and a VUT.
+
+        Args:
+            active: whether an episode runs in the corridor, (K,).
+            step: steps since it began, (K,).
+            x_pov_m: positions of the POV, (K,).
+            v_pov_mps: its speeds, (K,).
+            x_vut_m: positions of the VUT, (K,).
+            v_vut_mps: its speeds, (K,).
+        """
         return cls(active, step, np.array((x_pov_m, x_vut_m)), np.array((v_pov_mps, v_vut_mps)))
 
     @property

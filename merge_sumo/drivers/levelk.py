@@ -2,7 +2,7 @@
 
 The networks are trained by `merge_sumo.training` with torch; here they act in float64 numpy, so
 that a campaign needs no torch, and each corridor is evaluated on its own, so that an episode does
-not depend on how many others run beside it.
+not depend on concurrent episodes.
 """
 
 from __future__ import annotations
@@ -83,7 +83,16 @@ def features(
     *,
     scenario: Scenario,
 ) -> FloatArray:
-    """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation."""
+    """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation.
+
+    Args:
+        x_pov_m: positions of the POV, (n,).
+        v_pov_mps: its speeds, (n,).
+        x_vut_m: positions of the VUT, (n,).
+        v_vut_mps: its speeds, (n,).
+        svo_rad: social value orientations of the POV, (n,), if the network sees them.
+        scenario: the scenario that is played.
+    """
     state = x_pov_m, v_pov_mps, x_vut_m, v_vut_mps
     return np.stack(feature_columns(*state, svo_rad, scenario=scenario), axis=-1)
 
@@ -107,6 +116,14 @@ def feature_columns(
 
     Times and gaps follow from what vehicles can do in the scenario, and all is measured in its
     units. The numbers below are those of the paper's scenario, whose units are 1.
+
+    Args:
+        x_pov_m: positions of the POV, (n,).
+        v_pov_mps: its speeds, (n,).
+        x_vut_m: positions of the VUT, (n,).
+        v_vut_mps: its speeds, (n,).
+        svo_rad: social value orientations of the POV, (n,), if the network sees them.
+        scenario: the scenario that is played.
     """
     unit = Units.of(scenario)
     times, gaps, v_level0, v_full = prospects(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps, scenario)
@@ -136,6 +153,13 @@ def prospects(
     scenario: Scenario,
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
     """Predict times, gaps and speeds at M for n states, every array of shape (n,).
+
+    Args:
+        x_pov_m: positions of the POV, (n,).
+        v_pov_mps: its speeds, (n,).
+        x_vut_m: positions of the VUT, (n,).
+        v_vut_mps: its speeds, (n,).
+        scenario: the scenario that is played.
 
     Returns:
         The VUT's times to M in s on the level-0 profile, at constant speed and at full
@@ -308,7 +332,7 @@ class LevelKDriver(Driver):
         super().begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the held accelerations, decided anew where a decision is due.
+        """Return the held accelerations, decided again where a decision is due.
 
         They are NaN where an action value is not finite.
         """

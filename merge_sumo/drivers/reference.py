@@ -91,7 +91,7 @@ class RampDriver(Level0Vut):
         self.forget(corridor)
 
     def forget(self, corridors: int | Flags) -> None:
-        """Begin afresh in a corridor, or where a mask, (K,), says so."""
+        """Reset a corridor, or those of a mask, (K,)."""
         self._reacts[corridors] = False
         self._delay_steps[corridors] = 0
         self._conflict_steps[corridors] = 0

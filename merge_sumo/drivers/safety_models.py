@@ -198,7 +198,13 @@ class FsmModel(SafetyModel):
 
 
 def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
-    """Return the time to collision, (K,): 0 where they overlap, infinite where the gap opens."""
+    """Return the time to collision, (K,): 0 where they overlap, infinite where the gap opens.
+
+    Args:
+        gap_m: gaps from bumper to bumper, (K,).
+        v_rear_mps: speeds of the rear vehicle, (K,).
+        v_front_mps: speeds of the front vehicle, (K,).
+    """
     closing = v_rear_mps - v_front_mps
     times = np.where(closing > 0.0, gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
     found: FloatArray = np.where(gap_m <= 0.0, 0.0, times)
@@ -216,6 +222,14 @@ def rss_distance_m(
     """Return the safe distance of RSS, (K,): the rear one accelerates for the response time.
 
     [v_r rho + a rho^2 / 2 + (v_r + rho a)^2 / (2 b_min) - v_f^2 / (2 b_max)]+.
+
+    Args:
+        v_rear_mps: speeds of the rear vehicle v_r, (K,).
+        v_front_mps: speeds of the front vehicle v_f, (K,).
+        response_s: response time rho.
+        accel_mps2: acceleration a of the rear vehicle in that time.
+        brake_min_mps2: its least braking b_min after that, positive.
+        brake_max_mps2: hardest braking b_max of the front vehicle, positive.
     """
     fastest = v_rear_mps + response_s * accel_mps2
     stops_m = v_rear_mps * response_s + 0.5 * accel_mps2 * response_s**2
@@ -246,7 +260,7 @@ class Reaction:
         self._braking_mps2 = np.full(corridors, model.released_mps2)
 
     def forget(self, corridors: int | Flags) -> None:
-        """Begin afresh in some corridors."""
+        """Reset some corridors."""
         self._waited[corridors] = 0
         self._braking_mps2[corridors] = self._model.released_mps2
 

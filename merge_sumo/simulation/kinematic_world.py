@@ -45,7 +45,10 @@ class EquationWorld:
     ) -> None:
         """Put the vehicles of a corridor where an episode starts.
 
-        `starts` are (x in m, v in m/s) in the order of rows. `own` is for a `World` alone.
+        Args:
+            corridor: the corridor.
+            starts: (x in m, v in m/s) of each vehicle, in the order of rows.
+            own: for a `World` alone.
         """
         for row, (x, v) in enumerate(starts):
             self.x_m[row, corridor], self.v_mps[row, corridor] = x, v

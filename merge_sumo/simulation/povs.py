@@ -1,4 +1,4 @@
-"""The drivers of the POV at each level: a value that every process can be told, and the drivers."""
+"""The drivers of the POV at each level, and the value from which each process opens them."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Povs:
 
     Attributes:
         policies: folder of the networks that drive at levels 1 and 2.
-        own: makes the controller that drives at the level of a person's own; None without one.
+        own: makes the controller that drives at level own; None without one.
     """
 
     policies: Path
@@ -65,11 +65,11 @@ class Povs:
 
     @property
     def files(self) -> Files:
-        """The files of a POV of a person's own, as far as they are known before it drives."""
+        """The files of the user's POV, as far as they are known before it drives."""
         return {} if self.own is None else self.own.files or {}
 
     def with_log(self, log: Path) -> Povs:
-        """Return the same POVs, with what one of a person's own prints added to a file."""
+        """Return the same POVs, with the output of the user's POV added to a file."""
         return self if self.own is None else replace(self, own=self.own.with_log(log))
 
     def corridors(self, asked: int, cars: int) -> int:
@@ -110,9 +110,16 @@ def parse_levels(
     own: bool,
     choice: str = CHOICE,
 ) -> tuple[int, ...]:
-    """Return the levels that a person names in their order: all are those that have a POV.
+    """Return the named levels in their order; "all" are those that have a POV.
 
-    Raises `UserError` for a name of none, and where a POV of a person's own would not drive.
+    Args:
+        asked: names of levels.
+        policies: folder of the networks.
+        own: whether the user brings a POV.
+        choice: the end of the message for an unknown name.
+
+    Raises:
+        UserError: for an unknown name, or if the user's POV would not drive.
     """
     names = names_of_levels(asked)
     if names == ("all",):
@@ -128,14 +135,20 @@ def parse_levels(
 
 
 def one_level(text: str, policies: Path, *, own: bool) -> int:
-    """Return the one level that a person names."""
+    """Return the one level of a name.
+
+    Args:
+        text: the name.
+        policies: folder of the networks.
+        own: whether the user brings a POV.
+    """
     if text == "all" or "," in text:
         raise UserError(f"`level` {text} does not go here: choose {ONE}")
     return parse_levels(text, policies, own=own, choice=ONE)[0]
 
 
 def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
-    """Return the folder of the policies that a person names, else of those for a scenario."""
+    """Return the named folder of policies, by default the shipped one for a scenario."""
     return policies_of(scenario) if policies is None else policies_in(policies)
 
 
@@ -154,7 +167,7 @@ def own_pov(text: str, options: ControllerOptions) -> ControllerKind:
 
 
 class PovLibrary(Driver):
-    """Plays a POV of level 0, 1 or 2, or one of a person's own, corridor by corridor."""
+    """Plays a POV of level 0, 1 or 2, or the user's own, corridor by corridor."""
 
     def __init__(self, corridors: int, povs: Povs, world: World | None = None) -> None:
         """Prepare the drivers of all available levels."""
@@ -196,7 +209,7 @@ class PovLibrary(Driver):
         return self._drivers[int(self._level[corridor])].reason(corridor)
 
     def files(self) -> tuple[Path, ...]:
-        """Return the files that a POV of a person's own has loaded so far."""
+        """Return the files that the user's POV has loaded so far."""
         return self._drivers[OWN].files() if OWN in self._drivers else ()
 
     def close(self) -> None:

@@ -142,7 +142,7 @@ def _simple_returns(game: Game, state: FloatArray) -> FloatArray:
 BestGames = tuple[FloatArray, IntArray]
 """Best returns of a search from n states, (n,), and the actions that lead there, (n, decisions).
 
-Actions are places in `game.actions_mps2`, -1 behind the end of the game.
+Actions are places in `game.actions_mps2`, -1 after the end of the game.
 """
 
 
@@ -154,6 +154,13 @@ def beam_search(
     Every state of the beam is continued by all actions. Of the results, half of the beam goes to
     those with the best reward so far plus the agent's own estimate of the rest, and half to the
     best of each class of predicted gap at M, so that the agent's errors cannot hide an answer.
+
+    Args:
+        game: the game that is searched.
+        state: starting states, (n, 4).
+        svo_rad: psi of the POV, (n,).
+        agent: network that estimates the rest of the reward.
+        width: states in the beam of a case.
     """
     returns, plans = [np.empty(0)], [np.empty((0, game.max_decisions), np.int64)]
     for start in range(0, len(state), _CHUNK):

@@ -1,4 +1,4 @@
-"""Are the drivers rational? Their returns in SUMO beside the best response."""
+"""Regret of the learned drivers: their returns in SUMO compared with the best response."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ CORRIDORS = 32
 
 @dataclass(frozen=True, slots=True)
 class PolicyCheck:
-    """A driver beside its best response, over random cases of the pool.
+    """A driver compared with its best response, over random cases of the pool.
 
     Attributes:
         mean_return: mean return of the driver, played in SUMO.
@@ -72,7 +72,16 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> RewardParts:
 def play(
     cases: list[Case], make_pov: type[Driver] | QNetwork, make_vut: type[Driver] | QNetwork
 ) -> list[Trajectory]:
-    """Play cases of one scenario in SUMO between two drivers; return the trajectories in order."""
+    """Play cases of one scenario in SUMO between two drivers.
+
+    Args:
+        cases: cases of one scenario.
+        make_pov: class of the POV's driver, or the network by which it acts.
+        make_vut: the same of the VUT.
+
+    Returns:
+        The trajectories, in the order of the cases.
+    """
     scenario = cases[0].scenario
     pov, vut = (
         LevelKDriver(CORRIDORS, make) if isinstance(make, QNetwork) else make(CORRIDORS)
@@ -89,7 +98,14 @@ def check_policy(
     *,
     scenario: Scenario,
 ) -> PolicyCheck:
-    """Compare a network with its best response over `count` cases of the pool."""
+    """Compare a network of a folder with its best response.
+
+    Args:
+        name: name of the network, such as "pov1".
+        folder: the folder; by default the shipped policies.
+        count: number of random cases of the pool.
+        scenario: the scenario that is played.
+    """
     opponent = {"pov2": "vut1", "vut2": "pov1"}.get(name)
     known = None if opponent is None else load_network(opponent, folder)
     return check_network(name, load_network(name, folder), known, Reward.of(scenario), count)
@@ -98,7 +114,15 @@ def check_policy(
 def check_network(
     name: str, network: QNetwork, opponent: QNetwork | None, reward: Reward, count: int
 ) -> PolicyCheck:
-    """Compare a network with its best response; `opponent` is None for level 0."""
+    """Compare a network with its best response.
+
+    Args:
+        name: name of the network, such as "pov1".
+        network: the network.
+        opponent: network of its opponent; None for level 0.
+        reward: the reward of the game.
+        count: number of random cases of the pool.
+    """
     level, scenario = 2 if name == "pov2" else 1, of_two(reward.scenario)
     points = np.random.default_rng(20_201).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)

@@ -7,7 +7,7 @@ What differs from the textbook, and why:
   drowns the rest.
 - The target network follows by Polyak averaging, and that average is what is kept.
 - Exploring starts (`game.exploring_starts`).
-- psi is drawn anew for every replayed transition: the reward is stored in its three parts.
+- psi is drawn again for every replayed transition: the reward is stored in its three parts.
 - No discount: every game ends.
 """
 
@@ -116,7 +116,15 @@ class ReplayBuffer:
         after: FloatArray,
         goes_on: np.ndarray,
     ) -> None:
-        """Add a transition per game, as far as there is room."""
+        """Add a transition per game, as far as there is room.
+
+        Args:
+            before: features before the decision, (n, 26).
+            action: actions, (n,).
+            parts: rewards in their three parts, (n, 3).
+            after: features after the decision, (n, 26).
+            goes_on: whether the game continues, (n,).
+        """
         rows = slice(self.filled, min(self.filled + len(action), len(self.action)))
         n = rows.stop - rows.start
         self.before[rows], self.after[rows] = before[:n], after[:n]
@@ -133,7 +141,15 @@ def train(
     sees_svo: bool = False,
     on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> QNetwork:
-    """Train the agent of a game and return its network; same seed, same weights."""
+    """Train the agent of a game and return its network; same seed, same weights.
+
+    Args:
+        game: the game.
+        seed: of the weights and of the games.
+        settings: by default those of the shipped policies.
+        sees_svo: whether the network sees psi of the POV.
+        on_progress: called after every thousand updates.
+    """
     s = settings or DdqnSettings()
     # One thread: the result must not depend on the number of cores.
     torch.set_num_threads(1)

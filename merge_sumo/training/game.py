@@ -67,14 +67,35 @@ class Game:
     def advance(
         self, state: FloatArray, svo_rad: FloatArray, a_mps2: FloatArray
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """Hold accelerations, (n,), for one decision; return states, rewards, and what is over."""
+        """Hold accelerations for one decision.
+
+        Args:
+            state: states, (n, 4).
+            svo_rad: psi of the POV, (n,).
+            a_mps2: accelerations of the agent, (n,).
+
+        Returns:
+            The states after it, (n, 4), the agent's rewards, (n,), and whether each game is over,
+            (n,).
+        """
         after, parts, over = self.decide(state, svo_rad, a_mps2)
         return after, parts.of(self.role, svo_rad), over
 
     def decide(
         self, state: FloatArray, svo_rad: FloatArray, a_mps2: FloatArray
     ) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
-        """Return the same with the rewards in parts; what is over stands at t1."""
+        """Hold accelerations for one decision, with the rewards in parts.
+
+        A game that is over stays in its state at t1.
+
+        Args:
+            state: states, (n, 4).
+            svo_rad: psi of the POV, (n,).
+            a_mps2: accelerations of the agent, (n,).
+
+        Returns:
+            As `advance`.
+        """
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         of_pov, reward = self.role == "pov", self.reward
         learned = None
@@ -115,7 +136,12 @@ class Game:
     ) -> FloatArray:
         """Return the returns, (n,), of playing to the end.
 
-        Where `first` actions are given, they are held for a number of decisions.
+        Args:
+            state: states, (n, 4).
+            svo_rad: psi of the POV, (n,).
+            policy: chooses the actions.
+            first: actions, (n,), that come before those of the policy, if any.
+            held: number of decisions for which these are held.
         """
         returns, index = np.zeros(len(state)), np.arange(len(state))
         actions = self.actions_mps2
@@ -134,9 +160,13 @@ class Game:
     def action_returns(
         self, state: FloatArray, svo_rad: FloatArray, policy: Policy, held: int = 1
     ) -> FloatArray:
-        """Return the returns of each action, (n, 7), held for a number of decisions.
+        """Return the returns of each action, (n, 7), with the policy after it.
 
-        After them the policy goes on.
+        Args:
+            state: states, (n, 4).
+            svo_rad: psi of the POV, (n,).
+            policy: chooses the actions that follow.
+            held: number of decisions for which an action is held.
         """
         repeated, psi = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
         first = np.tile(np.arange(ACTIONS), len(state))
@@ -160,14 +190,27 @@ def greedy(network: QNetwork, scenario: Scenario) -> Policy:
 def inputs_of(
     network: QNetwork, state: FloatArray, svo_rad: FloatArray, scenario: Scenario
 ) -> FloatArray:
-    """Return the inputs of a network in states, (n, 4), with psi, (n,), if it has one."""
+    """Return the inputs of a network, (n, features).
+
+    Args:
+        network: the network.
+        state: states, (n, 4).
+        svo_rad: psi of the POV, (n,), which not every network sees.
+        scenario: the scenario that is played.
+    """
     psi = svo_rad if network.sees_svo else None
     x_pov, v_pov, x_vut, v_vut = state.T
     return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=network.limited(scenario))
 
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
-    """Return `n` starting states, (n, 4), uniform over the pool."""
+    """Return starting states, (n, 4), uniform over the pool.
+
+    Args:
+        n: their number.
+        rng: source of random numbers.
+        scenario: the scenario of the pool.
+    """
     x_pov = rng.uniform(*scenario.x_pov0_m, n)
     v_pov = rng.uniform(*scenario.v_pov0_mps, n)
     v_vut = _starting_speeds(n, rng, scenario)
@@ -187,6 +230,12 @@ def exploring_starts(
     Most of the former are states from which both would reach M together, because that is where
     a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
     drivers there.
+
+    Args:
+        n: number of states.
+        rng: source of random numbers.
+        midway: share of states from mid-way in a game.
+        scenario: the scenario that is played.
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
     x_vut0, a = scenario.x_vut0_m, scenario.level0_a_mps2

@@ -109,11 +109,23 @@ def train_library(
 
     A network that the folder's manifest already has with the same scenario, seed, weights,
     settings and opponent is not trained again, so an interrupted training goes on with what is not
-    finished. Next to each network lies a log, `<name>.training.jsonl`. `a_min_mps2` is the hardest
-    braking of the POVs; the VUTs keep the scenario's limit. Raises `UserError` when the limit is
-    not one of the scenario, the scenario has no road, an opponent is missing or of another
-    scenario, the folder has such a network of another plan, or the folder cannot be written or
-    holds something else.
+    finished. Next to each network lies a log, `<name>.training.jsonl`.
+
+    Args:
+        folder: folder of the networks and their manifest.
+        names: networks that are trained.
+        seed: seed of every network.
+        weights: weights of the reward; by default those of the scenario.
+        settings: settings of every network; by default those of its level.
+        scenario: the scenario that is played.
+        a_min_mps2: hardest braking of the POVs; the VUTs keep the scenario's limit.
+        on_progress: called with the progress of each network.
+        on_done: called with the name of each network and its check, None for one that was there.
+
+    Raises:
+        UserError: if the limit does not fit the scenario, the scenario has no road, an opponent is
+            missing or of another scenario, the folder has such a network of another plan, or the
+            folder cannot be written or has other contents.
     """
     scenario = of_two(scenario)
     if a_min_mps2 is not None and not scenario.a_min_mps2 <= a_min_mps2 < 0.0:

@@ -94,7 +94,15 @@ def refine(
     settings: RefineSettings | None = None,
     on_progress: Callable[[TrainingProgress], None] | None = None,
 ) -> QNetwork:
-    """Return the network, refined for its game; same seed, same weights."""
+    """Return the network, refined for its game; same seed, same weights.
+
+    Args:
+        game: the game.
+        network: a network that `ddqn.train` has trained for it.
+        seed: of starts, exploration and batches.
+        settings: by default those of level 1.
+        on_progress: called after every round.
+    """
     from threadpoolctl import threadpool_limits
 
     s = settings or RefineSettings()
