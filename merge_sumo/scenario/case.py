@@ -216,7 +216,10 @@ class Pool:
 def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> FloatArray:
     """Return the cases of one level as points, (n, d), with the pool's box as the unit cube.
 
-    Where there are no cases, d is that of the scenario.
+    Args:
+        cases: the cases; without any, d is that of the scenario.
+        level: the level of all of them.
+        scenario: their scenario.
     """
     rows, known, dims = [], scenario, scenario.dimensions(level)
     for case in cases:
@@ -227,7 +230,13 @@ def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> Flo
 
 
 def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Case]:
-    """Return the cases at points, (n, d), of the unit cube; the inverse of `to_unit`."""
+    """Return the cases at points of the unit cube; the inverse of `to_unit`.
+
+    Args:
+        points: coordinates between 0 and 1, (n, d).
+        level: the level of the cases.
+        scenario: their scenario.
+    """
     dims = scenario.dimensions(level)
     v_vut0_mps, _ = scenario.bounds("v_vut0_mps")
     cases = []

@@ -172,7 +172,13 @@ ACT: Final = "act"
 
 
 def with_numbers(imperfection: Kind, prefix: str, case: Any) -> Kind:
-    """Return an imperfection with the numbers that a case has for its ranges."""
+    """Return an imperfection with the numbers that a case has for its ranges.
+
+    Args:
+        imperfection: fields that are a number or a range of numbers.
+        prefix: begins the names of these fields in a case.
+        case: the case, with an attribute PREFIX_NAME for each of them.
+    """
     ranged = imperfection.ranged
     if not ranged:
         return imperfection

@@ -153,10 +153,17 @@ class ProgramEnd:
 def run_program(
     name: str, arguments: Sequence[str], folder: Path, limit_s: float | None = PROGRAM_LIMIT_S
 ) -> ProgramEnd:
-    """Run a SUMO program in a folder of ours, and kill it and what it started after `limit_s`.
+    """Run a SUMO program, with the environment of the installation.
 
-    What SUMO takes from the environment is that of the installation. Without a limit, what the
-    program says goes to the terminal. Raises `UserError` where a shared library is missing.
+    Args:
+        name: the program, as "sumo".
+        arguments: its arguments.
+        folder: the folder in which it runs.
+        limit_s: time after which it is killed, with the processes that it started. Without a limit
+            its errors go to the terminal.
+
+    Raises:
+        UserError: the program or a shared library is missing.
     """
     command = [sumo_program(name), *arguments]
     with subprocess.Popen(

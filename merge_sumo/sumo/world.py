@@ -194,8 +194,10 @@ class World:
     ) -> None:
         """Put the vehicles of a corridor where an episode starts, and read them back.
 
-        `starts` are (x in m, v in m/s) of the vehicles in the order of their rows; `own` is whether
-        the cars of the mainline are the tester's own.
+        Args:
+            corridor: number of the corridor.
+            starts: (x in m, v in m/s) of the vehicles in the order of their rows.
+            own: whether the cars of the mainline are the tester's own.
         """
         self._merged[corridor] = False
         for row, (x, v) in enumerate(starts):
