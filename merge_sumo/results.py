@@ -10,6 +10,7 @@ from typing import Any
 
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
+from merge_sumo.analysis.share import SHARES
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
@@ -185,11 +186,19 @@ class CampaignRun(Result):
         return doubts(self.run.cases, self.run.criterion, self.run.settings.in_vain)
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `merge-sumo campaign --json` prints."""
+        """Return what `merge-sumo campaign --json` prints.
+
+        `contacts` counts failures in which bodies touch at or after the merge point; `shares` has
+        the uniform starts of each level, of which `failures` fail and `without_verdict` are not
+        judged; `worst_case` is the index of the failure with the lowest margin.
+        """
+        shares, worst = SHARES.read(self.folder), failures(self.run.cases)
         criterion, at_limits = self.run.criterion, mostly_clipped(self.run.cases)
         return {
             **to_plain(self.summary),
             **self.verdict.to_record(),
+            "worst_case": worst[0].index if worst else None,
+            "shares": [] if shares is None else to_plain(shares.levels),
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",

@@ -71,7 +71,7 @@ class Stratum(Record, frozen=True):
         share: of the cases, as often as they occur.
         cases: fresh cases.
         failures: those of them that fail.
-        without_verdict: those that ended as VUT_ERROR or SIM_ERROR.
+        without_verdict: those that are not judged: errors, and timeouts that are no failures.
         low: lower end of the interval of the share that fails there; they count as safe.
         high: upper end; they count as failures.
     """
@@ -151,6 +151,17 @@ class ProbabilityResult(Result, Record, frozen=True):
     seed: int
     engine: str
     campaign: dict[str, Any]
+
+    @property
+    def without_verdict(self) -> int:
+        """Number of cases that are not judged."""
+        strata = [one for level in self.levels.values() for one in level.strata]
+        return sum(one.without_verdict for one in strata)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether any case is judged: else no probability can be stated."""
+        return self.without_verdict < self.cases
 
 
 PROBABILITY: Final = StudyFile("probability.json", ProbabilityResult)
@@ -286,8 +297,8 @@ def draw(
 
 
 def _judged(episode: Episode) -> tuple[bool, bool, bool]:
-    """Return whether a case failed, had a verdict, and ran in SUMO."""
-    return episode.outcome.failed, episode.outcome.margin is not None, episode.in_sumo
+    """Return whether a case failed, is judged, and ran in SUMO."""
+    return episode.outcome.failed, episode.outcome.is_tested, episode.in_sumo
 
 
 def _named(case: Case) -> dict[str, float]:

@@ -171,7 +171,7 @@ class Study:
                 "nobody can tell what the program behind this VUT loads; this truth is kept "
                 "for its command and the files that are named there"
             )
-        return TruthResult(settings.vut, by_level, settings.criterion)
+        return TruthResult(settings.vut, by_level, settings.criterion, settings.scenario)
 
     def compare(
         self, levels: tuple[int, ...], samplers: Sequence[str], asked: config.Benchmark

@@ -43,7 +43,10 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class LevelShare(Record, frozen=True):
-    """Uniform cases of a POV level, how many of them fail, and how many end as an error."""
+    """Uniform cases of a POV level: how many fail, and how many are not judged.
+
+    A case is not judged after an error, and where the VUT never reached the merge point.
+    """
 
     level: Count
     cases: Count
@@ -94,7 +97,7 @@ def own_shares(run: Run) -> list[LevelShare]:
     for level in run.levels:
         cases = [outcome for outcome in run.cases if outcome.case.level == level]
         failures = sum(outcome.failed and outcome.index not in unsure for outcome in cases)
-        unknown = sum(outcome.margin is None or outcome.index in unsure for outcome in cases)
+        unknown = sum(not outcome.is_tested or outcome.index in unsure for outcome in cases)
         shares.append(LevelShare(level, len(cases), failures, unknown))
     return shares
 
@@ -175,5 +178,5 @@ def uniform_cases(
 
 
 def end_of(episode: Episode) -> tuple[bool, bool]:
-    """Return whether a case fails, and whether it ended as an error."""
-    return episode.outcome.failed, episode.trajectory.end.is_error
+    """Return whether a case fails, and whether it is not judged."""
+    return episode.outcome.failed, not episode.outcome.is_tested

@@ -297,11 +297,13 @@ class TruthResult(Result):
         truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
             points of the `failures`, (m, d).
         criterion: what counts as a failure.
+        scenario: the scenario of the cases.
     """
 
     vut: str
     truths: dict[int, Truth]
     criterion: Criterion
+    scenario: Scenario
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints: that of the level, or sums with a list of the levels."""

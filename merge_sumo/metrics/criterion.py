@@ -46,7 +46,7 @@ class NamedCriterion:
 CRITERIA: Final = {
     PAPER: NamedCriterion(
         "score < -500",
-        "the front bumpers are within 6 m as the VUT reaches M: a contact or a conflict",
+        "front bumpers are within 6 m when the VUT reaches M: a contact or a conflict",
     ),
     "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
     "unsafe": NamedCriterion(
@@ -129,9 +129,16 @@ class Criterion:
         """Whether it is a condition on the score, whose margin may be that of the score."""
         return self.require is None and "score" in condition_of(self.words).names
 
+    def said(self, scenario: Scenario) -> str:
+        """Return when a case of a scenario fails, in the words that a user reads."""
+        if self.is_papers:
+            limit = f"{scenario.dx_crash_m:g} m"
+            return f"front bumpers are within {limit} when the VUT reaches {scenario.goal}"
+        return self.words
+
     @property
     def text(self) -> str:
-        """What a person would write."""
+        """The criterion as a user writes it."""
         return self.fail_when if self.require is None else f"not ({self.require})"
 
     @property

@@ -310,7 +310,7 @@ class Verdict:
         cases: cases that ran.
         failures: cases that fail under the criterion, but for those that are undecided.
         undecided: failing cases that ran too seldom to tell: see `chance.undecided`.
-        contacts: failures in which bodies touch.
+        contacts: failures in which bodies touch at or after the merge point.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
         troubles: errors and timeouts by message: errors first, then the most frequent.

@@ -40,8 +40,6 @@ PROBABLY: Final = "probability that a case fails"
 WORST: Final = "worst case"
 KIND: Final = "kind of the worst case"
 SCATTERED: Final = "scattered"
-FAILING: Final = "margin < 0"
-"""By what a failing line of `outcomes.jsonl` is known; by default its margin is of its score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +159,7 @@ def _not_said(run: Run, of: Mapping[str, Fact], known: set[str]) -> Iterator[str
         more = _counted(of[TOUCH], "more case touches", "more cases touch")
         where = run.scenario.said(" after M") if run.criterion.is_papers else ""
         parts.append(f"{more}{where}, which this rule does not count: `fail_when` unsafe")
-    if not known & {STARTS_THAT_FAIL, PROBABLY}:
+    if PROBABLY not in known and SHARES.read(run.folder) is None:
         measure = again("probability", run.folder, run.record)
         parts.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if parts:
@@ -185,18 +183,21 @@ def _tested(run: Run) -> Iterator[Fact]:
     yield Fact("VUT", run.vut, "", SETTINGS, "vut")
     yield Fact("scenario", run.scenario.name, "", SETTINGS, "scenario.name")
     key = "fail_when" if criterion.require is None else "require"
-    words = criterion.words
-    if criterion.is_papers:
-        limit_m = run.scenario.dx_crash_m
-        words = f"front bumpers are within {limit_m:g} m as the VUT reaches {run.scenario.place}"
-    yield Fact(RULE, words, "", SETTINGS, key)
+    yield Fact(RULE, criterion.said(run.scenario), "", SETTINGS, key)
     sampler = f"{settings.sampler}, seed {settings.seed}"
     yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
+
+
+def _failing(run: Run) -> str:
+    """Return the key of the failing lines of `outcomes.jsonl`: the paper's rule has no margin."""
+    return run.criterion.words if run.criterion.is_papers else "margin < 0"
 
 
 def _shares(run: Run) -> Iterator[Fact]:
     known = SHARES.read(run.folder)
     for one in () if known is None else known.levels:
+        if one.without_verdict == one.cases:
+            continue  # no start was judged: nothing is known of a share
         key = "levels: failures of cases"
         yield Fact(STARTS_THAT_FAIL, one.shown, "", SHARES.name, key, one.level)
         yield Fact(STARTS, one.cases, "", SHARES.name, "levels: cases", one.level)
@@ -216,11 +217,12 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
         yield counted("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
     if verdict.timeouts:
         yield counted("timeouts", verdict.timeouts, "end: TIMEOUT")
-    yield counted("failures", summary.failures, FAILING)
+    failing = _failing(run)
+    yield counted("failures", summary.failures, failing)
     if run.tolerated:
         yield counted(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
-        yield counted("failures with contact", verdict.contacts, f"{FAILING}, severity: contact")
+        yield counted("failures with contact", verdict.contacts, f"{failing}, severity: contact")
     for severity, about in (
         (Severity.CONTACT, TOUCH),
         (Severity.CONFLICT, "cases with a conflict that are no failures"),
@@ -228,7 +230,7 @@ def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
     ):
         number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
         if number:
-            yield counted(about, number, f"severity: {severity}, not {FAILING}")
+            yield counted(about, number, f"severity: {severity}, not {failing}")
 
 
 def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> Iterator[Fact]:
@@ -239,16 +241,17 @@ def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> I
     if untested:
         yield fact("without a verdict", found.cases - found.tested, "end")
     if found.tested or not found.cases:
-        yield fact("failures", found.failures, FAILING)
+        key = _failing(run)
+        yield fact("failures", found.failures, key)
         if run.tolerated:
             yield fact(UNDECIDED, found.undecided, "draw")
         failing = found.failures + found.undecided
         # Failures from which on more than half as many regions are said to be scattered.
         scattered = failing >= 10 and 2 * found.regions > failing
         regions = SCATTERED if scattered else found.regions
-        yield Fact("regions", regions, "", OUTCOMES, f"{FAILING}: starts", level)
+        yield Fact("regions", regions, "", OUTCOMES, f"{key}: starts", level)
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact("FMC", found.fmc, f"{FAILING}: starts within {radius:.2g}")
+        yield fact("FMC", found.fmc, f"{key}: starts within {radius:.2g}")
     if run.scenario.lane_m is not None:
         yield from _of_lane(run, level)
 
@@ -303,14 +306,14 @@ def _motion(run: Run, unsure: set[int]) -> Iterator[Fact]:
     known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
     if known:
         name = "failures that full braking or full acceleration of the VUT avoids"
-        yield Fact(name, sum(known), "", OUTCOMES, f"{FAILING}, avoidable")
+        yield Fact(name, sum(known), "", OUTCOMES, f"{_failing(run)}, avoidable")
     for name, measure, unit in (
         ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
         ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
     ):
         values = [v for o in worst if (v := o.measures.value(measure)) is not None]
         if values:
-            yield Fact(name, max(values), unit, OUTCOMES, f"{FAILING}: {measure}")
+            yield Fact(name, max(values), unit, OUTCOMES, f"{_failing(run)}: {measure}")
 
 
 def _avoided(run: Run, unsure: set[int]) -> Iterator[Fact]:
@@ -337,7 +340,7 @@ def _studies(run: Run) -> Iterator[Fact]:
         name = f"failures that stay failures in all {stress.runs} runs of the stress test"
         yield Fact(name, len(stress.robust), "", STRESS.name, "rungs")
     known = PROBABILITY.read(run.folder)
-    if known is not None and known.overall is not None:
+    if known is not None and known.overall is not None and known.is_judged:
         for name in ("probability", "low", "high"):
             end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
             value, key = 100.0 * getattr(known.overall, name), f"overall.{name}"

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 from merge_sumo.analysis.comparison import (
@@ -39,7 +40,7 @@ from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case, coordinates, described
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
+from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
 FRAGILE: Final = 10
@@ -178,7 +179,7 @@ def truths(found: TruthResult) -> list[str]:
             cases = counted(truth.in_sumo, "case")
             line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
         lines += [line, *(f"  {remark}" for remark in truth_remarks(truth))]
-    return [*lines, f"  a case fails when {found.criterion.words}"]
+    return [*lines, f"  a case fails when {found.criterion.said(found.scenario)}"]
 
 
 def _spread(spread: Spread, form: str) -> str:
@@ -296,6 +297,8 @@ def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
 @lines_of.register
 def probability(found: ProbabilityResult) -> list[str]:
     """Return the probability and its interval, the strata, the levels, and what is counted."""
+    if not found.is_judged:
+        return ["P(fail) is not known: no case was judged, the VUT never reached the merge point"]
     at = f"{100.0 * found.confidence:g} % interval"
     lines = [] if found.per_merge is None else _per_merge(found.per_merge, at)
     if found.overall is not None:
@@ -310,9 +313,13 @@ def probability(found: ProbabilityResult) -> list[str]:
         for level, estimate in found.levels.items():
             lines.append(f"  level {level_name(level)}: P(fail) {_interval(estimate)}")
     criterion = Criterion(found.campaign["fail_when"], found.campaign["require"])
-    lines.append(f"  a case fails when {criterion.words}")
-    if errors := sum(s.without_verdict for e in found.levels.values() for s in e.strata):
-        lines.append(f"  {errors} without a verdict: safe for lower ends, failures for upper")
+    scenario = replace(US23, dx_crash_m=found.campaign["scenario"]["dx_crash_m"])
+    lines.append(f"  a case fails when {criterion.said(scenario)}")
+    if found.without_verdict:
+        lines.append(
+            f"  {found.without_verdict} not judged (error or timeout): safe for lower ends, "
+            "failures for upper"
+        )
     if found.in_sumo < found.cases:
         lines.append(f"  by the equations of motion; {found.in_sumo:,} in SUMO too, all alike")
     return lines

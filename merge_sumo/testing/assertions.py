@@ -34,7 +34,7 @@ def _message(run: CampaignRun, seed: int) -> str | None:
     if run.verdict.tested and not wrong:
         return None
     lines = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
-    lines.append(f"  a case fails when {run.run.criterion.words}")
+    lines.append(f"  a case fails when {run.run.criterion.said(run.run.scenario)}")
     lines += run.verdict.trouble_lines()
     if not run.verdict.tested:
         lines.append(f"  {run.verdict.nothing_tested}")

@@ -148,3 +148,25 @@ def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
     said = f"  {level.shown} of all starts fail, by 10  "
     assert any(said in line for line in run.lines())
     assert not any("not measured" in line for line in run.lines())
+
+
+class Parked:
+    """A VUT that stands on the ramp."""
+
+    def act(self, seen: object) -> float:
+        return -4.5
+
+
+def test_no_share_or_probability_is_stated_of_a_vut_that_never_merges(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = api.campaign(Parked, level=0, cases=4, out="run", progress=False)
+    [level] = SHARES.read(run.folder).levels
+    assert level.failures == 0
+    assert level.without_verdict == level.cases
+    assert not any("of all starts fail" in line for line in run.lines())
+    record = run.to_record()
+    assert (record["shares"][0]["without_verdict"], record["worst_case"]) == (level.cases, None)
+    found = api.probability(run, vut=Parked, cases=20)
+    assert found.lines() == [
+        "P(fail) is not known: no case was judged, the VUT never reached the merge point"
+    ]

@@ -74,6 +74,10 @@ def test_the_simulated_time_has_the_follow_up(run, tmp_path):
     assert Run(lost).simulated_s == pytest.approx(up_to_m_s)
 
 
+def test_name_the_key_of_a_failing_line_under_the_papers_rule(facts):
+    assert facts["failures", None].key == "score < -500"
+
+
 def test_stand_once_each_with_a_file_of_the_folder(made):
     found = CampaignRun(made).facts
     assert set(Counter((fact.name, fact.level) for fact in found).values()) == {1}
@@ -106,7 +110,7 @@ def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
     of = {name: fact.shown for (name, level), fact in facts.items() if level is None}
     of |= {f"{name} {level}": f.shown for (name, level), f in facts.items() if level is not None}
     first, *levels, unknown, avoided, worst = headline(made, CampaignRun(made).facts)
-    rule = "front bumpers are within 6 m as the VUT reaches M"
+    rule = "front bumpers are within 6 m when the VUT reaches the merge point"
     assert first == f"handmade: a case fails when {rule}; 180 cases"
     found = [
         ["level", str(level), of[f"failures {level}"], "failures", "found"]
