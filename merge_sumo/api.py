@@ -311,9 +311,18 @@ def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None =
 
 
 def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> int:
-    """Show a case in sumo-gui until the window is closed; return the exit code of sumo-gui.
+    """Show a case in sumo-gui until the window is closed.
 
-    The arguments are those of `replay`. Raises `UserError` without a display.
+    Args:
+        folder: a scenario folder, or a campaign.
+        index: the case of the campaign, which is exported where it is not yet.
+        from_s: begin so long before the first conflict, as in -3.
+
+    Returns:
+        The exit code of sumo-gui.
+
+    Raises:
+        UserError: without a display.
     """
     check_from(from_s)
     return replayer.open_gui(_scenario_folder(folder, index), from_s)
@@ -512,7 +521,12 @@ def opened_study(
 def opened_truths(
     settings: CampaignSettings, where: c.Execution, engine: str | None = None
 ) -> Iterator[Study]:
-    """Open a study of truths; the cache of objects of this process is a passing one.
+    """Open a study of truths; the truths of objects of this process are not kept.
+
+    Args:
+        settings: the settings of the study.
+        where: where its cases run.
+        engine: engine that moves the vehicles; by default the kinematic one where it is possible.
 
     Raises:
         UserError: for an engine that a level does not allow.
@@ -631,7 +645,13 @@ def _study(
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
-    """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT."""
+    """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT.
+
+    Args:
+        settings: the settings of a new campaign.
+        plan: how its cases run.
+        config: its config.
+    """
     if config.level == "all" and not set(LEVELS) <= set(settings.levels):
         present = ", ".join(map(level_name, settings.levels))
         notice(

@@ -122,7 +122,15 @@ class Commands(App):
 
 
 def use_all_cores(_app: App, _commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Let a command have a worker a core; in Python a script without a guard would start again."""
+    """Give a command a worker for each core, where the user names no number.
+
+    In Python the default is one: a script without a main guard would start again in each worker.
+
+    Args:
+        _app: the application.
+        _commands: the words of the command.
+        arguments: its arguments, which get the number of workers.
+    """
     for argument in arguments:
         if argument.field_info.name == "workers" and not argument.has_tokens:
             argument.append(Token(keyword="--workers", value="auto"))

@@ -104,7 +104,7 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
 def check_own(*paths: Path) -> None:
     """Raise `UserError` where one of the paths exists and is neither a file nor a folder.
 
-    To be called before writing what was written before: in a folder of another person, a link leads
+    To be called before writing what was written before: in a received folder, a link leads
     anywhere, and a pipe never answers.
     """
     for path in paths:

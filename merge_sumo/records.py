@@ -3,7 +3,7 @@
 What a record may hold is what the annotations of its class say, with bounds as `Meta`. Reading is
 strict: texts and true are not numbers, and 18 is 18.0 where a number may have a fraction.
 Unknown names, numbers beyond float64, half characters and endless nesting are refused, since the
-file may be another person's.
+file may be received from others.
 """
 
 from __future__ import annotations

@@ -28,12 +28,8 @@ class Registry(Mapping[str, T], Generic[T]):
     It is read like a dictionary. An unknown name, a name that stands twice, and an object that
     cannot be loaded or is of another kind raise `UserError`.
 
-    Args:
-        group: group of entry points, as `merge_sumo.samplers`.
-        noun: what it holds, in the singular.
-        ours: objects of this package by name, or `module:attribute` for an import when needed.
-        accepts: whether a loaded object is of the kind.
-        contract: what it must be, for the sentence where it is not, as "a subclass of Sampler".
+    Example:
+        SAMPLERS["gpr"]  # imports the class
     """
 
     def __init__(
@@ -45,6 +41,15 @@ class Registry(Mapping[str, T], Generic[T]):
         accepts: Callable[[object], bool],
         contract: str,
     ) -> None:
+        """Take the objects of this package.
+
+        Args:
+            group: group of entry points, as `merge_sumo.samplers`.
+            noun: the kind of its objects, in the singular.
+            ours: objects of this package by name, or `module:attribute` for an import when needed.
+            accepts: returns whether a loaded object is of the kind.
+            contract: required kind, for error messages, as "a subclass of Sampler".
+        """
         self.group, self.noun = group, noun
         self._accepts, self._contract = accepts, contract
         self._ours: dict[str, EntryPoint | T] = {}

@@ -1,6 +1,6 @@
-"""Processes that import neither the program that a person runs nor what lies where it is run.
+"""Child processes that import neither the main module nor modules of the working folder.
 
-They may end with the process that started them, whatever native code they are in.
+They may end with the process that started them, whatever native code they run.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def without_cwd() -> Iterator[None]:
     """Let processes that are started meanwhile import nothing from the working directory.
 
     `multiprocessing` starts them by `python -c`, which looks there first: a `json.py` in a folder
-    that somebody sent would be run. In the process, `forget_safe_path` is due: what it starts in
-    turn may be a person's own.
+    that was received would run. In the process, `forget_safe_path` is due: what it starts in
+    turn may be a user's program.
     """
     if os.environ.get(SAFE_PATH):
         yield

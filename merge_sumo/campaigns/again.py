@@ -1,6 +1,6 @@
-"""Commands that are printed to be run as they stand, with the controllers that they need.
+"""Commands that the package prints for a user to run, with the controllers that they need.
 
-They are of a shell, or calls of Python where a controller is an object, which no shell can name.
+They are shell commands, or calls of Python where a controller is an object of this process.
 """
 
 from __future__ import annotations
@@ -33,25 +33,38 @@ Argument = str | Path | int | float | Sequence[int] | Mapping[str, float]
 def again(
     verb: str, folder: Path, record: Mapping[str, Any], *arguments: Argument, **options: Argument
 ) -> str:
-    """Return the command of a verb for a recorded campaign, which names its controllers again.
+    """Return the command of a verb for a recorded campaign, with the controllers of the campaign.
 
     Args:
-        verb: the name of a function of the API; `run` is of a case, and `resume` goes on.
-        folder: the folder of the campaign.
-        record: what its `campaign.json` says.
-        arguments: what follows the folder.
-        options: what else is stated, by keyword; a controller takes the place of the recorded one.
+        verb: name of a function of the API; `run` takes a case, `resume` continues the campaign.
+        folder: folder of the campaign.
+        record: content of its `campaign.json`.
+        arguments: further arguments after the folder.
+        options: options by keyword; a controller replaces the recorded one.
     """
     return command(verb, folder, *arguments, **(options | _named(verb, record) | options))
 
 
 def call_again(verb: str, folder: Path, record: Mapping[str, Any], **options: Argument) -> str:
-    """Return the same as a call of Python, whatever drives."""
+    """Return the call in Python of a verb for a recorded campaign.
+
+    Args:
+        verb: name of a function of the API.
+        folder: folder of the campaign.
+        record: content of its `campaign.json`.
+        options: options by keyword; a recorded controller replaces a controller.
+    """
     return call(verb, [folder], {**options, **_named(verb, record)})
 
 
 def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
-    """Return the command of a verb, or its call in Python where an object drives."""
+    """Return the command of a verb, or its call in Python where a controller is an object.
+
+    Args:
+        verb: name of a function of the API.
+        arguments: arguments in their order.
+        options: options by keyword; those that are None are left out.
+    """
     given = {name: value for name, value in options.items() if value is not None}
     specs = [parse(str(given[name])) for name in CONTROLLERS if name in given]
     if any(spec.kind == HERE for spec in specs):
@@ -75,7 +88,7 @@ def _flag(name: str) -> str:
 
 
 def campaign_in(scenario: Scenario, **options: str | None) -> str:
-    """Return the command of a campaign in a scenario; empty where that is of a file elsewhere."""
+    """Return the command of a campaign in a scenario; empty for a scenario without a name."""
     name = spoken_name(scenario)
     if name is None:
         return ""
@@ -124,7 +137,13 @@ def _root(kind: str, argument: str) -> str:
 def call(
     verb: str, arguments: Sequence[Argument], given: Mapping[str, Argument] | None = None
 ) -> str:
-    """Return a call of Python, in which `ms` is this package."""
+    """Return a call of Python, in which `ms` is this package.
+
+    Args:
+        verb: name of a function of the API.
+        arguments: arguments in their order.
+        given: options by keyword.
+    """
     parts = [_value(argument) for argument in arguments]
     if verb == "run" and parts:
         parts = [f"recorded=({', '.join(parts)})"]

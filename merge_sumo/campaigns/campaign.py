@@ -224,7 +224,7 @@ def _compared(
 
 
 def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
-    """Return the sampler of a campaign, which was told nothing."""
+    """Return the sampler of a campaign, without outcomes."""
     model = controller_model_of(settings, plan)
     predictor = (
         model
@@ -236,7 +236,7 @@ def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
 
 
 def controller_model_of(settings: CampaignSettings, plan: SimulationPlan) -> ControllerModel:
-    """Return a model of the controller that has learned nothing."""
+    """Return an untrained model of the controller."""
     lines = centre_lines(plan.road)
     return ControllerModel(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
 
@@ -247,6 +247,16 @@ def case_name(index: int) -> str:
 
 
 def export_case(run: Run, index: int, folder: Path, road: Corridor | None = None) -> Path:
-    """Write a case of a run as a replay folder; return the path of its SUMO configuration."""
+    """Write a case of a campaign as a replay folder.
+
+    Args:
+        run: the campaign.
+        index: index of the case.
+        folder: the new folder.
+        road: the road of the scenario; read from its net by default.
+
+    Returns:
+        The path of the SUMO configuration.
+    """
     road = road or road_for(run.scenario)
     return write_scenario(folder, road, run.outcome(index), run.trajectory(index))

@@ -55,7 +55,13 @@ class Journal:
     """
 
     def __init__(self, folder: Path, outcomes: io.FileIO, settings: dict[str, Any]) -> None:
-        """Take the folder, its open outcomes and settings; use `create` or `reopen`."""
+        """Take an open folder; use `create` or `reopen`.
+
+        Args:
+            folder: the folder.
+            outcomes: its `outcomes.jsonl`, open for reading and writing.
+            settings: content of its `campaign.json`.
+        """
         self.folder, self.settings = folder, settings
         self.earlier: Self | None = None
         self._outcomes = outcomes

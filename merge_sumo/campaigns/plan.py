@@ -196,6 +196,11 @@ def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, 
 def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     """Return the case of a scenario with values by the names of its fields.
 
+    Args:
+        scenario: the scenario.
+        level: level of the POV.
+        values: coordinates by the names of `outcomes.jsonl`, in m, m/s, s and rad.
+
     Raises:
         UserError: a coordinate is missing or unknown, or a value is out of range.
     """

@@ -1,18 +1,15 @@
-"""Cases of a campaign that run a second time: does a result depend on what ran before it?
+"""Repeatability: some cases of a campaign run a second time, and must move as the first time.
 
-An episode is to depend on its case alone. A controller that draws random numbers, reads a clock,
-or keeps something from one episode to the next breaks that, and then a result depends on the number
-of workers, on the sampler, and on chance. So a few cases run again at the end of a campaign: the
-first ones, when the controller was new, and others, in reverse order. Their motion must be the same
-to the last bit. The VUTs of this package need no such check.
-
-Where a campaign repeats cases (`--repeat`), chance is expected, and what it keeps from one episode
-to the next is not: what differed runs twice more, each time from the beginning in a new process.
-
-repeats.jsonl           in the folder of the campaign: one line per case that ran twice
-
-The file of a folder that somebody sent is data as everything in it.
+`repeats.jsonl` in the folder of the campaign has a line for each case that ran twice.
 """
+
+# An episode must depend on its case alone. A controller that draws random numbers, reads a clock,
+# or keeps a state from one episode to the next violates this: its results depend on the number of
+# workers, on the sampler, and on chance. The first cases run again, which a new controller ran, and
+# others, in reverse order. The VUTs of this package need no such check.
+#
+# A campaign with `--repeat` expects chance, but no state between episodes: cases that differ run
+# twice more, each time with new controllers.
 
 from __future__ import annotations
 
@@ -72,9 +69,18 @@ class Repeat(Record, frozen=True, omit_defaults=True):
 def repeat(
     run: Run, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
 ) -> list[Repeat]:
-    """Run some cases of a campaign again, and keep in its folder what became of them, by index.
+    """Run some cases of a campaign again, and write the comparison to `repeats.jsonl`.
 
-    Cases whose trajectory is lost, and those that end in an error now, are left out.
+    Cases whose trajectory is lost, and cases that end in an error now, are left out.
+
+    Args:
+        run: the campaign.
+        settings: its settings.
+        plan: how its cases run.
+        workers: where they run.
+
+    Returns:
+        A comparison for each case, by index.
     """
     chosen = chosen_again(run.outcomes, settings)
     recorded = run.trajectories(outcome.index for outcome in chosen)
@@ -137,7 +143,13 @@ def others_drive(outcomes: Iterable[Outcome], settings: CampaignSettings) -> lis
 
 
 def repeat_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
-    """Return how the second run of a case compares with the first one."""
+    """Return how the second run of a case compares with the first one.
+
+    Args:
+        outcome: outcome of the first run.
+        recorded: trajectory of the first run.
+        ran: the second run.
+    """
     differs_from_s, first = _difference(recorded, ran.trajectory)
     now = ran.outcome
     end = now.measures.end

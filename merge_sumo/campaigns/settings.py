@@ -1,4 +1,4 @@
-"""Everything that decides what a campaign does, and how it is written down."""
+"""Settings of a campaign, and their record in `campaign.json`."""
 
 from __future__ import annotations
 
@@ -193,7 +193,13 @@ def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any
 
 
 def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
-    """Return whether two campaigns had the same POV at a level, by what both have recorded."""
+    """Return whether two campaigns had the same POV at a level.
+
+    Args:
+        a: content of `campaign.json` of a campaign.
+        b: that of another campaign; files that only one of both recorded decide nothing.
+        level: the level.
+    """
     name = "pov_files" if level == OWN else "policies_sha256"
     one, other = (known if isinstance(known := r.get(name), dict) else {} for r in (a, b))
     both = one.keys() & other.keys()

@@ -82,8 +82,3 @@ class TestTheNames:
         returned = str(inspect.signature(getattr(ms, name)).return_annotation)
         ours = set(re.findall(r"[A-Z]\w+", returned)) - {"Path"}
         assert ours <= shown_classes()
-
-
-def test_a_keyword_that_is_unknown_is_a_type_error():
-    with pytest.raises(TypeError, match="unexpected keyword argument 'scenari'"):
-        ms.campaign("design2", scenari="us23")  # type: ignore[call-arg]

@@ -259,14 +259,6 @@ class TestARun:
         for outcome in run.outcomes:
             assert Measures.of(run.trajectory(outcome.index), lines) == outcome.measures
 
-    def test_that_was_interrupted_between_trajectories_and_outcomes_is_read(self, folder):
-        outcomes = folder / "outcomes.jsonl"
-        lines = outcomes.read_bytes().splitlines(keepends=True)
-        outcomes.write_bytes(b"".join(lines[:2]))
-        run = Run(folder)
-        assert len(run.outcomes) == 2
-        assert not run.torn
-
     @pytest.mark.parametrize("name", ["campaign.json", "outcomes.jsonl"])
     def test_without_one_of_its_files_is_no_campaign(self, folder, name):
         (folder / name).unlink()
@@ -294,8 +286,3 @@ class TestARun:
             Run(folder).trajectory(0)
         assert_sentence(error, "00000.npz")
         assert not (folder / "trapped").exists()
-
-
-def test_every_measure_is_in_the_record():
-    record = episode(0).outcome.to_record()
-    assert set(EVERYWHERE) <= set(record)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.campaigning import campaign_settings, resume_campaign, run_campaign
+from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 
 from merge_sumo.campaigns.journal import to_line
 from merge_sumo.campaigns.loop import AGE, GROUPS, SearchLoop
-from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES, read_settings
+from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION
@@ -179,13 +179,6 @@ def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two
     run_campaign(few, tmp_path / "1")
     run_campaign(few, tmp_path / "2", workers=two)
     assert recorded(tmp_path / "1") == recorded(tmp_path / "2")
-
-
-def test_a_campaign_records_how_many_are_in_flight(tmp_path):
-    folder = run_campaign(settings(cases=14), tmp_path / "run").folder
-    assert read_settings(folder)["in_flight"] == 12
-    with pytest.raises(UserError, match="in_flight differs"):
-        resume_campaign(folder, {"in_flight": 13, "cases": 70})
 
 
 class TestAhead:

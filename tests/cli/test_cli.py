@@ -156,23 +156,6 @@ class TestReplay:
         assert "\ndiverged at t = 2.0 s" in call("replay", scenario).out
 
 
-class TestReport:
-    def test_is_written_again_and_nothing_else(self, call, campaign, tmp_path):
-        before = contents(tmp_path)
-        said = call("report", campaign)
-        assert (said.code, said.err) == (0, "")
-        assert said.out == f"{campaign / 'report.html'}\n"
-        first = (campaign / "report.html").read_text()
-        (campaign / "report.html").write_text(first[:1000])
-        assert call("report", campaign).code == 0
-        assert (campaign / "report.html").read_text() == first
-        after = contents(tmp_path)
-        for made in ("report.html", "expected.json"):
-            after.pop(campaign / made, None)
-            before.pop(campaign / made, None)
-        assert after == before
-
-
 class TestHelp:
     @pytest.mark.parametrize("name", COMMANDS)
     def test_of_every_command_has_an_example_of_that_command(self, name):
