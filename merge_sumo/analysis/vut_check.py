@@ -1,24 +1,24 @@
-"""A short drill for a VUT before a campaign: what is wrong with it, and what a step costs."""
+"""A short check of a VUT before a campaign: what is wrong with it, and the cost of a step."""
 
 from __future__ import annotations
 
 import statistics
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from time import perf_counter
-from typing import Final, NamedTuple
 
 import numpy as np
 
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.controllers.python import installed_vuts
-from merge_sumo.controllers.spec import HERE
-from merge_sumo.drivers.base import Driver, DriverWrapper, Scene, VutLostError
+from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
+from merge_sumo.errors import UserError
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.result import Result, Shown
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
@@ -27,21 +27,24 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
 
-CORRIDORS: Final = 4
-PLACES: Final = tuple(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
-"""Cases in the unit square of the first two coordinates of a level-0 pool: where the POV starts and
-how fast, in a merge."""
+CORRIDORS = 4
+"""Episodes that run at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
 class VutCheck(Result):
-    """What the drill found.
+    """What is wrong with a VUT, and the cost of a step.
+
+    Example:
+        found = ms.check_vut("my_vut.py:MyVut")
+        assert found.ok, found.problems
 
     Attributes:
         vut: the VUT.
         problems: sentences on what makes the VUT's results wrong or worthless.
         notes: sentences on what its author may want to know.
-        us_per_step_median: cost of one step of one episode, microseconds, without SUMO.
+        us_per_step_median: cost of one step of one episode, microseconds, without SUMO; None for a
+            VUT that does not start.
         us_per_step_worst: cost of the slowest step.
     """
 
@@ -50,8 +53,8 @@ class VutCheck(Result):
     vut: str
     problems: list[str]
     notes: list[str]
-    us_per_step_median: float
-    us_per_step_worst: float
+    us_per_step_median: float | None
+    us_per_step_worst: float | None
 
     @property
     def is_good(self) -> bool:
@@ -65,152 +68,100 @@ class VutCheck(Result):
 
 
 def check_vut(plan: SimulationPlan) -> VutCheck:
-    """Let the VUT of a plan drive a few cases, some of them again, and one from a stand."""
-    plan = plan.for_cases(CORRIDORS)
-    cases = _ordinary_cases(plan.scenario)
-    from_stand = replace(cases[0], v_vut0_mps=0.0)
-    with Simulator(plan) as ground:
-        timed = ground.vut = _Timed(ground.vut)
-        first = ground.run(cases)
-        problems, differing = _errors(cases, first), list[_Difference]()
-        if not problems:
-            backwards = ground.run(cases[::-1])[::-1]
-            differing += _differences("the same cases in another order", first, backwards)
-            alone = [ground.run([case])[0] for case in cases]
-            differing += _differences("each case alone", first, alone)
-            for corridor in range(ground.world.corridors):
-                ground.vut.begin(corridor, from_stand)
-            differing += _differences("a reset too many", first, ground.run(cases))
-        outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
-        vain = Counter(command for one in first for command in one.in_vain)
-        headline = [*filter(None, [mostly_clipped(outcomes)])]
-        notes = [*headline, *doubts(outcomes, plan.criterion, vain)]
-        problems += _from_stand(ground, from_stand)
-        notes += _not_numbers(ground, cases[0])
-        if not problems and not differing:
-            after = ground.run(cases[:1])
-            differing += _differences("a state that is no number", first[:1], after)
-    if differing:
-        problems += [
-            f"After {d.when} it drives differently from t = {d.at_s:g} s on." for d in differing
-        ]
-        problems.append(_why(plan, differing[0]))
+    """Let the VUT of a plan drive a few cases, some of them again, and one from standstill."""
+    problems: list[str] = []
+    notes: list[str] = []
+    cost_us: list[float] = []
+    with ExitStack() as opened:
+        try:
+            simulator = opened.enter_context(Simulator(plan.for_cases(CORRIDORS)))
+        except UserError as error:
+            problems.append(f"It does not start: {error}")
+        else:
+            timed = simulator.vut = _Timed(simulator.vut)
+            problems, notes = _checked(simulator, plan)
+            cost_us = timed.us_per_step
     return VutCheck(
         vut=str(plan.vut.spec),
         problems=problems,
         notes=notes,
-        us_per_step_median=statistics.median(timed.us_per_step),
-        us_per_step_worst=max(timed.us_per_step),
+        us_per_step_median=statistics.median(cost_us) if cost_us else None,
+        us_per_step_worst=max(cost_us, default=None),
     )
 
 
+def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], list[str]]:
+    """Return what is wrong with the VUT of a simulator, and notes, in sentences."""
+    cases = _ordinary_cases(plan.scenario)
+    from_standstill = replace(cases[0], v_vut0_mps=0.0)
+    first = simulator.run(cases)
+    problems = []
+    wrong = [trajectory for trajectory in first if trajectory.end.is_error]
+    if wrong:
+        problems.append(
+            f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
+            f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
+        )
+    else:
+        backwards = simulator.run(cases[::-1])[::-1]
+        problems += _differences("the same cases in another order", first, backwards)
+        alone = [simulator.run([case])[0] for case in cases]
+        problems += _differences("each case alone", first, alone)
+        for corridor in range(simulator.world.corridors):
+            simulator.vut.begin(corridor, from_standstill)
+        problems += _differences("a reset too many", first, simulator.run(cases))
+    if problems and not wrong:
+        problems.append(
+            "It draws random numbers, reads a clock, or keeps something from earlier episodes: in "
+            "its object (which attributes does `reset` not clear?), its class or its module."
+        )
+    outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
+    in_vain = Counter(command for one in first for command in one.in_vain)
+    notes = doubts(outcomes, plan.criterion, in_vain)
+    if headline := mostly_clipped(outcomes):
+        notes.insert(0, headline)
+    (trajectory,) = simulator.run([from_standstill])
+    if trajectory.end.is_error:
+        problems.append(
+            f"From standstill it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
+            f"{trajectory.error}"
+        )
+    elif trajectory.end is End.TIMEOUT and not trajectory.v_vut_mps.any():
+        problems.append("From standstill it never starts, although the road is free at last.")
+    return problems, notes
+
+
 def _ordinary_cases(scenario: Scenario) -> list[Case]:
-    points = np.full((len(PLACES), len(scenario.dimensions(0))), 0.5)
-    points[:, :2] = PLACES
+    """Return level-0 cases over the start and the speed of the POV."""
+    starts_and_speeds = list(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
+    points = np.full((len(starts_and_speeds), len(scenario.dimensions(0))), 0.5)
+    points[:, :2] = starts_and_speeds
     return from_unit(points, 0, scenario=scenario)
 
 
 class _Timed(DriverWrapper):
-    """Passes everything on and notes what a step of one corridor costs."""
+    """Notes the cost of a step of one corridor."""
 
     def __init__(self, driver: Driver) -> None:
         super().__init__(driver)
         self.us_per_step: list[float] = []
 
     def act(self, scene: Scene) -> FloatArray:
-        start = perf_counter()
+        start_s = perf_counter()
         answer = self._driver.act(scene)
-        spent = perf_counter() - start
-        self.us_per_step.append(spent * 1e6 / max(int(scene.active.sum()), 1))
+        spent_s = perf_counter() - start_s
+        self.us_per_step.append(spent_s * 1e6 / max(int(scene.active.sum()), 1))
         return answer
 
 
-def _errors(cases: Sequence[Case], trajectories: Sequence[Trajectory]) -> list[str]:
-    wrong = [t for t in trajectories if t.end.is_error]
-    if not wrong:
-        return []
-    return [
-        f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
-        f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
-    ]
-
-
-class _Difference(NamedTuple):
-    """A case that went differently when it ran again: after what, and from when on."""
-
-    when: str
-    case: Case
-    at_s: float
-
-
-def _differences(
-    when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]
-) -> list[_Difference]:
-    """Return the first of motions that differ and should be the same, if any."""
+def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
+    """Return a sentence on the first of motions that differ and should be the same, if any."""
     for one, other in zip(before, after, strict=True):
         if not np.array_equal(one.motion, other.motion):
             rows = min(len(one.motion), len(other.motion))
-            steps = np.flatnonzero((one.motion[:rows] != other.motion[:rows]).any(axis=(1, 2)))
-            return [_Difference(when, one.case, float(steps[0] if steps.size else rows) * DT_S)]
-    return []
-
-
-def _why(plan: SimulationPlan, difference: _Difference) -> str:
-    """Return why a VUT drives differently; a case that runs first, twice, tells it."""
-    spec = plan.vut.spec
-    if spec.kind == HERE or plan.vut.waits(spec.argument):
-        return (
-            "It draws random numbers, reads a clock, or keeps something from earlier episodes, "
-            "perhaps in its module or its class."
-        )
-    motions = []
-    for _ in range(2):
-        with Simulator(plan.for_cases(1)) as ground:
-            motions.append(ground.run([difference.case])[0].motion)
-    if not np.array_equal(motions[0], motions[1]):
-        return (
-            "It draws random numbers, reads a clock, or keeps something outside of its process: as "
-            "the first case of a new process such a case does not repeat either."
-        )
-    return (
-        "It keeps something from earlier episodes, or shares it between those that run at a time: "
-        "in its object (what does `reset` not clear?), its class or its module. As the first case "
-        "of a new process such a case repeats."
-    )
-
-
-def _from_stand(ground: Simulator, from_stand: Case) -> list[str]:
-    (trajectory,) = ground.run([from_stand])
-    if trajectory.end.is_error:
-        return [
-            f"From a stand (v = 0) it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
-            f"{trajectory.error}"
-        ]
-    if trajectory.end is End.TIMEOUT and not trajectory.v_vut_mps.any():
-        return ["From a stand (v = 0) it never starts, although the road is free at last."]
-    return []
-
-
-def _not_numbers(ground: Simulator, case: Case) -> list[str]:
-    """Show the VUT a state of NaN; it may answer anything, but must not hang or end us."""
-    corridors, vehicles = ground.world.corridors, len(ground.world.x_m)
-    if ground.world.vut_type is not None:
-        return []  # SUMO's own drivers see SUMO's state, which is never NaN
-    active = np.zeros(corridors, dtype=bool)
-    active[0] = True
-    nothing = np.full((vehicles, corridors), np.nan)
-    ground.vut.begin(0, case)
-    step = np.zeros(corridors, dtype=np.int64)
-    merged = None if case.scenario.lane_m is None else np.zeros(corridors, dtype=bool)
-    scene = Scene(
-        active, step, nothing, nothing, facing=step if vehicles > 2 else None, merged=merged
-    )
-    try:
-        answer = float(ground.vut.act(scene)[0])
-    except VutLostError as lost:
-        return [f"To a state that is not a number it answers nothing, but {lost}."]
-    if np.isfinite(answer):
-        return [f"To a state that is not a number it answers {answer:g} m/s2."]
+            differs = (one.motion[:rows] != other.motion[:rows]).any(axis=(1, 2))
+            step = int(differs.argmax()) if differs.any() else rows
+            return [f"After {when} it drives differently from t = {step * DT_S:g} s on."]
     return []
 
 

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, Final
 
@@ -431,10 +431,12 @@ def _axis(axis: Axis, name: str, unit: str) -> str:
 @lines_of.register
 def vut_check(found: VutCheck) -> list[str]:
     """Return what is wrong in sentences, and the cost of a step."""
-    problems: Sequence[str] = found.problems or ["nothing wrong"]
-    cost = f"{found.us_per_step_median:.0f} us (median), {found.us_per_step_worst:.0f} us at worst"
-    notes = [f"note: {sentence}" for sentence in found.notes]
-    return [*problems, *notes, f"a step costs {cost}"]
+    lines = found.problems or ["nothing wrong"]
+    lines = lines + [f"note: {sentence}" for sentence in found.notes]
+    median, worst = found.us_per_step_median, found.us_per_step_worst
+    if median is not None:
+        lines.append(f"a step costs {median:.0f} us (median), {worst:.0f} us at worst")
+    return lines
 
 
 # Of one case
