@@ -36,7 +36,7 @@ from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.povs import PovLibrary, Povs
 from merge_sumo.simulation.rollout import Rollout
-from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_program
+from merge_sumo.sumo.binding import NO_COLLISIONS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_program
 from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
 from merge_sumo.sumo.world import MAX_SPEED_MPS, World
 
@@ -113,7 +113,7 @@ def process_s(cases: list[Case]) -> list[float]:
         net_file = Path(folder) / "one.net.xml"
         road = road_of()
         net_file.write_bytes(hosted_net(road, 1))
-        command = [sumo_program("sumo"), "--net-file", str(net_file), *SUMO_OPTIONS]
+        command = [sumo_program("sumo"), "--net-file", str(net_file), *SUMO_OPTIONS, *NO_COLLISIONS]
         for case in cases:
             start = time.perf_counter()
             traci.start(command, numRetries=100)
