@@ -1,4 +1,4 @@
-"""Every verb of merge-sumo, once: what the command line calls, and what a notebook calls.
+"""The functions of merge-sumo, which the command line, scripts and notebooks call.
 
 import merge_sumo as ms
 
@@ -7,8 +7,8 @@ run.failures        # rows for pandas.DataFrame(run.failures); a table in a note
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
-Every verb raises `UserError`, with one sentence, for values and files that do not fit, and where
-something stands in the place of what it would write, before it runs anything.
+Before it runs anything, each raises `UserError` with one sentence for wrong values and files, and
+for an output that exists.
 Results print as the command prints them, and `to_record()` is what the command's `--json` prints.
 """
 

@@ -1,4 +1,4 @@
-"""Files and folders: written without overwriting what is not ours, and read only where regular.
+"""Files and folders: written without overwriting those of a user, and read only where regular.
 
 What a user names as an output must not exist. It is written under a temporary name next to its
 place and renamed when it is whole, so a process that is killed leaves nothing that looks finished.
@@ -350,7 +350,7 @@ def hashed(paths: Iterable[Path]) -> Files:
 
 
 def files_now(recorded: Files, loaded: Files) -> Files:
-    """Return recorded files with the hashes that they have now, then what is `loaded` besides.
+    """Return recorded files with the hashes that they have now, then the other `loaded` files.
 
     Args:
         recorded: files by names that are relative to where a record was written.

@@ -1,8 +1,7 @@
 """SIGINT and SIGTERM: the first finishes what is running, the second stops at once.
 
-Who sends SIGTERM sends no second one, but SIGKILL: it has what is running finish in a few seconds.
-
-What has nothing to finish stops at the first, in good order.
+After SIGTERM, systems send SIGKILL: the running batch has a few seconds to finish. Work without a
+batch stops at the first signal, in good order.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ ENDING = ("SIGTERM", "SIGHUP")
 """SIGHUP comes when a terminal is closed; not every platform has it."""
 STDERR = 2
 PATIENCE_S = 5.0
-"""Seconds after SIGTERM in which what is running may end."""
+"""Time in s after SIGTERM in which the running batch may end."""
 
 
 class Stopped(BaseException):

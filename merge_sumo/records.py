@@ -1,6 +1,6 @@
-"""Records by declaration: JSON and TOML into typed values, or one sentence on what is wrong.
+"""Records by declaration: JSON and TOML into typed values, or one sentence on the error.
 
-What a record may hold is what the annotations of its class say, with bounds as `Meta`. Reading is
+The annotations of a class declare its values, with bounds as `Meta`. Reading is
 strict: texts and true are not numbers, and 18 is 18.0 where a number may have a fraction.
 Unknown names, numbers beyond float64, half characters and endless nesting are refused, since the
 file may be received from others.
@@ -268,7 +268,7 @@ def _unknown(name: object, kind: Any) -> str:
 
 
 def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
-    """Return a sentence on a record: the field, its value, and what it must be."""
+    """Return a sentence on a record: the field, its value, and the required type."""
     message, _, place = str(error).partition(" - at `$")
     name = "it"
     for name in re.findall(r"\.(\w+)", place):

@@ -126,7 +126,7 @@ class Registry(Mapping[str, T], Generic[T]):
 def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
     """Return the installed entry points of a group, by name and then by package.
 
-    Nothing is imported, and nothing in the working folder, where lies what somebody sent, is found.
+    Nothing is imported. The working folder, which may be received, is not searched.
     """
     try:
         return _installed(group, tuple(sys.path), Path.cwd().resolve())

@@ -1,4 +1,4 @@
-"""The base of what the verbs of the API return: a JSON record, and lines for a terminal."""
+"""The base class of results: a JSON record, and lines for a terminal."""
 
 from __future__ import annotations
 

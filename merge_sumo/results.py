@@ -42,14 +42,6 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 
 MOST_ROWS = 20
 """Rows that a notebook shows of a table."""
-PLACE = ("index", "level")
-VERDICT = ("end", "score", "dx_m", "dv_mps", "avoidable", "error")
-"""Columns that it shows before and behind the coordinates of the case; the rows hold all of
-`outcomes.jsonl`."""
-
-
-FACTS = ("cases that ran more than once",)
-"""Facts that the terminal lists with the headline, where there are any."""
 
 
 class Table(list[dict[str, Any]]):
@@ -59,14 +51,17 @@ class Table(list[dict[str, Any]]):
         rows = list(outcomes)
         super().__init__(outcome.to_record() for outcome in rows)
         scenario = rows[0].case.scenario if rows else US23
-        self._columns = (*PLACE, *(c.field for c in coordinates(scenario)), *VERDICT)
+        # A notebook shows some columns; the rows hold all of `outcomes.jsonl`.
+        self._columns = ["index", "level"]
+        self._columns += [coordinate.field for coordinate in coordinates(scenario)]
+        self._columns += ["end", "score", "dx_m", "dv_mps", "avoidable", "error"]
 
     def _repr_html_(self) -> str:
         head = "".join(f"<th>{name}</th>" for name in self._columns)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{_cell(row[name])}</td>" for name in self._columns) + "</tr>"
-            for row in self[:MOST_ROWS]
-        )
+        body = ""
+        for row in self[:MOST_ROWS]:
+            cells = "".join(f"<td>{_cell(row[name])}</td>" for name in self._columns)
+            body += f"<tr>{cells}</tr>"
         more = f"<p>{len(self) - MOST_ROWS} more rows</p>" if len(self) > MOST_ROWS else ""
         return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
 
@@ -213,7 +208,11 @@ class CampaignRun(Result):
     def lines(self) -> list[str]:
         """Return the headline, what else is to be known, and the path of the report."""
         run = self.run
-        facts = [fact for fact in self.facts if fact.level is None and fact.name in FACTS]
+        repeated = [
+            f"{fact.name}: {fact.shown}"
+            for fact in self.facts
+            if fact.level is None and fact.name == "cases that ran more than once"
+        ]
         tested, *found = headline(run, self.facts)
         optional = [
             unrepeatable(self.repeats),
@@ -221,7 +220,7 @@ class CampaignRun(Result):
             mostly_clipped(run.cases),
             *self.verdict.trouble_lines(),
             *found,
-            *(f"{fact.name}: {fact.shown}" for fact in facts),
+            *repeated,
             run.ran_again_in_words if run.settings.ran_again else None,
             *(f"note: {note}" for note in self._doubts),
             *self._against_lines(),
@@ -286,7 +285,7 @@ class CaseRun(Result):
         return f"<case: {self.cause}>"
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `merge-sumo run --json` prints: outcome, motion, and what the VUT left."""
+        """Return what `merge-sumo run --json` prints: outcome, motion, and signals of the VUT."""
         record = {**self.outcome.to_record(), "motion": self.trajectory.whole.tolist()}
         left = {"signals": self.trajectory.signals, "in_vain": self.trajectory.in_vain}
         return record | {name: value for name, value in left.items() if value}

@@ -175,7 +175,7 @@ def _sized(
 
 
 def _reopened(folder: Path, opened: ExitStack) -> tuple[Journal, Run]:
-    """Return the journal of a folder, which `opened` closes, and what the folder holds."""
+    """Return the journal of a folder, which `opened` closes, and the campaign in it."""
     journal, run, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
     if dropped:
@@ -193,7 +193,7 @@ def _compared(
     """
     recorded = {k: v for k, v in before.record.items() if k not in TALLIES}
     record = record_of(settings, plan)
-    # Where policies are decides nothing: what is in them does.
+    # The content of policies decides outcomes, and not their folder.
     moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
     recorded["policies"] = record["policies"]
     # What was loaded while it ran must be the same, too, although it is not loaded yet.

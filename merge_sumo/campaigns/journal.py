@@ -77,11 +77,13 @@ class Journal:
 
     @classmethod
     def reopen(cls, folder: Path) -> tuple[Self, Run, int]:
-        """Return the journal of a campaign to go on with, what it holds, and what was dropped.
+        """Return the journal of a stopped campaign, the campaign, and the number of lost outcomes.
 
-        Dropped are outcomes, whole or torn, of a batch that was not written to its end: they are
-        run again. Raises `UserError` when another process writes the folder, when a link in it
-        leads elsewhere, or as `Run` does.
+        The outcomes of a batch that was not written to its end are dropped: its cases run again.
+
+        Raises:
+            UserError: another process writes the folder, a link in it leads elsewhere, or `Run`
+                cannot read it.
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
@@ -104,7 +106,7 @@ class Journal:
         return journal, run, dropped
 
     def keep(self, run: Run, cases: int) -> None:
-        """Drop the outcomes of a run behind its first cases, from the folder and from memory."""
+        """Drop all outcomes of a run after its first cases, from the folder and from memory."""
         del run.outcomes[cases:]
         self._outcomes.seek(0)
         length = sum(len(line) for line, _ in zip(self._outcomes, run.outcomes, strict=False))

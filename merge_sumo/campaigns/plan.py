@@ -31,7 +31,7 @@ DEBUG_DEADLINE_S = 86_400.0
 def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPlan:
     """Return the plan of what settings name: road, drivers, criterion.
 
-    A verb calls it once: it reads files, and loads a VUT of the user's to ask what it is.
+    A verb calls it once: it reads files and loads the controllers.
 
     Args:
         settings: the settings.

@@ -33,9 +33,9 @@ from merge_sumo.workers import Workers
 
 REPEATS = "repeats.jsonl"
 MOST: Final = 20
-"""Cases that run twice at the end of a campaign, at most,"""
+"""Maximum number of cases that run twice at the end of a campaign."""
 ONE_IN: Final = 8
-"""and one in so many."""
+"""One case of this number runs twice, up to the maximum."""
 
 
 class Repeat(Record, frozen=True, omit_defaults=True):
@@ -94,11 +94,10 @@ def repeat(
             found.append(repeat_of(outcome, recorded[outcome.index], ran))
     if settings.repeat != 1 and not all(one.same for one in found):
         first, second = (_simulated_again(plan, cases) for _ in range(2))
-        drawn = {
-            outcome.index: _difference(first[place].trajectory, second[place].trajectory)
-            != (None, None)
-            for place, outcome in enumerate(again)
-        }
+        drawn = {}
+        for outcome, one, other in zip(again, first, second, strict=True):
+            difference = _difference(one.trajectory, other.trajectory)
+            drawn[outcome.index] = difference != (None, None)
         found = [one if one.same else replaced(one, drawn=drawn[one.index]) for one in found]
     found.sort(key=lambda one: one.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
@@ -133,7 +132,7 @@ def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> lis
 def others_drive(outcomes: Iterable[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases in which something drives that may not repeat itself.
 
-    None of a TraCI client that nobody starts: it may have gone.
+    A TraCI client that a user starts has none: it may have ended.
     """
     if waits_for_client(settings.vut):
         return []
@@ -188,10 +187,11 @@ def unrepeatable(found: Iterable[Repeat]) -> str | None:
         return None
     verdicts = sum(one.other_verdict for one in differing)
     example = next((one for one in differing if one.other_verdict), differing[0])
-    by = {one.first for one in differing}
-    who = {"vut": "VUT", "pov": "POV"}.get(next(iter(by)) or "", "") if len(by) == 1 else ""
+    who = "VUT or the POV"
+    for vehicle in ("vut", "pov"):
+        if all(one.first == vehicle for one in differing):
+            who = vehicle.upper()
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
-    who = who or "VUT or the POV"
     why = cause(who)
     if all(one.drawn is False for one in differing):
         why = f"The {who} keeps something from earlier episodes"

@@ -25,9 +25,9 @@ ROOM: Final = 0.98
 BEFORE_GORE_M: Final = 50.0
 """A VUT starts at least so far before an acceleration lane, where the ramp allows: 2 to 3 s."""
 PATIENCE: Final = 2.0
-"""The timeout is at least so many times what the level-0 profile takes to the end of the lane."""
+"""Minimum timeout, as a multiple of the time of the level-0 profile to the end of the lane."""
 FOLLOW_UP_S: Final = 5.0
-"""How long the traffic behind a merge on a lane is followed."""
+"""Duration of the simulation after a merge on a lane, in s."""
 
 
 def suggested_lane_m(road: Corridor) -> Bounds | None:
@@ -193,7 +193,7 @@ regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %
 
 
 def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
-    """Return in what a scenario lies outside of what the learned drivers were trained on.
+    """Return the differences of a scenario from the training of the learned drivers, in sentences.
 
     `policies` is the folder of these drivers, by default of the shipped ones for the scenario. They
     measure in the units of the scenario that they play, so what counts is what its numbers are like

@@ -123,10 +123,10 @@ class CampaignSettings(SharedSettings):
         return replace(self, vut=self.against, against=None)
 
     def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
-        """Return what says of the outcomes so far whether the search is over, if anything does."""
-        return (
-            partial(has_converged, tolerated=self.tolerated) if self.stop_when_converged else None
-        )
+        """Return a function of all outcomes that ends the search; None without one."""
+        if not self.stop_when_converged:
+            return None
+        return partial(has_converged, tolerated=self.tolerated)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
         """Return the sampler, without outcomes; `predictor` as of `make_sampler`."""
