@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -23,7 +23,7 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import POLICIES
 
-TOLERANCE: Final = 0.01
+TOLERANCE = 0.01
 
 
 class Head(Record, frozen=True):

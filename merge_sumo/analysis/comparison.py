@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -108,11 +108,11 @@ class Version:
         return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
 
 
-LISTED: Final = 10
+LISTED = 10
 """Cases of each kind, and regions, that lines name."""
-SIGNIFICANT: Final = 0.05
+SIGNIFICANT = 0.05
 """Chance of the runs of a case in equal versions, up to which a change is none of chance."""
-PAGE: Final = Path("changes.html")
+PAGE = Path("changes.html")
 """The page with both motions that a command writes."""
 
 
@@ -140,7 +140,7 @@ class Change(StrEnum):
     BOTH = "pass with both"
 
 
-GOT_WORSE: Final = (Change.BROKE, Change.WORSE)
+GOT_WORSE = (Change.BROKE, Change.WORSE)
 
 
 def passes(outcome: Outcome) -> bool:

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -50,22 +50,22 @@ from merge_sumo.simulation.simulator import povs_for
 from merge_sumo.sumo.world import World
 from merge_sumo.workers import Workers, workers_or_here
 
-CAREFUL: Final = "careful"
+CAREFUL = "careful"
 """The reference driver that takes the place of a careful one."""
-TAKES_OVER: Final = "fsm"
+TAKES_OVER = "fsm"
 """The reference driver that takes over. From the start it avoids what can be avoided; the careful
 driver brakes only 2 s before a collision, and would tell of itself more than of the VUT."""
-MOST: Final = 500
+MOST = 500
 """Failures that run again, the worst: each takes some thirty episodes."""
-CHUNK: Final = 250
-IN_SUMO: Final = 64
+CHUNK = 250
+IN_SUMO = 64
 """Failures that a worker takes at a time, and where they run in SUMO: enough to keep all corridors
 busy."""
-FEW: Final = 100
+FEW = 100
 """Failures that take as long as what a worker has to load for them."""
-BLOCK_STEPS: Final = 10
+BLOCK_STEPS = 10
 """Take-overs that are tried at a time, from the last one back. Chosen, not tuned."""
-CORRIDORS: Final = 1024
+CORRIDORS = 1024
 """Episodes that run at a time without SUMO. 243 failures of design2 take .8 s of CPU time with
 1024, 1.0 s with 512, 1.5 s with 256."""
 
@@ -97,7 +97,7 @@ class Avoidance(Record, frozen=True):
         return f"{text}; so would a careful POV" if self.pov_careful else text
 
 
-AVOIDANCE: Final = StudyFile("avoidance.jsonl", Avoidance)
+AVOIDANCE = StudyFile("avoidance.jsonl", Avoidance)
 """One line per failure; of very many, the worst."""
 
 

@@ -18,7 +18,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -34,7 +34,7 @@ Weights = Annotated[
     tuple[Weight, ...], Meta(min_length=1, description="weights, numbers of 0 or more")
 ]
 ByLevel = Annotated[dict[str, Weight], Meta(description="weights, numbers of 0 or more, by level")]
-LEAST_INSIDE: Final = 1e-9
+LEAST_INSIDE = 1e-9
 """Share of a distribution that the pool has at least, or its quantiles are no numbers."""
 
 
@@ -188,9 +188,9 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
     return Distribution(shares, marginals, scenario)
 
 
-FOLDER: Final = Path(__file__).resolve().parent / "traffics"
-SUFFIX: Final = ".toml"
-LEAST_SPEEDS: Final = 0.01
+FOLDER = Path(__file__).resolve().parent / "traffics"
+SUFFIX = ".toml"
+LEAST_SPEEDS = 0.01
 """Share of the speeds of a traffic that a pool has at least, or nothing is estimated."""
 
 

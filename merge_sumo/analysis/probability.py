@@ -27,7 +27,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,18 +48,18 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import Engine
 
-DEFAULT_CASES: Final = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
-STREAM: Final = 7
+DEFAULT_CASES = {Engine.KINEMATIC: 100_000, Engine.SUMO: 4000}
+STREAM = 7
 """Key of the random stream, so that it is none of a sampler's."""
-CELLS: Final = 16_384
+CELLS = 16_384
 """Cells of a level, at most."""
-EXPECTED: Final = 0.5
+EXPECTED = 0.5
 """Chance to fail from which the surrogate expects a failure."""
-EXPECTED_LEAST: Final = 0.25
+EXPECTED_LEAST = 0.25
 """Least share of the cases for the stratum where failures are expected, if there is one: it is
 small, and nearly all of the variance is in it. If the surrogate knows nothing, that costs 15 % of
 the width."""
-NAMED: Final = 20
+NAMED = 20
 """Failures where none was expected that the result names."""
 
 
@@ -164,7 +164,7 @@ class ProbabilityResult(Result, Record, frozen=True):
         return self.without_verdict < self.cases
 
 
-PROBABILITY: Final = StudyFile("probability.json", ProbabilityResult)
+PROBABILITY = StudyFile("probability.json", ProbabilityResult)
 
 
 class Cells(NamedTuple):

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +34,12 @@ from merge_sumo.simulation.plan import versions
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.workers import Workers
 
-SAMPLERS: Final = ("uniform", "annealing", "subset", "gpr", "coverage")
-ADAPTIVE: Final = ("gpr", "coverage")
+SAMPLERS = ("uniform", "annealing", "subset", "gpr", "coverage")
+ADAPTIVE = ("gpr", "coverage")
 """The paper's sampler and ours: whose shares of the truth and of the levels are shown."""
-SURFACE_BATCHES: Final = (1, 4, 13, 20)
+SURFACE_BATCHES = (1, 4, 13, 20)
 """Batches after which the paper shows its surrogate."""
-SURFACE_POINTS: Final = 81
+SURFACE_POINTS = 81
 """Points of a surrogate's grid, in each direction."""
 
 
@@ -61,8 +61,8 @@ class Column:
         return f"level-{self.level} POV, {self.vut}"
 
 
-PAPERS: Final = ("truth", "uniform", "annealing", "subset", "gpr")
-TABLE_II: Final = tuple(
+PAPERS = ("truth", "uniform", "annealing", "subset", "gpr")
+TABLE_II = tuple(
     Column(vut, level, dict(zip(PAPERS, found, strict=True)))
     for vut, level, found in (
         ("design1", 0, (0.1296, 0.0223, 0.0497, 0.0830, 0.1012)),

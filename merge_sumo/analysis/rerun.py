@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Final
 
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import (
@@ -33,7 +32,7 @@ from merge_sumo.simulation.evaluate import evaluate, open_simulators
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers, workers_or_here
 
-AGAIN: Final = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
+AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
 """Changes whose cases run a second time, where a controller drives that may not repeat itself."""
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import accumulate, chain, islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +40,9 @@ from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers, workers_or_here
 
-MOST_PROBES: Final = 10_000
+MOST_PROBES = 10_000
 """Failures of a truth of which a covered share is one, at most: its error is then below .01."""
-COMPARED_BATCH: Final = 20
+COMPARED_BATCH = 20
 """Cases of a batch by default, of samplers that choose none: that of Table II."""
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from time import perf_counter
-from typing import Annotated, Final
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
@@ -30,14 +30,14 @@ from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers, workers_or_here
 
-CASES: Final = 2000
+CASES = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
-ROUND: Final = 200
+ROUND = 200
 """Uniform cases of a level that run at a time where they run in SUMO, and the least of them."""
-PART: Final = 0.2
+PART = 0.2
 """Of the time of a campaign, for further rounds."""
-CONFIDENCE: Final = 0.95
-STREAM: Final = 11
+CONFIDENCE = 0.95
+STREAM = 11
 """Key of the random stream, so that it is none of a sampler's."""
 Count = Annotated[int, Meta(ge=0)]
 
@@ -84,7 +84,7 @@ class Shares(Record, frozen=True):
     levels: tuple[LevelShare, ...]
 
 
-SHARES: Final = StudyFile("shares.json", Shares)
+SHARES = StudyFile("shares.json", Shares)
 
 
 def own_shares(run: Run) -> list[LevelShare]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -26,7 +26,7 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COORDINATES, DT_S
 from merge_sumo.simulation.plan import SimulationPlan
 
-LISTED: Final = 10
+LISTED = 10
 """Failures that are not robust that a sentence names."""
 Index = Annotated[int, Meta(ge=0)]
 """The index of a case in its campaign."""
@@ -112,20 +112,20 @@ class StressResult(Result, Record, frozen=True):
         return rung.flips / max(self.cases * len(rung.runs), 1)
 
 
-STRESS: Final = StudyFile("stress.json", StressResult)
-PART_S: Final = 0.02
+STRESS = StudyFile("stress.json", StressResult)
+PART_S = 0.02
 """Step of the rung with a shorter step than that of eq. (4)."""
-LAGS_S: Final = (0.2, 0.35, 0.5)
-POWER_W_PER_KG: Final = 34.0
+LAGS_S = (0.2, 0.35, 0.5)
+POWER_W_PER_KG = 34.0
 """Power over mass: above this a car is of class 3, the highest. UN GTR No. 15, Annex 1."""
-ERROR_X_M: Final = 0.5
-ERROR_V_MPS: Final = 2.0 / 3.6
+ERROR_X_M = 0.5
+ERROR_V_MPS = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
-ERRORS_BY_UNIT: Final = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
-OF_VUT: Final = {"v_vut0_mps", *COORDINATES}
+ERRORS_BY_UNIT = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
+OF_VUT = {"v_vut0_mps", *COORDINATES}
 """Coordinates that are no state of another car."""
-CAR_LENGTH_M: Final = 5.0
-DRAWS: Final = 5
+CAR_LENGTH_M = 5.0
+DRAWS = 5
 """Times that all cases run where a change is drawn at random, with the seed of the case."""
 
 
@@ -185,8 +185,8 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, **values)
 
 
-NOTHING: Final = Disturbance("nothing", "nothing is changed")
-RUNGS: Final = (
+NOTHING = Disturbance("nothing", "nothing is changed")
+RUNGS = (
     NOTHING,
     Disturbance(
         "step",
@@ -221,7 +221,7 @@ RUNGS: Final = (
     ),
 )
 """The ladder; the first rung shows whether cases repeat at all."""
-RUNS: Final = sum(one.draws for one in RUNGS)
+RUNS = sum(one.draws for one in RUNGS)
 
 
 def stress(study: RunStudy) -> StressResult:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -20,9 +19,9 @@ from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.workers import workers_or_cores
 
-FEWEST_FAILURES: Final = 5
+FEWEST_FAILURES = 5
 """Failures at a level from which a surrogate is learned. Chosen, not tuned."""
-PART: Final = 4000
+PART = 4000
 """Points asked at a time, so that memory does not grow with their number."""
 
 Grid = tuple[int, int, int]

@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import chain
-from typing import Final, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +22,12 @@ from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import US23, Scenario, Units
 
-BRAKING: Final = (1.0, 0.75, 0.5, 0.25)
+BRAKING = (1.0, 0.75, 0.5, 0.25)
 """Shares of the hardest braking that a learned driver chooses from,"""
-ACCELERATING: Final = (0.5, 1.0)
+ACCELERATING = (0.5, 1.0)
 """and of the hardest acceleration; between them it coasts."""
 ACTIONS = len(BRAKING) + 1 + len(ACCELERATING)
-DECISION_STEPS: Final = 5
+DECISION_STEPS = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
 
 BLOCK = 512

@@ -11,7 +11,7 @@ UN Regulation No. 157. `tests/drivers/test_cut_in.py` compares these functions w
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,9 @@ class Pair(NamedTuple):
     a_rear_mps2: FloatArray | float = 0.0
 
 
-JERK_MPS3: Final = 12.65
+JERK_MPS3 = 12.65
 """Growth of the deceleration: UN R157, Annex 3, Appendix 3."""
-HARDEST_MPS2: Final = 0.774 * 9.81
+HARDEST_MPS2 = 0.774 * 9.81
 """Hardest deceleration of the careful driver: the same."""
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -19,12 +18,12 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory
 
-WIDTH_M: Final = 1.8
+WIDTH_M = 1.8
 """Of every car."""
-TOUCHING_M: Final = WIDTH_M + 0.5
+TOUCHING_M = WIDTH_M + 0.5
 """Bodies may touch where the centre lines are nearer: in a bend they stand a little out of line."""
-LOOKED_AT_M: Final = 300.0
-SPACING_M: Final = 0.25
+LOOKED_AT_M = 300.0
+SPACING_M = 0.25
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
-from typing import Any, Final, Self
+from typing import Any, Self
 
 import numpy as np
 
@@ -27,9 +27,9 @@ from merge_sumo.scenario.case import Case, Coordinate, FloatArray, coordinates
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-BRAKED_MPS: Final = 1.0
+BRAKED_MPS = 1.0
 """Loss of speed from which a vehicle is said to brake, and gain from which to accelerate."""
-ROUNDING_MPS: Final = 1e-6
+ROUNDING_MPS = 1e-6
 
 
 class Kind(StrEnum):
@@ -118,12 +118,12 @@ class Feature:
     value: Callable[[Case], float]
 
 
-DECIMALS: Final = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
+DECIMALS = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
 """With which bounds of regions are written, by unit."""
-NAMED: Final = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
-MOST_BOXES: Final = 10
+NAMED = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
+MOST_BOXES = 10
 """Leaves of the decision tree of a level."""
-FEWEST_FAILURES: Final = 3
+FEWEST_FAILURES = 3
 """Failures that make a region worth a sentence; of fewer, the cases speak for themselves."""
 
 Bounds = tuple[tuple[Feature, float, float], ...]

@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
@@ -32,7 +31,7 @@ from merge_sumo.printable import nearest, printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-PAPER: Final = "paper"
+PAPER = "paper"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +42,7 @@ class NamedCriterion:
     about: str  # what fails, in a phrase
 
 
-CRITERIA: Final = {
+CRITERIA = {
     PAPER: NamedCriterion(
         "score < -500",
         "front bumpers are within 6 m when the VUT reaches M: a contact or a conflict",
@@ -58,16 +57,16 @@ CRITERIA: Final = {
 """Criteria by the name that follows `fail_when`."""
 
 
-TEXTS: Final = {
+TEXTS = {
     "end": frozenset(end.value for end in End if not end.is_error),
     "severity": frozenset(severity.value for severity in Severity),
     "merged_first": frozenset({"VUT", "POV"}),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """What may be said of measures that are texts. Errors have no verdict under any criterion."""
-NO_TEXT: Final = frozenset({"merged_first", "severity"})
+NO_TEXT = frozenset({"merged_first", "severity"})
 """Texts that an episode may be without; they count as an empty one."""
-CLOSE: Final[dict[str, Value]] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
+CLOSE: dict[str, Value] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
 """What it counts as where |dx| < 6 m: no braking would do, and there was no way out at any time."""
 
 
@@ -185,7 +184,7 @@ class Criterion:
         return margin is not None and abs(margin) <= rounding
 
 
-PAPER_CRITERION: Final = Criterion()
+PAPER_CRITERION = Criterion()
 
 
 @lru_cache

@@ -15,7 +15,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Set
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import either, meant, nearest, printable
@@ -23,17 +23,17 @@ from merge_sumo.printable import either, meant, nearest, printable
 Value = float | str
 """A number, which may be infinite, or a text."""
 
-MOST_MARGIN: Final = 100.0
-LEAST_MARGIN: Final = 1e-9
+MOST_MARGIN = 100.0
+LEAST_MARGIN = 1e-9
 """Margins are finite and never 0, so that their sign says whether a condition is met."""
-MOST_CHARACTERS: Final = 1000
+MOST_CHARACTERS = 1000
 """Of an expression: what a parser that is not ours may be given."""
-MOST_WRITTEN: Final = 20 * MOST_CHARACTERS
+MOST_WRITTEN = 20 * MOST_CHARACTERS
 """Of one as Python writes it, with its spaces, brackets and digits: records have it so."""
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The values that there are by name: the texts that one may have, None for a number."""
-OTHER_SIGNS: Final = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
+OTHER_SIGNS = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
 """Signs of other languages."""
 
 

@@ -19,13 +19,12 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-RADIUS: Final = 0.05
+RADIUS = 0.05
 """Ball radius rho of the paper, in normalised coordinates (no unit)."""
 
 FloatArray = NDArray[np.float64]

@@ -19,7 +19,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from traceback import extract_tb
-from typing import Any, Final, Generic, Literal, TypeVar
+from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
@@ -45,11 +45,11 @@ from merge_sumo.scenario.trajectory import End, Trajectory, as_reason
 
 T = TypeVar("T")
 
-SUSTAINED_STEPS: Final = 16
+SUSTAINED_STEPS = 16
 """Steps over which braking counts as sustained: 1.6 s, as in published braking of drivers."""
-FOLLOW_UP: Final = "a follow-up"
-LANE: Final = "an acceleration lane"
-TRAFFIC: Final = "traffic"
+FOLLOW_UP = "a follow-up"
+LANE = "an acceleration lane"
+TRAFFIC = "traffic"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -542,8 +542,8 @@ class Measures:
         return round(DT_S * int(((x_m >= lane_m[0]) & (v_mps < STANDS_MPS)).sum()), 1)
 
 
-OURS: Final = {name: one for name, one in vars(Measures).items() if isinstance(one, Measure)}
-RESERVED: Final = frozenset({"index", "batch", "level", "draw", "margin", "foretold"})
+OURS = {name: one for name, one in vars(Measures).items() if isinstance(one, Measure)}
+RESERVED = frozenset({"index", "batch", "level", "draw", "margin", "foretold"})
 """Names of a record that are no measures."""
 
 
@@ -555,7 +555,7 @@ def _is_measure(item: object) -> bool:
     )
 
 
-MEASURES: Final[Registry[Measure[Any]]] = Registry(
+MEASURES: Registry[Measure[Any]] = Registry(
     "merge_sumo.measures",
     "measure",
     OURS,

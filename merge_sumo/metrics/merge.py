@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from enum import StrEnum
-from typing import Final, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +23,14 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-REACTION_S: Final = 0.75
+REACTION_S = 0.75
 """tau: from seeing the danger to braking, as the competent and careful driver of UN Regulation
 No. 157 takes (`drivers/reference.py`)."""
 
 
-STANDS_MPS: Final = 0.1
+STANDS_MPS = 0.1
 """A slower VUT stands."""
-HARSH_MPS2: Final = 3.0
+HARSH_MPS2 = 3.0
 """The most that a lane change may ask of a vehicle that approaches from behind: UN Regulation
 No. 79, 5.6.4.7."""
 

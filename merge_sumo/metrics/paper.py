@@ -9,24 +9,23 @@ tens of metres towards that limit, jumps little there, and goes on falling beyon
 from __future__ import annotations
 
 import math
-from typing import Final
 
 import numpy as np
 
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-FAILURE_SCORE: Final = -500.0
+FAILURE_SCORE = -500.0
 """lambda: a case fails by the paper's criterion when its score is below."""
 
 # The bounds that make "P < -500" and the paper's crash the same: without one P_safety and
 # P_task are at least -1, so P >= -495; with one P_safety is at most -1, so P <= -560.
-MU_CRASH: Final = -110.0
-MU_SAFETY: Final = 450.0
-MU_TASK: Final = 45.0
-GAP_SCALE_M: Final = 15.0
+MU_CRASH = -110.0
+MU_SAFETY = 450.0
+MU_TASK = 45.0
+GAP_SCALE_M = 15.0
 """Length over which P_safety decays with the gap; tens of metres, so that a surrogate sees it."""
-TTC_SHARE: Final = 1.0 / 9.0
+TTC_SHARE = 1.0 / 9.0
 """Part of P_safety that a short time to collision can cost; the gap has the rest."""
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
 
 from merge_sumo.metrics.criterion import CRITERIA, Criterion, condition_of, values_of
 from merge_sumo.metrics.outcome import Outcome
@@ -12,12 +11,12 @@ from merge_sumo.metrics.summary import message_of
 from merge_sumo.printable import counted, printable
 from merge_sumo.scenario.scenario import DT_S
 
-KMH_PER_MPS: Final = 3.6
-CLIPPED_SHARE: Final = 0.01
+KMH_PER_MPS = 3.6
+CLIPPED_SHARE = 0.01
 """Share of the steps from which on it is said that accelerations were clipped."""
-MOSTLY_CLIPPED: Final = 0.5
+MOSTLY_CLIPPED = 0.5
 """Share of the steps above which it is a headline: the limits drove, and not the VUT."""
-_THRESHOLD: Final = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
+_THRESHOLD = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
 """A measure, and the number that it is compared with."""
 
 

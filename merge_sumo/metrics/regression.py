@@ -8,14 +8,13 @@ that is told this margin searches for regressions as it searches for failures.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
 from merge_sumo.metrics.outcome import NO_GAP, Outcome, Prediction
 from merge_sumo.scenario.case import FloatArray
 
-FARTHEST: Final = NO_GAP - 1.0
+FARTHEST = NO_GAP - 1.0
 """Margin of a VUT that never arrives, and the largest one."""
 
 

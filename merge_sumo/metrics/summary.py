@@ -19,7 +19,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from operator import itemgetter
-from typing import Any, Final
+from typing import Any
 
 from scipy.special import betainc
 
@@ -32,12 +32,12 @@ from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.scenario import US23, level_name
 from merge_sumo.scenario.trajectory import End
 
-CONFIDENCE: Final = 0.95
+CONFIDENCE = 0.95
 """That the interval of a case holds its failure probability."""
-DOUBT: Final = 0.05
+DOUBT = 0.05
 """A case is decided where it fails in more than the tolerated share of its runs, or does not, with
 at most this posterior probability of the contrary."""
-MOST_RUNS: Final = 20
+MOST_RUNS = 20
 """Runs of a case after which it counts as decided."""
 
 
@@ -274,11 +274,11 @@ def _level(outcomes: Sequence[Outcome], level: int, unsure: set[int]) -> LevelSu
     )
 
 
-MESSAGE_CHARACTERS: Final = 300
+MESSAGE_CHARACTERS = 300
 """Of a message that is shown; `outcomes.jsonl` has the whole."""
-MOST_MESSAGES: Final = 5
+MOST_MESSAGES = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
-_VARYING: Final = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
+_VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
 """Measured values and addresses: messages that differ in them alone are one."""
 
 
@@ -424,9 +424,9 @@ def shortened(text: str, characters: int) -> str:
     return text if len(text) <= characters else text[: characters - 3] + "..."
 
 
-REGRESSIONS: Final = "regressions"
+REGRESSIONS = "regressions"
 """The gate that counts the cases that fail and pass with an earlier version of the VUT."""
-NUMBERS: Final = ("failures", "errors", "timeouts", REGRESSIONS)
+NUMBERS = ("failures", "errors", "timeouts", REGRESSIONS)
 """Gates that are met by one case."""
 
 

@@ -12,7 +12,7 @@ import math
 import re
 import sys
 from functools import lru_cache
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -23,24 +23,24 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
 from merge_sumo.scenario.trajectory import Trajectory
 
-SIGNALS: Final = (
+SIGNALS = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
     *("dx_m", "dv_mps", "bumper_gap_m", "ttc_s"),
 )
 """What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
-NEVER_S: Final = 100.0
+NEVER_S = 100.0
 """The time to collision where no gap closes, and the longest."""
-LAST_PYTHON: Final = (3, 12)
+LAST_PYTHON = (3, 12)
 """The last one that the parser of rtamt runs on."""
-WORDS: Final = (
+WORDS = (
     *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
     *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
 )
-FINITE: Final = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
+FINITE = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
 """Parts of a formula that have numbers, by rtamt's names; infinite, they would decide by chance."""
-_TOKEN: Final = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
-_BOUNDS: Final = re.compile(r"\[([^\]]*)\]")
-_NUMBER: Final = re.compile(r"\d+\.?\d*|\.\d+")
+_TOKEN = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
+_BOUNDS = re.compile(r"\[([^\]]*)\]")
+_NUMBER = re.compile(r"\d+\.?\d*|\.\d+")
 
 
 def check_formula(text: str) -> str:

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
-from typing import Final
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -27,9 +26,9 @@ from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 
-MOST: Final = 40
+MOST = 40
 """Cases of a file for which nobody names any."""
-ABOUT: Final = """\
+ABOUT = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
 # error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is
 # less by more than the tolerance. A known failure may have in its line: accepted = "the reason"

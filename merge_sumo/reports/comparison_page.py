@@ -5,7 +5,7 @@ It is one HTML file without scripts that loads nothing.
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -19,18 +19,18 @@ from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_ro
 from merge_sumo.scenario.case import FloatArray, coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
-SHOWN: Final = 200
+SHOWN = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
-DRAWN: Final = (
+DRAWN = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
     *(Change.STILL_CONTACT, Change.FIXED),
 )
 """Changes of which a section has both motions of each case; the template says what they mean."""
-PAGE: Final = ".html"
+PAGE = ".html"
 """Ending of a page: a browser shows a file with another one as source."""
-AGAINST_PAGE: Final = f"{AGAINST}{PAGE}"
+AGAINST_PAGE = f"{AGAINST}{PAGE}"
 """Page in the folder of a campaign against an earlier version."""
-STYLES: Final = ("report.css", "comparison.css")
+STYLES = ("report.css", "comparison.css")
 
 
 def write_against(run: Run) -> None:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -30,20 +30,20 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 
-EXPORTS: Final = "exports"
-TABLE: Final = "trajectories.csv"
-SEVERITY: Final = "severity"
+EXPORTS = "exports"
+TABLE = "trajectories.csv"
+SEVERITY = "severity"
 """Column with one of our words."""
-SIGNAL: Final = "signal_"
+SIGNAL = "signal_"
 """Begins the names of the columns of signals, whose names and words are a stranger's."""
-MERGED: Final = "merged"
+MERGED = "merged"
 """Column of scenarios with an acceleration lane: 1 where the VUT has left it, else 0."""
-ROAD: Final = "road.xodr"
-CONTROLLER: Final = "EgoController"
+ROAD = "road.xodr"
+CONTROLLER = "EgoController"
 """Parameter that names the controller of a free VUT."""
-WHEEL_M: Final = 0.7
+WHEEL_M = 0.7
 
-FORMATS: Final = {
+FORMATS = {
     "sumo": "folders that sumo-gui replays",
     "openscenario": "folders with OpenSCENARIO and OpenDRIVE",
     "csv": "one table of motion",

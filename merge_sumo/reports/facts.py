@@ -10,7 +10,6 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
-from typing import Final
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.probability import PROBABILITY
@@ -26,20 +25,20 @@ from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, 
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import level_name
 
-PERCENT: Final = "%"
-STARTS_THAT_FAIL: Final = "starts that fail"
-STARTS: Final = "uniform starts of that"
-UNDECIDED: Final = "undecided"
-RULE: Final = "a case fails when"
-AT_MOST: Final = "cases at most; the search converged before"
-TOUCH: Final = "cases with contact that are no failures"
-DRIVEN: Final = "failures that reference drivers drove"
-AVOIDED: Final = "failures that driver {} avoids"
-AVOIDED_BY_POV: Final = "failures that a careful POV avoids"
-PROBABLY: Final = "probability that a case fails"
-WORST: Final = "worst case"
-KIND: Final = "kind of the worst case"
-SCATTERED: Final = "scattered"
+PERCENT = "%"
+STARTS_THAT_FAIL = "starts that fail"
+STARTS = "uniform starts of that"
+UNDECIDED = "undecided"
+RULE = "a case fails when"
+AT_MOST = "cases at most; the search converged before"
+TOUCH = "cases with contact that are no failures"
+DRIVEN = "failures that reference drivers drove"
+AVOIDED = "failures that driver {} avoids"
+AVOIDED_BY_POV = "failures that a careful POV avoids"
+PROBABLY = "probability that a case fails"
+WORST = "worst case"
+KIND = "kind of the worst case"
+SCATTERED = "scattered"
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import io
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-TRUTH: Final = "truth"
-LEVEL_LOOKS: Final = {
+TRUTH = "truth"
+LEVEL_LOOKS = {
     0: ("#000000", "o"),
     1: ("#CC79A7", "s"),
     2: ("#56B4E9", "^"),
     OWN: ("#009E73", "D"),
 }
 """Colour and marker of each level."""
-KINDS: Final = (".png", ".svg")
-STYLE: Final[Any] = {
+KINDS = (".png", ".svg")
+STYLE: Any = {
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,

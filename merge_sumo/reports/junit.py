@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
 
 from lxml import etree
 
@@ -29,11 +28,11 @@ from merge_sumo.reports.text import change_in_words, step_headline
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
-CLASS: Final = "merge-sumo"
+CLASS = "merge-sumo"
 
-JUNIT: Final = (".xml",)
+JUNIT = (".xml",)
 """Endings of the name of such a file."""
-REGRESSION: Final = "regression"
+REGRESSION = "regression"
 """Type of a case that fails and passes with an earlier version."""
 
 

@@ -6,7 +6,7 @@ import base64
 import hashlib
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
@@ -17,10 +17,10 @@ from merge_sumo.scenario.scenario import level_name
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-X_AXIS: Final = "x, m (0 at M, negative before it)"
+X_AXIS = "x, m (0 at M, negative before it)"
 """The label of positions over time, in all charts."""
-TEMPLATES: Final = Path(__file__).parent / "templates"
-ERROR_CHARACTERS: Final = 2000
+TEMPLATES = Path(__file__).parent / "templates"
+ERROR_CHARACTERS = 2000
 """Of a message or a setting in a page; the files of the run folder have the whole."""
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
@@ -20,9 +20,9 @@ from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 from merge_sumo.scenario.scenario import level_name
 
-PER: Final = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
+PER = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
 """Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
-LINES: Final = 10
+LINES = 10
 """Maximum number of progress lines without a terminal."""
 
 

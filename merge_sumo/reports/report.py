@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import Final, Self
+from typing import Self
 
 import msgspec
 from markupsafe import Markup
@@ -35,11 +35,11 @@ from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import OnPart, ReportModel
 from merge_sumo.reports.text import comparison_headline, robustness
 
-REPORT: Final = "report.html"
+REPORT = "report.html"
 """By this a report is known as ours, and may be replaced by a newer one."""
-FIRST_S: Final = 2.0
+FIRST_S = 2.0
 """Seconds after which the report of a running campaign first appears."""
-EVERY_S: Final = 5
+EVERY_S = 5
 """Minimum time between two reports of a running campaign, in s."""
 
 
@@ -115,7 +115,7 @@ def check_report(folder: Path) -> None:
     check_ours(folder / AGAINST_PAGE)
 
 
-LEVEL_ABOUT: Final = {
+LEVEL_ABOUT = {
     0: "keeps its speed",
     1: "makes room for a VUT that accelerates",
     2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Sequence
 from itertools import combinations
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -27,10 +27,10 @@ from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, l
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
 
-SPEED_UNIT_MPS: Final = 0.002
+SPEED_UNIT_MPS = 0.002
 """Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
-COUNT_GRID: Final = (32, 20)
-GRID: Final[dict[int, Grid]] = {2: (49, 49, 1), 3: (33, 33, 9)}
+COUNT_GRID = (32, 20)
+GRID: dict[int, Grid] = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
 
 Axes = tuple[int, int]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.analysis.comparison import compare_against
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
@@ -29,9 +29,9 @@ from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import LEVELS
 
-LISTED: Final = 10
+LISTED = 10
 """Cases in a list, and messages of errors and timeouts."""
-SHOWN: Final = 2000
+SHOWN = 2000
 """Cases that the page holds one by one, with their motion; more are shown as counts."""
 
 OnPart = Callable[[int, int], None]

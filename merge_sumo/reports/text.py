@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.analysis.comparison import (
     LISTED,
@@ -43,7 +43,7 @@ from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
-FRAGILE: Final = 10
+FRAGILE = 10
 """Failures that are not robust that a sentence names."""
 
 # Comparisons

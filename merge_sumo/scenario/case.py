@@ -13,7 +13,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,10 +41,10 @@ from merge_sumo.scenario.scenario import (
 )
 
 FloatArray = NDArray[np.float64]
-_IMPERFECTIONS: Final = attrgetter(*COORDINATES)
-_NONE: Final = (None,) * len(COORDINATES)
-_PERFECT: Final = (PERFECT_SENSING, PERFECT_ACTUATION)
-MOST_DRAWS: Final = 2**32
+_IMPERFECTIONS = attrgetter(*COORDINATES)
+_NONE = (None,) * len(COORDINATES)
+_PERFECT = (PERFECT_SENSING, PERFECT_ACTUATION)
+MOST_DRAWS = 2**32
 """Draws of a case: their numbers have 4 bytes."""
 
 

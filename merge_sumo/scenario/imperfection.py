@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, Final, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import either, meant
@@ -152,7 +152,7 @@ class Actuation(Imperfection):
     power_w_per_kg: Amount | None = None
 
 
-RANGES: Final[dict[type, dict[str, Bounds]]] = {
+RANGES: dict[type, dict[str, Bounds]] = {
     Sensing: {
         "delay_s": (0.0, 5.0),
         "noise_x_m": (0.0, 100.0),
@@ -164,11 +164,11 @@ RANGES: Final[dict[type, dict[str, Bounds]]] = {
     Actuation: {"lag_s": (0.0, 5.0), "delay_s": (0.0, 5.0), "power_w_per_kg": (1.0, 1000.0)},
 }
 """What the numbers can be, by field."""
-PERFECT_SENSING: Final = Sensing()
-PERFECT_ACTUATION: Final = Actuation()
+PERFECT_SENSING = Sensing()
+PERFECT_ACTUATION = Actuation()
 
-SENSE: Final = "sense"
-ACT: Final = "act"
+SENSE = "sense"
+ACT = "act"
 
 
 def with_numbers(imperfection: Kind, prefix: str, case: Any) -> Kind:

@@ -12,7 +12,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from msgspec import Meta
 
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-DT_S: Final = 0.1
+DT_S = 0.1
 """Step of the equations of motion, eq. (4)."""
-LEVELS: Final = (0, 1, 2)
+LEVELS = (0, 1, 2)
 """Levels of reasoning of the POV."""
-OWN: Final = 3
+OWN = 3
 """Stands for a level where a user's own controller is the POV; users write and read "own"."""
-ALL_LEVELS: Final = (*LEVELS, OWN)
-DEADLINE_S: Final = 5.0
+ALL_LEVELS = (*LEVELS, OWN)
+DEADLINE_S = 5.0
 """A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
-MEMORY_GIB: Final = 4.0
+MEMORY_GIB = 4.0
 """A user's code that takes more memory than this fails to get it."""
-MAX_EPISODE_S: Final = 120.0
+MAX_EPISODE_S = 120.0
 """No scenario lets an episode last longer."""
 
-MAX_FOLLOW_UP_S: Final = 30.0
+MAX_FOLLOW_UP_S = 30.0
 """Longest follow-up of vehicles after M."""
 
-ROOM_AFTER_M: Final = 2000.0
+ROOM_AFTER_M = 2000.0
 """Minimum length of the road after M."""
 
 Bounds = tuple[float, float]
@@ -88,7 +88,7 @@ class Notation:
     symbol: str
 
 
-COORDINATES: Final = {
+COORDINATES = {
     "sense_delay_s": Notation("sensing delay", "s", 2, "sensing delay (s)"),
     "sense_noise_x_m": Notation("noise of x", "m", 2, "noise of $x$ (m)"),
     "sense_noise_v_mps": Notation("noise of v", "m/s", 2, "noise of $v$ (m/s)"),
@@ -101,18 +101,18 @@ COORDINATES: Final = {
 }
 """Coordinates of the pool, by the fields of a case: `SENSE` or `ACT`, and the field of those."""
 
-SVO: Final = Dimension("svo_rad", 0.0, math.pi / 2)
+SVO = Dimension("svo_rad", 0.0, math.pi / 2)
 """psi in [0, pi/2): the upper end itself is outside the pool."""
 
-POV: Final = 0
-VUT: Final = 1
-AHEAD: Final = 2
-BEHIND: Final = 3
+POV = 0
+VUT = 1
+AHEAD = 2
+BEHIND = 3
 """Rows of the vehicles of an episode, in every array that has one for each. The mainline is driven
 on by the POV and, in traffic, by a car ahead of it and one behind it."""
-VEHICLES: Final = ("pov", "vut", "ahead", "behind")
+VEHICLES = ("pov", "vut", "ahead", "behind")
 """Their names."""
-COLOURS: Final = {"pov": "#e69f00", "vut": "#0072b2", "ahead": "#009e73", "behind": "#a6518b"}
+COLOURS = {"pov": "#e69f00", "vut": "#0072b2", "ahead": "#009e73", "behind": "#a6518b"}
 """Their colours in every picture (Okabe and Ito, 2008); `report.css` has lighter ones for dark
 pages."""
 Vehicle = Annotated[str, Meta(pattern="^(pov|vut|ahead|behind)$", description="a vehicle's name")]
@@ -127,10 +127,10 @@ def rgb(vehicle: str) -> tuple[int, int, int]:
     return red, green, blue
 
 
-_LENGTH_M: Final = (0.1, 100.0)
-_SPEED_MPS: Final = (0.0, 100.0)
-_HEADWAY_S: Final = (0.0, 60.0)
-RANGES: Final[dict[str, Bounds]] = {
+_LENGTH_M = (0.1, 100.0)
+_SPEED_MPS = (0.0, 100.0)
+_HEADWAY_S = (0.0, 60.0)
+RANGES: dict[str, Bounds] = {
     "x_pov0_m": (-5000.0, 0.0),
     "v_pov0_mps": _SPEED_MPS,
     "x_vut0_m": (-5000.0, 0.0),
@@ -159,7 +159,7 @@ RANGES: Final[dict[str, Bounds]] = {
 }
 """What a road and its cars can have, by field: 360 km/h, 2 g, 5 km. Beyond, nothing is computed."""
 
-V_VUT0_MPS: Final = 18.0
+V_VUT0_MPS = 18.0
 """Speed at which the paper's VUT starts."""
 
 
@@ -402,7 +402,7 @@ class Scenario:
         return arrived
 
 
-US23: Final = Scenario()
+US23 = Scenario()
 """The paper's."""
 
 

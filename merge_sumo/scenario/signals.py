@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import groupby, islice
-from typing import Annotated, Any, Final
+from typing import Annotated, Any
 
 import numpy as np
 from msgspec import Meta
@@ -22,9 +22,9 @@ Left = dict[str, float | str]
 Signals = dict[str, tuple[float | str | None, ...]]
 """By name, a value for each row of the motion of a case; None where none was left."""
 
-MOST_NAMES: Final = 8
+MOST_NAMES = 8
 """Signals of a case; what else is left is dropped."""
-CHARACTERS: Final = 40
+CHARACTERS = 40
 """Of a name, and of a word."""
 
 

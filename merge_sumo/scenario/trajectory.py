@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Final
 
 import numpy as np
 
@@ -34,8 +33,8 @@ class End(StrEnum):
         return self in (End.VUT_ERROR, End.SIM_ERROR)
 
 
-REASON_CHARACTERS: Final = 600
-_ADDRESS: Final = re.compile("0x[0-9a-fA-F]{6,}")
+REASON_CHARACTERS = 600
+_ADDRESS = re.compile("0x[0-9a-fA-F]{6,}")
 
 
 def as_reason(text: str) -> str:

@@ -14,7 +14,6 @@ import zlib
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
@@ -27,9 +26,9 @@ from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.simulator import Simulator, corridors_of
 
-CHECKED_SHARE: Final = 0.01
+CHECKED_SHARE = 0.01
 """Least share of the cases that run in SUMO as well."""
-CHUNK: Final = 2500
+CHUNK = 2500
 """Cases that a worker takes at a time. A number of its own, whatever the workers, so that the same
 cases are checked."""
 CORRIDORS = 512

@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from merge_sumo.controllers.kinds import runs_code
 from merge_sumo.controllers.spec import ControllerKind
@@ -21,7 +21,7 @@ from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.workers import AnyWorkers
 
-MAX_CORRIDORS: Final = 32
+MAX_CORRIDORS = 32
 """Episodes that one process runs at a time."""
 
 

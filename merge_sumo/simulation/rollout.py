@@ -6,7 +6,6 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 
@@ -33,7 +32,7 @@ WRONGS = (Exception, SystemExit)
 OF_THE_POV = "the POV: "
 """Begins the reason of an error that is the doing of a POV."""
 
-MAX_DEATHS: Final = 2
+MAX_DEATHS = 2
 """A case that ends the process of its controller this often, alone, is at fault: once may have come
 from outside."""
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import torch
@@ -28,7 +27,7 @@ from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.game import Game, exploring_starts
 from merge_sumo.training.reward import RewardParts, Role
 
-SQUASH_BELOW: Final = -2.0
+SQUASH_BELOW = -2.0
 GAMES = 64
 """Games that are played at once."""
 

@@ -22,7 +22,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 import torch
@@ -36,9 +35,9 @@ from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import TrainingProgress, as_torch, descend, export, squash
 from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy, inputs_of
 
-BETTER: Final = 1e-3
+BETTER = 1e-3
 """A game that was found is better than the policy's where its return is higher by more."""
-COST_CAP: Final = 1.0
+COST_CAP = 1.0
 """A choice that costs more is wrong enough: what a crash costs must not drown the rest."""
 
 

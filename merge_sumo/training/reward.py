@@ -11,7 +11,7 @@ Every phi is 0 or negative, but for the reward of a wide gap in `phi_dx`. No dis
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, Self
+from typing import Literal, Self
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, Scenario, Units
 
 Role = Literal["pov", "vut"]
-FULL_GAP_M: Final = 45.0
+FULL_GAP_M = 45.0
 """In the paper's scenario a gap is full when it is this much wider than one that is not critical:
 what a vehicle on the level-0 profile drives in 1.6 s."""
 
