@@ -229,6 +229,11 @@ def paired(
     """Return the cases of both, what broke first, the worst first; see `Change` for the order.
 
     `tolerated` is the share of its runs in which a case may fail.
+
+    Args:
+        before: outcomes of the earlier version.
+        after: outcomes of the later version.
+        tolerated: share of its runs in which a case may fail.
     """
     first, second = _by_case(before, tolerated), _by_case(after, tolerated)
     cases = [
@@ -439,7 +444,13 @@ def compare_against(run: Run) -> Comparison | None:
 
 
 def of_two(before: Version, after: Version, source: str) -> Comparison:
-    """Return the comparison of two versions that ran the same cases."""
+    """Return the comparison of two versions that ran the same cases.
+
+    Args:
+        before: the earlier version.
+        after: the later version.
+        source: where the cases are from, as a text.
+    """
     return Comparison((before, after), (_step((before, after), 1),), source)
 
 

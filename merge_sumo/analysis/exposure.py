@@ -163,6 +163,11 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
 
     It is cut off at the pool's bounds. Raises `UserError` with the place in the file where it is no
     distribution over the cases of `levels`.
+
+    Args:
+        path: the JSON file; None for the uniform distribution.
+        levels: levels of the cases.
+        scenario: scenario of the cases.
     """
     coordinates = scenario.dimensions(2)
     fields = [(d.field, Marginal, Uniform()) for d in coordinates]

@@ -197,6 +197,11 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
 
     Raises `UserError` for a distribution, a traffic or numbers that make no sense, for a campaign
     with a net or POVs of another day, and for a file that exists or cannot be written.
+
+    Args:
+        study: the study of the campaign.
+        asked: options of the verb.
+        out: new file for the result.
     """
     levels, scenario = study.settings.levels, study.settings.scenario
     cases = DEFAULT_CASES[study.plan.engine] if asked.cases is None else asked.cases
@@ -280,6 +285,12 @@ def draw(
     """Return independent cases of each stratum, as often as they occur there.
 
     They are places in the distribution, (n, d), uniform in the unit cube, for each of the cells.
+
+    Args:
+        cells: cells of each stratum.
+        scenario: scenario of the cases.
+        cases: number of cases in all.
+        rng: random generator.
     """
     expected = sum(one.share for one in cells if one.expects_failures)
     some = cases > 1 and 0.0 < expected < 1.0 - 1e-9

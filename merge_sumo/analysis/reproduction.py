@@ -213,6 +213,12 @@ def reproduce(
 
     The POVs are those of `policies`, by default the shipped ones; `on_part` is told how far it is.
     Raises `UserError` where a level has no POV.
+
+    Args:
+        scale: numbers of cases and seeds.
+        policies: folder of the POV networks; by default the shipped ones.
+        workers: where cases run; by default this process.
+        on_part: called with the title of a part, its cases that are done, and all.
     """
     povs = Povs(policies=policies or policies_of(US23))
 

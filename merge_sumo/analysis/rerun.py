@@ -40,6 +40,11 @@ def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[O
     """Return cases of a campaign by their indices, by default all, of some levels or of all.
 
     Raises `UserError` for an index without a case, and where there is no such case.
+
+    Args:
+        run: the campaign.
+        indices: indices of cases; none for all.
+        level: levels of the cases.
     """
     found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
     asked, there = names_of_levels(level), tuple(map(level_name, run.levels))

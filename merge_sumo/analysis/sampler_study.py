@@ -150,7 +150,13 @@ class Study:
     engine: str | None = None
 
     def truth(self, level: int, cases: int | None = None, seed: int = 0) -> Truth:
-        """Return the truth at a level, from the cache where it is kept."""
+        """Return the truth at a level, from the cache where it is kept.
+
+        Args:
+            level: level of the POV.
+            cases: number of cases; by default that of the study.
+            seed: seed of the cases.
+        """
         total, ended = TRUTH_CASES[level] if cases is None else cases, 0
         title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
 
@@ -179,6 +185,11 @@ class Study:
         """Let each sampler search with the seeds 0, 1, ... beside the truth of each level.
 
         A dense truth is used where the cache has one.
+
+        Args:
+            levels: levels of the POV.
+            samplers: names of the samplers.
+            asked: options of the verb.
         """
         truths = {level: self.truth(level, asked.truth_cases) for level in levels}
         kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
@@ -194,7 +205,15 @@ class Study:
         cases: int,
         batch: int | None,
     ) -> dict[str, list[SamplerRun]]:
-        """Let each sampler search with each seed; return the searches by sampler."""
+        """Let each sampler search with each seed; return the searches by sampler.
+
+        Args:
+            levels: levels of the POV.
+            samplers: names of the samplers.
+            seeds: number of seeds.
+            cases: cases of a search.
+            batch: cases of a batch; None for the wish of the sampler.
+        """
         numbers = range(seeds)
         tasks = [Task(name, levels, cases, batch, seed) for name in samplers for seed in numbers]
         for level in levels:

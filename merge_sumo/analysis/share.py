@@ -172,7 +172,14 @@ def stream(seed: int, level: int) -> np.random.Generator:
 def uniform_cases(
     scenario: Scenario, level: int, count: int, rng: np.random.Generator
 ) -> list[Case]:
-    """Return uniform cases of a level."""
+    """Return uniform cases of a level.
+
+    Args:
+        scenario: scenario of the cases.
+        level: level of the POV.
+        count: number of cases.
+        rng: random generator.
+    """
     points = rng.random((count, len(scenario.dimensions(level))))
     return Pool(levels=(level,), scenario=scenario).cases(points, level)
 

@@ -52,7 +52,13 @@ def nodes(grid: Grid) -> FloatArray:
 def learn_surface(
     outcomes: Sequence[Outcome], level: int, tolerated: float = 0.0
 ) -> Surface | None:
-    """Return the surrogate of a level, or None where too few cases failed to learn from."""
+    """Return the surrogate of a level, or None where too few cases failed to learn from.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        level: level of the POV.
+        tolerated: share of its runs in which a case may fail.
+    """
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     if not at_level:
         return None

@@ -208,7 +208,15 @@ def _run(
 def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
-    """Return the truth that the cache has, by whichever engine; None where it has none."""
+    """Return the truth that the cache has, by whichever engine; None where it has none.
+
+    Args:
+        plan: how the cases would run.
+        level: level of the POV.
+        cases: number of cases.
+        seed: seed of the cases.
+        cache: folder of the truths; by default that of the user.
+    """
     plan = plan.for_verdicts()
     found = TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
     return None if found is None else found[0]
@@ -243,7 +251,13 @@ class TruthKey:
         cache: Path | None = None,
         engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
     ) -> tuple[Truth, Path] | None:
-        """Return the truth that is kept by the first of some engines, and its file; or None."""
+        """Return the truth that is kept by the first of some engines, and its file; or None.
+
+        Args:
+            scenario: scenario of the cases.
+            cache: folder of the truths; by default that of the user.
+            engines: engines in the order of preference.
+        """
         for engine in engines:
             path = replace(self, engine=engine).path(cache)
             truth = read_truth(path, self.level, self.cases, scenario)
@@ -257,6 +271,12 @@ def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth 
 
     None where there is none, or it is torn, of other shapes or types, or another truth under this
     name, others can write the cache, or a file that the VUT loaded is not what it was.
+
+    Args:
+        path: the file.
+        level: level that it is to hold.
+        cases: number of cases that it is to hold.
+        scenario: scenario of the cases.
     """
     dims = len(scenario.dimensions(level))
     try:

@@ -178,7 +178,13 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
 
 
 def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelKDriver:
-    """Return the driver that acts by a network."""
+    """Return the driver that acts by a network.
+
+    Args:
+        name: name of the network.
+        corridors: number of corridors.
+        folder: folder of the networks; by default the shipped ones.
+    """
     return LevelKDriver(corridors, load_network(name, folder))
 
 

@@ -255,6 +255,11 @@ def cause(outcome: Outcome, trajectory: Trajectory | None, others: str = "") -> 
     """Return in a sentence what happened in a case, and for a failure what would have avoided it.
 
     `trajectory` is None where the motion is lost. `others` is a clause on other drivers.
+
+    Args:
+        outcome: the outcome.
+        trajectory: its motion; None where that is lost.
+        others: a clause on other drivers.
     """
     avoided = "; ".join(clause for clause in (_way_out(outcome), others) if clause)
     fails_behind = outcome.is_tested and outcome.measures.error is not None

@@ -159,7 +159,14 @@ class Criterion:
     def outcome(
         self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
     ) -> Outcome:
-        """Return the outcome of an episode at a place in a campaign."""
+        """Return the outcome of an episode at a place in a campaign.
+
+        Args:
+            index: index of the case.
+            batch: number of its batch.
+            trajectory: the motion.
+            lines: centre lines of the road.
+        """
         measures = Measures.of(trajectory, lines)
         margin = self.margin(trajectory, measures)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
@@ -176,7 +183,13 @@ class Criterion:
     def is_close_call(
         self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
     ) -> bool:
-        """Return whether another motion, by a rounding error in m, could have another verdict."""
+        """Return whether another motion, by a rounding error in m, could have another verdict.
+
+        Args:
+            trajectory: the motion.
+            rounding: largest rounding error of a position, m.
+            lines: centre lines of the road.
+        """
         if self.is_papers:
             last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
             return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)

@@ -179,7 +179,13 @@ class Conflict(NamedTuple):
 
     @classmethod
     def find(cls, motion: FloatArray, merges: int | None, lengths_m: tuple[float, float]) -> Self:
-        """Find it in x and v, (T + 1, A, 2), with a VUT in that lane from a row on, or never."""
+        """Find it in x and v, (T + 1, A, 2), with a VUT in that lane from a row on, or never.
+
+        Args:
+            motion: x and v of all vehicles, (T + 1, A, 2), m and m/s.
+            merges: first row in which the VUT is on the mainline; None for never.
+            lengths_m: lengths of the VUT and of the other cars.
+        """
         if merges is None:
             return cls(len(motion) - 1, "the end of the episode")
         gap_m, closing_mps = gaps_m(motion[merges:], lengths_m)

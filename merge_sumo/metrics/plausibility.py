@@ -25,6 +25,11 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
 
     Of a criterion that says the same of all cases, a neighbour that would not. `vain` are commands
     that changed nothing: see `in_vain`.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        criterion: the failure criterion.
+        vain: number of cases by command that had no effect.
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]

@@ -23,6 +23,11 @@ def regression(new: Outcome, old: Outcome, prediction: Prediction | None = None)
 
     It has the measures of the new version, and its margin is not that of the score. Without a
     verdict on both versions it has none.
+
+    Args:
+        new: outcome of the new version.
+        old: outcome of the earlier version.
+        prediction: prediction of the case.
     """
     silent = next((outcome for outcome in (new, old) if outcome.margin is None), None)
     if silent is not None:

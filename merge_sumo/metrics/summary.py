@@ -154,6 +154,11 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
 
     By the posterior of Jeffreys' prior. The first failure is left out: by it the case was noticed.
     With none tolerated a failure decides, and nothing else.
+
+    Args:
+        failures: number of failing runs.
+        runs: number of runs.
+        tolerated: share of its runs in which a case may fail.
     """
     if not tolerated:
         return failures > 0
@@ -164,7 +169,13 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
 
 @cache
 def runs_needed(failures: int, runs: int, tolerated: float) -> int:
-    """Return how many further runs of a case decide at least; 0 from `MOST_RUNS` on."""
+    """Return how many further runs of a case decide at least; 0 from `MOST_RUNS` on.
+
+    Args:
+        failures: number of failing runs.
+        runs: number of runs.
+        tolerated: share of its runs in which a case may fail.
+    """
     further = 0
     while runs + further < MOST_RUNS:
         ends = failures, failures + further
@@ -187,6 +198,11 @@ def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float
     """Return the exact interval of a probability by independent cases; (0, 1) without any.
 
     Source: Clopper and Pearson (1934). Never for cases that a sampler has chosen.
+
+    Args:
+        failures: number of failures.
+        cases: number of independent cases.
+        confidence: confidence level of the interval.
     """
     from scipy.stats import binomtest
 
@@ -238,6 +254,11 @@ def summarise(
     """Return the summary of outcomes, at the given levels and where else there are any.
 
     A case counts once, by the run that stands for it where a share of its runs is `tolerated`.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        levels: levels to report, also without cases.
+        tolerated: share of its runs in which a case may fail.
     """
     every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
     unsure = undecided(outcomes, tolerated)
@@ -452,6 +473,11 @@ class Gate:
 
         `regressions` are the cases that fail and pass with the version that the campaign is
         against.
+
+        Args:
+            verdict: verdict on the campaign.
+            summary: summary of the campaign.
+            regressions: number of cases that fail now and pass with the earlier version.
         """
         if self.what == "fmc":
             by_level = {level: found.fmc for level, found in summary.levels.items()}

@@ -128,7 +128,14 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
 
 
 def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
-    """Return a cases file for a path; `vut` is who drove."""
+    """Return a cases file for a path; `vut` is who drove.
+
+    Args:
+        run: the campaign.
+        outcomes: its cases to write.
+        path: path of the file.
+        vut: the VUT that drove.
+    """
     scenario = run.scenario
     ordered = sorted(outcomes, key=lambda one: (one.case.level, one.index))
     usual, place = {one.name: one.default for one in fields(scenario)}, scenario.to_record()

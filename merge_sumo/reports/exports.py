@@ -169,6 +169,12 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
     The reference point of each car is its front bumper, as in the record: x, y and heading are
     those of SUMO's record, and the bounding box lies behind them. Raises `UserError` when the
     folder exists or the package scenariogeneration is missing.
+
+    Args:
+        run: the campaign.
+        index: index of the case.
+        folder: new folder to write.
+        road: corridor of the scenario.
     """
     try:
         importlib.import_module("scenariogeneration.xosc")

@@ -77,6 +77,11 @@ def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
     """Return the facts of a campaign, by what its folder holds.
 
     Raises `UserError` where a file of a study is not as it was written.
+
+    Args:
+        run: the campaign.
+        summary: its summary.
+        verdict: its verdict.
     """
     unsure = undecided(run.outcomes, run.tolerated)
     return [

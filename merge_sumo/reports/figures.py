@@ -120,6 +120,11 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
 
     The pale discs around failures are what FMC counts; of three coordinates the first two are
     drawn, without discs.
+
+    Args:
+        title: title of the figure.
+        panels: what each panel shows, by its title.
+        level: level of the POV.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
@@ -181,7 +186,14 @@ def _pool_axes(axes: Axes, level: int) -> None:
 def predicted_margins(
     title: str, by_batch: Mapping[int, PredictedMargins], level: int, truth: FloatArray
 ) -> Figure:
-    """Draw the surrogate's margin after some batches, with the failures of the truth, (m, 2)."""
+    """Draw the surrogate's margin after some batches, with the failures of the truth, (m, 2).
+
+    Args:
+        title: title of the figure.
+        by_batch: predicted margins by the title of a panel.
+        level: level of the POV.
+        truth: failing cases of the truth, (m, 2).
+    """
     x, v = US23.dimensions(level)
     steps = np.linspace(-1.0, 1.0, 21)
     failures = _physical(truth, level)

@@ -46,7 +46,15 @@ def check_junit(path: Path, folder: Path) -> None:
 def write_junit(
     path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> None:
-    """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written."""
+    """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written.
+
+    Args:
+        path: new file to write.
+        run: the campaign.
+        facts: its facts.
+        verdict: its verdict.
+        gates: results of its gates.
+    """
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, facts, verdict, gates)
     compared = compare_against(run)

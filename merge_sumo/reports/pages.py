@@ -27,7 +27,14 @@ ERROR_CHARACTERS = 2000
 def page(
     template: str, *, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **words: Any
 ) -> str:
-    """Return a page as HTML, with style sheets and scripts in it, by name, and words as needed."""
+    """Return a page as HTML, with style sheets and scripts in it, by name, and words as needed.
+
+    Args:
+        template: name of the template.
+        styles: names of style sheets to include.
+        scripts: names of scripts to include.
+        words: variables of the template.
+    """
     own = {}
     for name, files in (("style", styles), ("script", scripts)):
         source = "".join(map(source_of, files))

@@ -27,7 +27,13 @@ LINES = 10
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
-    """Return a readable rate: "7,140 cases/s", "12 cases/s", "3.5 cases/min"."""
+    """Return a readable rate: "7,140 cases/s", "12 cases/s", "3.5 cases/min".
+
+    Args:
+        count: number of things done.
+        elapsed_s: time that they took.
+        unit: name of the things.
+    """
     if count <= 0.0 or elapsed_s <= 0.0:
         return f"- {unit}/s"
     rates = [(count / elapsed_s * seconds, name) for seconds, name in PER]
@@ -110,6 +116,13 @@ class Bars:
         """Set a bar that counts things called `unit`, with their rate and the time left.
 
         A `note` that takes time to make is a function; it is called when it is shown.
+
+        Args:
+            title: title of the bar.
+            done: number of things done.
+            total: number of all things.
+            unit: name of the things.
+            note: text after the bar.
         """
         # What ends first began before: with the others, or when the bar before was full.
         start_s = self._opened_s if done else time.monotonic()

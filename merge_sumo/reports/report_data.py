@@ -203,6 +203,12 @@ def map_data(
     A level with two coordinates has one map; with a third, the reader moves through it. Of more, a
     map shows the cases in a pair, without a chance to fail. `others` are outcomes that the page
     counts instead of showing one by one.
+
+    Args:
+        scenario: scenario of the campaign.
+        level: level of the POV.
+        others: outcomes that are counted and not drawn.
+        surface: surrogate of the level; None for no contour.
     """
     dims = len(scenario.dimensions(level))
     return {

@@ -32,7 +32,14 @@ class AnnealingSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` moves, (n, d), of the chains; a uniform batch at the start."""
+        """Return `n` moves, (n, d), of the chains; a uniform batch at the start.
+
+        Args:
+            history: outcomes of the level.
+            n: number of points.
+            rng: random generator.
+            level: level of the POV.
+        """
         if not len(history.points):
             return rng.random((n, history.dims))
         states = self._replay(history, level)

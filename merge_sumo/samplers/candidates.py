@@ -17,7 +17,13 @@ REFINED_REACH = 0.6
 def surrogate_candidates(
     surrogate: FailureProbability, n: int, rng: np.random.Generator
 ) -> FloatArray:
-    """Return more than `n` candidates, (m, d), of the surrogate alone."""
+    """Return more than `n` candidates, (m, d), of the surrogate alone.
+
+    Args:
+        surrogate: surrogate of the level.
+        n: size of the batch.
+        rng: random generator.
+    """
     history = surrogate.history
     centres = history.points[history.failed]
     if not len(centres):

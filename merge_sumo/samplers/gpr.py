@@ -67,7 +67,14 @@ class GprSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` points by lines 1 to 9 of Algorithm 1."""
+        """Return `n` points by lines 1 to 9 of Algorithm 1.
+
+        Args:
+            history: outcomes of the level.
+            n: number of points.
+            rng: random generator.
+            level: level of the POV.
+        """
         if not len(history.points):
             return rng.random((n, history.dims))
         queries = rng.random((QUERIES, history.dims))

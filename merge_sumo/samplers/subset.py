@@ -89,7 +89,14 @@ class SubsetSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return the next move of `n` chains, (n, d), or uniform points at first."""
+        """Return the next move of `n` chains, (n, d), or uniform points at first.
+
+        Args:
+            history: outcomes of the level.
+            n: number of points.
+            rng: random generator.
+            level: level of the POV.
+        """
         state = replay(history)
         if state.number == 0:
             return rng.random((n, history.dims))

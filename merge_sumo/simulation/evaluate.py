@@ -126,7 +126,13 @@ def evaluate(
 def submit_cases(
     plan: SimulationPlan, cases: Sequence[Case], workers: Workers
 ) -> Job[Case, Episode]:
-    """Submit cases to workers, a share to each; `collect` returns their episodes in order."""
+    """Submit cases to workers, a share to each; `collect` returns their episodes in order.
+
+    Args:
+        plan: how the cases run.
+        cases: cases of the scenario of the plan.
+        workers: where they run.
+    """
     size = workers.chunk_size(len(cases))
     chunks = [cases[first : first + size] for first in range(0, len(cases), size)]
     return workers.submit(partial(simulate, plan), chunks, partial(lost, plan))

@@ -199,7 +199,13 @@ class SimulationPlan:
 
 
 def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Return by name where two records differ, with both values; None for one that is missing."""
+    """Return by name where two records differ, with both values; None for one that is missing.
+
+    Args:
+        was: the earlier record.
+        now: the present record.
+        name: name of the record, before a dot.
+    """
     if isinstance(was, dict) and isinstance(now, dict):
         differing: dict[str, tuple[Any, Any]] = {}
         for key in now | was:

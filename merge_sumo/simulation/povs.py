@@ -94,7 +94,13 @@ def levels_in(policies: Path, *, own: bool) -> tuple[int, ...]:
 
 
 def check_level(level: int, policies: Path, *, own: bool) -> None:
-    """Raise `UserError` where there is no POV of a level."""
+    """Raise `UserError` where there is no POV of a level.
+
+    Args:
+        level: level of the POV.
+        policies: folder of the networks.
+        own: whether the user names a POV.
+    """
     if level not in ALL_LEVELS:
         raise UserError(f"there is no POV level {level}: choose {CHOICE}")
     if level == OWN and not own:

@@ -217,7 +217,13 @@ class Rollout:
         return next(self.queue, (-1, None))
 
     def begin(self, corridor: int, index: int, case: Case | None) -> None:
-        """Begin an episode in a corridor, or park it."""
+        """Begin an episode in a corridor, or park it.
+
+        Args:
+            corridor: index of the corridor.
+            index: index of the case in the rollout.
+            case: the case; None to leave the corridor empty.
+        """
         self.active[corridor] = case is not None
         self.step[corridor] = self.clipped[corridor] = 0
         if self.merging is not None:
@@ -315,6 +321,11 @@ class Rollout:
 
         An error behind M ends the follow-up alone: the VUT has merged. After a merge from an
         acceleration lane it is one of the episode, because the time after the merge is judged.
+
+        Args:
+            corridor: index of the corridor.
+            end: how the episode ends.
+            error: message of an error; None without one.
         """
         episode = self.episodes[corridor]
         assert episode is not None, "only running episodes end"  # noqa: S101

@@ -93,7 +93,14 @@ def corridors_of(plan: SimulationPlan, most: int) -> int:
 
 
 def povs_for(scenario: Scenario, povs: Povs, corridors: int, sumo: World | None = None) -> Driver:
-    """Return the drivers of the mainline of a scenario, for the cars of K `corridors`."""
+    """Return the drivers of the mainline of a scenario, for the cars of K `corridors`.
+
+    Args:
+        scenario: the scenario.
+        povs: drivers of the POV by level.
+        corridors: number of corridors, K.
+        sumo: the simulation, for drivers of SUMO.
+    """
     library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
     drives_on = scenario.lane_m is not None or scenario.follow_up_s > 0.0
     return LanePov(library) if drives_on else library

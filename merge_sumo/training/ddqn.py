@@ -241,7 +241,13 @@ class _Collector:
         self.returns[which] = 0.0
 
     def collect(self, online: nn.Sequential, epsilon: float, replay: ReplayBuffer) -> None:
-        """Take one decision in every game, a random one with probability epsilon."""
+        """Take one decision in every game, a random one with probability epsilon.
+
+        Args:
+            online: network that decides.
+            epsilon: probability of a random action.
+            replay: buffer that takes the transitions.
+        """
         before = features(*self.state.T, scenario=self.game.of_agent)
         seen = before
         if self.sees_svo:
