@@ -1,4 +1,4 @@
-"""The model of the controller: it plays as SUMO does, learns, and is believed by its record."""
+"""The model of the controller: rollouts agree with SUMO, and predictions with outcomes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from support.plans import POVS, plan_for
 from merge_sumo.campaigns.run import Run
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
 from merge_sumo.road.merge import centre_lines, road_for
@@ -21,11 +20,9 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, Observation
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.scenario.case import (
-    Case,
     Pool,
 )
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.povs import Povs
 
@@ -43,10 +40,11 @@ def ran(vut: str, level: int, points, scenario=US23, povs=None):
     plan = plan_for(vut, scenario=scenario, povs=povs, corridors=16)
     pool = Pool(levels=(level,), scenario=scenario)
     done = simulate(plan, pool.cases(points, level))
-    return [
-        Outcome(index, index // 10, one.trajectory.case, one.outcome.measures)
-        for index, one in enumerate(done)
-    ], {index: one.trajectory.motion for index, one in enumerate(done)}
+    outcomes, motions = [], {}
+    for index, one in enumerate(done):
+        outcomes.append(Outcome(index, index // 10, one.trajectory.case, one.outcome.measures))
+        motions[index] = one.trajectory.motion
+    return outcomes, motions
 
 
 def gaps_of(outcomes) -> np.ndarray:
@@ -63,7 +61,7 @@ def whole(tmp_path_factory) -> Run:
     return run_campaign(SETTINGS, tmp_path_factory.mktemp("whole") / "run")
 
 
-class TestGames:
+class TestRollouts:
     @pytest.mark.parametrize(
         ("name", "level", "library"),
         [
@@ -129,7 +127,7 @@ class TestGames:
         assert not ModelRollout(Pool(levels=(0,), scenario=US23), POVS).can_predict(3)
 
 
-class TestWatching:
+class TestObservation:
     def test_sees_the_state_and_what_was_before(self):
         observation = Observation(US23, 1)
         for step in range(5):
@@ -144,8 +142,8 @@ class TestWatching:
         assert seen[25:27].tolist() == [-101.0, 10.0]
 
 
-class TestTwin:
-    def test_says_the_same_however_it_was_told(self, seen):
+class TestModel:
+    def test_predictions_do_not_depend_on_the_order_of_outcomes(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
         at_once, in_parts = (
@@ -158,21 +156,6 @@ class TestTwin:
         assert (at_once.predict({0: points})[0] == in_parts.predict({0: points})[0]).all()
 
 
-def outcome(
-    index: int, dx_m: float, prediction: Prediction | None = None, level: int = 0
-) -> Outcome:
-    case = Case(
-        level=level,
-        x_pov0_m=-300.0,
-        v_pov0_mps=30.0,
-        svo_rad=0.5 if level == 2 else None,
-        scenario=US23,
-    )
-    score = -600.0 if abs(dx_m) < 6.0 else -100.0
-    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
-    return Outcome(index, 0, case, measures, prediction)
-
-
 class TestPrediction:
     def test_is_read_as_it_was_written(self):
         one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
@@ -181,7 +164,7 @@ class TestPrediction:
 
 
 class TestACampaign:
-    def test_says_what_it_predicted(self, whole):
+    def test_records_predictions_near_the_outcomes(self, whole):
         known = [o for o in whole.outcomes if o.prediction is not None]
         assert len(known) >= 40
         last = known[-20:]
@@ -189,8 +172,8 @@ class TestACampaign:
         assert np.median(off) < 3.0
 
 
-def test_a_sampler_without_games_is_the_surrogate_alone():
+def test_a_sampler_without_a_model_uses_the_surrogate_alone(seen):
     sampler = CoverageSampler(Pool(levels=(0,), scenario=US23), 1)
-    sampler.tell([outcome(i, 30.0 + i) for i in range(5)])
+    sampler.tell(seen[0][:5])
     sampler.ask(3)
     assert [sampler.prediction(place) for place in range(3)] == [None] * 3

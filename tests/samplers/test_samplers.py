@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
@@ -41,14 +40,6 @@ class TestEverySampler(SamplerContract):
     @pytest.fixture(autouse=True)
     def _subject(self, name, pool):
         self.sampler, self.pool = SAMPLERS[name], pool
-
-
-class TestTheRegistry:
-    def test_names_the_samplers_that_there_are(self):
-        with pytest.raises(UserError) as error:
-            make_sampler("grp", Pool(levels=(0,), scenario=US23), 0)
-        for word in ("'grp'", *SAMPLERS):
-            assert word in str(error.value)
 
 
 class ProposedSampler(UniformSampler):
