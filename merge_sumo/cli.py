@@ -426,7 +426,7 @@ def main() -> None:
     for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     try:
-        # From here on, so that no signal finds a temporary folder that nobody removes.
+        # From here on, so that no signal leaves a temporary folder behind.
         with stopping_in_order():
             _check_working_folder()
             check_limits()

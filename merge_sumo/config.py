@@ -113,7 +113,7 @@ class Search:
     cases: int | None = None
     """Number of cases; by default until the search has converged, at most 800."""
     batch: int | None = None
-    """Cases per batch; by default as many as the sampler wants."""
+    """Cases per batch; by default the number that the sampler wants."""
     in_flight: int | None = None
     """Maximum number of cases that run or wait for a worker while the sampler proposes more,
     instead of batches: for controllers that take seconds for a case. About three times the

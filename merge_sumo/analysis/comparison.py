@@ -178,7 +178,7 @@ class ComparedCase:
             return Change.WITHIN_CHANCE
         if before:
             return Change.BROKE
-        # The criterion is met, but nobody would say that the case is mended.
+        # The criterion is met, but the case is not mended.
         is_contact = self.b.measures.severity == Severity.CONTACT
         return Change.STILL_CONTACT if is_contact else Change.FIXED
 

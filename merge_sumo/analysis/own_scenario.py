@@ -1,4 +1,4 @@
-"""Scenarios of a person's own: written for a merge in a net, and checked before they are run."""
+"""Scenarios of a user: written for a merge in a net, and checked before they are run."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
 
     Args:
         scenario: the scenario.
-        name: what a person calls it.
+        name: its name.
         policies: folder of the learned drivers, by default of the shipped ones.
     """
     found = road_for(scenario)

@@ -95,7 +95,7 @@ def quick(seeds: int) -> Scale:
 
 
 def scale_of(asked: config.Reproduce) -> Scale:
-    """Return the scale that a person asks for; `UserError` for numbers that make none."""
+    """Return the scale of the options; `UserError` for numbers that make none."""
     check_least(asked, seeds=1)
     if asked.quick:
         return quick(2 if asked.seeds is None else asked.seeds)

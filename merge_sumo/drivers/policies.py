@@ -1,4 +1,4 @@
-"""Policies, shipped or a person's own: safetensors with a manifest that says what they are."""
+"""Policies, shipped or the user's own: safetensors with a manifest that says what they are."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def policies_name(folder: Path) -> str:
 
 
 def policies_in(folder: str | Path) -> Path:
-    """Return the policies that a person or a record names, as a whole path.
+    """Return the policies that a user or a record names, as a whole path.
 
     That is a folder, or the name of a shipped library. Raises `UserError` where there are none, or
     where a folder here has the name of a shipped library.

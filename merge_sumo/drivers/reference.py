@@ -278,7 +278,7 @@ class CarefulPov(Driver):
 
 
 def _x_pov_m(scene: Scene) -> FloatArray:
-    """Return the POV's position, (K,); relative to the VUT where an episode goes on behind M."""
+    """Return the POV's position, (K,); relative to the VUT where an episode goes on after M."""
     x_m: FloatArray = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
     return x_m
 

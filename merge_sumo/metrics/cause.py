@@ -263,7 +263,7 @@ def cause(outcome: Outcome, trajectory: Trajectory | None, others: str = "") -> 
     """
     avoided = "; ".join(clause for clause in (_way_out(outcome), others) if clause)
     fails_behind = outcome.is_tested and outcome.measures.error is not None
-    behind = "behind M an error ends the follow-up" if fails_behind else ""
+    behind = "after M an error ends the follow-up" if fails_behind else ""
     sentences = [_happened(outcome, trajectory), avoided, behind]
     return " ".join(f"{text[0].upper()}{text[1:].removesuffix('.')}." for text in sentences if text)
 

@@ -110,7 +110,7 @@ class Criterion:
             if MEASURES[name].only_with == FOLLOW_UP:
                 raise UserError(
                     f"`fail_when` speaks of {name}, which is measured "
-                    f"{scenario.said('behind M')}: say how long with `follow_up_s` SECONDS"
+                    f"{scenario.said('after M')}: say how long with `follow_up_s` SECONDS"
                 )
             if MEASURES[name].only_with == LANE:
                 raise UserError(

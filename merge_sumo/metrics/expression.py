@@ -50,7 +50,7 @@ def parse_condition(
     """Return the condition that a text states, and the text as Python would write it.
 
     Args:
-        text: what a person wrote.
+        text: the condition as the user wrote it.
         vocabulary: the values that it may speak of.
         what: where it stands, which begins every complaint.
         named: conditions that it may name, by their names.

@@ -404,7 +404,7 @@ class Measures:
 
     @measure()
     def error(self) -> str | None:
-        """What the VUT or the simulation did wrong, also behind M, else None."""
+        """What the VUT or the simulation did wrong, also after M, else None."""
         return None if self.trajectory.error is None else as_reason(self.trajectory.error)
 
     @measure(only_with=TRAFFIC, default=VEHICLES[POV])
@@ -412,7 +412,7 @@ class Measures:
         """Name of the car that the measures are of; recorded in traffic only."""
         return VEHICLES[self.trajectory.nearest]
 
-    @measure(worse="low", unit="m", label="smallest bumper gap behind M", only_with=FOLLOW_UP)
+    @measure(worse="low", unit="m", label="smallest bumper gap after M", only_with=FOLLOW_UP)
     def after_gap_m(self) -> float | None:
         """Least gap between bumpers in the follow-up, 0 or less where bodies touch.
 
@@ -422,7 +422,7 @@ class Measures:
         after = self._after()
         return None if after is None else float(after[0].min())
 
-    @measure(worse="low", unit="s", label="time to collision behind M", only_with=FOLLOW_UP)
+    @measure(worse="low", unit="s", label="time to collision after M", only_with=FOLLOW_UP)
     def after_ttc_s(self) -> float | None:
         """Lowest time to collision in it, between bumpers, 0 where bodies touch.
 
@@ -437,7 +437,7 @@ class Measures:
         closes = closing_mps > 0.0
         return float((gap_m[closes] / closing_mps[closes]).min(initial=math.inf))
 
-    @measure(worse="high", unit="m/s2", label="braking needed behind M", only_with=FOLLOW_UP)
+    @measure(worse="high", unit="m/s2", label="braking needed after M", only_with=FOLLOW_UP)
     def after_drac_mps2(self) -> float | None:
         """Hardest braking that it needs, dv^2 / (2 gap); None where bodies touch."""
         after = self._after()
@@ -447,7 +447,7 @@ class Measures:
         closes = closing_mps > 0.0
         return float((np.square(closing_mps[closes]) / (2.0 * gap_m[closes])).max(initial=0.0))
 
-    @measure(worse="high", unit="m/s2", label="hardest braking behind M", only_with=FOLLOW_UP)
+    @measure(worse="high", unit="m/s2", label="hardest braking after M", only_with=FOLLOW_UP)
     def after_brake_mps2(self) -> float | None:
         """Hardest braking in it of cars behind the VUT, and of the VUT behind the nearest car."""
         return braked_after_mps2(self.trajectory)

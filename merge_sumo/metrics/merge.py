@@ -75,7 +75,7 @@ def place_of_merge_m(trajectory: Trajectory) -> float:
 def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return the rows, (T + 1,), of the whole motion in which the VUT has left its lane.
 
-    There are none without an acceleration lane: ramp and mainline have the same lanes behind M.
+    There are none without an acceleration lane: ramp and mainline have the same lanes after M.
     """
     merged = np.zeros(len(trajectory.whole), dtype=np.bool_)
     leaves = trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED
@@ -84,9 +84,9 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
 
 
 def brake_after_mps2(trajectory: Trajectory) -> float:
-    """Return the deceleration, in m/s2, that somebody needs after the merge.
+    """Return the deceleration, in m/s2, that a car needs after the merge.
 
-    0 where nobody has to brake or the VUT never merged, infinite where bodies overlap or no braking
+    0 where no car has to brake or the VUT never merged, infinite where bodies overlap or no braking
     is in time. In traffic it is the largest that any car or the VUT needs.
     """
     needed_mps2 = [0.0]
@@ -116,7 +116,7 @@ def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
 
 
 def braked_after_mps2(trajectory: Trajectory) -> float | None:
-    """Return the hardest braking behind M, in m/s2, of those that are behind another there.
+    """Return the hardest braking after M, in m/s2, of those that are behind another there.
 
     They are the cars behind the VUT at M, and the VUT itself where the nearest car is ahead of it.
     None without a follow-up.

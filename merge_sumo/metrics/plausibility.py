@@ -37,7 +37,7 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
 
 
 def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield in how many cases a driver fails behind M, where a verdict stands already."""
+    """Yield in how many cases a driver fails after M, where a verdict stands already."""
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:
         first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"

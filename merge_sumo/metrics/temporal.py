@@ -99,7 +99,7 @@ def try_formula(text: str) -> None:
 
 
 def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
-    """Return the signals of an episode by name, (T + 1,), with those of the follow-up behind M."""
+    """Return the signals of an episode by name, (T + 1,), with those of the follow-up after M."""
     motion = trajectory.whole
     scenario = trajectory.case.scenario
     (x_pov, v_pov, a_pov), (x_vut, v_vut, a_vut) = (

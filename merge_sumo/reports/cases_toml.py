@@ -27,7 +27,7 @@ from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 
 MOST = 40
-"""Cases of a file for which nobody names any."""
+"""Cases of a file where the user names none."""
 ABOUT = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
 # error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is

@@ -197,7 +197,7 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
 def _scenario(
     xosc: Any, trajectory: Trajectory, road: Corridor, name: str, title: str, *, free: bool
 ) -> Any:
-    """Return a case as a scenario; where the VUT is free, somebody else's controller drives it."""
+    """Return a case as a scenario; where the VUT is free, another controller drives it."""
     scenario = trajectory.case.scenario
     entities, init = xosc.Entities(), xosc.Init()
     act = xosc.Act("drive", _at_time(xosc, "start", 0.0))

@@ -112,7 +112,7 @@ def by_level(facts: Iterable[Fact]) -> tuple[list[Fact], list[tuple[int, list[Fa
 
 
 def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
-    """Return the lines that a person reads first of a campaign; each number is that of a fact."""
+    """Return the first lines about a campaign; each number is that of a fact."""
     of = {fact.name: fact for fact in facts if fact.level is None}
     cases = _counted(of["cases"], "case")
     if AT_MOST in of:

@@ -481,7 +481,7 @@ def _measures(outcome: Outcome) -> Iterator[str]:
     if found.clipped_steps:
         yield f"  {'steps beyond its limits':<{width}} {found.clipped_steps:10d}"
     if outcome.is_tested and found.error is not None:
-        yield f"  {'error behind M':<{width}} {found.error}"
+        yield f"  {'error after M':<{width}} {found.error}"
 
 
 def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:

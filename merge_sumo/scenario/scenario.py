@@ -328,7 +328,7 @@ class Scenario:
         """Return a text of this package, written with M, as it is true of this scenario."""
         if self.lane_m is None:
             return text
-        return re.sub(r"\bM\b", self.place, text.replace("behind M", "after M"))
+        return re.sub(r"\bM\b", self.place, text)
 
     def bounds(self, name: str) -> Bounds:
         """Return the bounds of a number that may be a range; twice the number where it is none."""

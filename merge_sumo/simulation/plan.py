@@ -54,7 +54,7 @@ class SimulationPlan:
     """What it takes to run cases in any process; it travels to workers with every chunk.
 
     Attributes:
-        scenario: the scenario, with its follow-up behind M.
+        scenario: the scenario, with its follow-up after M.
         road: the road on which it takes place.
         vut: the VUT.
         povs: the drivers of the mainline.

@@ -27,7 +27,7 @@ ROUNDING_MPS2 = 1e-9
 """An answer this little outside the limits is a rounding error, not a wish for more."""
 
 WRONGS = (Exception, SystemExit)
-"""A black box may raise anything; only a person's own interruption is not its doing."""
+"""A black box may raise anything; only the interruption by the user comes from elsewhere."""
 
 OF_THE_POV = "the POV: "
 """Begins the reason of an error that is the doing of a POV."""
@@ -51,7 +51,7 @@ class _Running:
     case: Case
     first_row: int
     merge_row: int | None = None
-    """The row in which the VUT is at M, where it goes on behind M."""
+    """The row in which the VUT is at M, where it goes on after M."""
     clipped: int = 0
     """Answers that were clipped before M."""
     left: list[tuple[int, Left]] = field(default_factory=list)
@@ -165,7 +165,7 @@ class Rollout:
         return [trajectory for _, trajectory in sorted(self.ended.items())]
 
     def goes_on(self, corridor: int, *, arrived: bool) -> bool:
-        """Return whether an episode goes on behind M; note where that begins."""
+        """Return whether an episode goes on after M; note where that begins."""
         episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
         assert episode is not None, "only running episodes go on"  # noqa: S101
         if corridor in self.errors or not arrived:
@@ -280,7 +280,7 @@ class Rollout:
         acceleration[:, ~self.active] = 0.0
         self.now[..., 2] = acceleration.T
         off = answer - acceleration
-        # In most steps nobody asks for more than it may.
+        # In most steps all commands are within the limits.
         commands = self.vut.clipped()
         if commands is not None:
             self.clipped += commands
@@ -319,7 +319,7 @@ class Rollout:
     def finish(self, corridor: int, end: End, error: str | None = None) -> None:
         """Keep the record of a corridor's episode; after an error without the last step.
 
-        An error behind M ends the follow-up alone: the VUT has merged. After a merge from an
+        An error after M ends the follow-up alone: the VUT has merged. After a merge from an
         acceleration lane it is one of the episode, because the time after the merge is judged.
 
         Args:

@@ -87,7 +87,7 @@ class Simulator:
 
 
 def corridors_of(plan: SimulationPlan, most: int) -> int:
-    """Return the number of corridors, at most so many, that VUT and POVs of a plan can serve."""
+    """Return the number of corridors, that VUT and POVs of a plan can serve."""
     corridors = min(most, plan.vut.max_corridors or most)
     return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
 

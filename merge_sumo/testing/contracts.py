@@ -103,7 +103,7 @@ class VutContract:
     """What a campaign relies on in a VUT, at a point and on an acceleration lane.
 
     Attributes:
-        vut: what a person writes after `--vut`.
+        vut: the text after `--vut`.
         scenarios: names of the shipped scenarios in which it drives.
     """
 
@@ -127,7 +127,7 @@ class VutContract:
                 assert alone.measures == run.outcome(index).measures
 
     def test_is_found_again_by_its_name(self) -> None:
-        """A worker is told the name and makes it anew."""
+        """A worker gets the name and makes the controller again."""
         first, second = (load(self.vut) for _ in range(2))
         assert first == second
         assert first.files == second.files

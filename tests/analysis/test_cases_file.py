@@ -148,7 +148,7 @@ def test_a_new_error_or_contact_is_worse(file):
 
     assert change(safe, severity=Severity.CONTACT) == "worse but passing"
     assert change(safe, severity=Severity.HARSH) == "pass with both"
-    assert change(safe, error="answered nan") == "broke", "behind M"
+    assert change(safe, error="answered nan") == "broke", "after M"
     record.accepted = {fails.index: "known", safe.index: "known"}
     assert change(fails) == "accepted"
     assert change(fails, end=End.VUT_ERROR, error="answered nan") == "broke"

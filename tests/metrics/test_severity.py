@@ -1,7 +1,7 @@
 """Contact, conflict, harsh and safe against a second calculation: polygons, and rows of the motion.
 
 It shares nothing with the package but the points of the lanes: rectangles are shapely's, gaps and
-braking behind M follow from the recorded places and speeds.
+braking after M follow from the recorded places and speeds.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def overlap_before_m(road: Corridor, trajectory: Trajectory) -> float:
 
 
 def expected(trajectory: Trajectory) -> str | None:
-    """Return the severity of a merge by its rows behind M; None where it is too close to call."""
+    """Return the severity of a merge by its rows after M; None where it is too close to call."""
     assert trajectory.after is not None
     x_m, v_mps = trajectory.after[:, :, 0], trajectory.after[:, :, 1]
     cars = [row for row in range(x_m.shape[1]) if row != VUT]

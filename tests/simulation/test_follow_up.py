@@ -1,4 +1,4 @@
-"""What happens behind M: both drive on, and it is measured."""
+"""What happens after M: both drive on, and it is measured."""
 
 # mypy: no-strict-optional
 
@@ -131,4 +131,4 @@ class TestDrivingOn:
                 Measures.of(trajectory).score == Measures.of(replace(trajectory, error=None)).score
             )
             words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
-            assert words.endswith("Behind M an error ends the follow-up.")
+            assert words.endswith("After M an error ends the follow-up.")

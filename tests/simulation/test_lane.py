@@ -82,11 +82,11 @@ class TestSumo:
 
 RAISING = """
 class Raises:
-    "Knows nothing behind M."
+    "Knows nothing after M."
 
     def act(self, seen):
         if seen.merged:
-            raise ValueError("behind M")
+            raise ValueError("after M")
         return {answer}
 """
 
@@ -109,7 +109,7 @@ class TestAControllerThatRaisesAfterItsMerge:
     def test_is_an_error_where_it_chooses_to_merge(self, tmp_path):
         for raising, _ in zip(*self.episodes(tmp_path, "1.0, True"), strict=True):
             assert raising.end is End.VUT_ERROR
-            assert raising.error.startswith("ValueError: behind M")
+            assert raising.error.startswith("ValueError: after M")
             assert raising.after is None
 
 
