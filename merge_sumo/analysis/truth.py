@@ -48,7 +48,7 @@ MOST_FILES_BYTES = 1 << 26
 REAL_REGION = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH = 0.2
-"""A truth is too small to be divided by where the same number of further cases could add more than this to its
+"""A truth is too small to be divided by where as many further cases could add more than this to its
 FMC. Measured with designs 1 and 2 in two and three coordinates: truths of 2,500 to 160,000 cases
 that could add less had .77 to .97 of the coverage of 1,000,000 cases, the others .03 to .83."""
 MOST_ALONE = 0.05
