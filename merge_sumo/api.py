@@ -108,7 +108,7 @@ from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.workers import Workers, open_workers
+from merge_sumo.workers import AnyWorkers, Workers, open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
@@ -583,11 +583,8 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
-    requested = where.workers
-    if requested is None and settings.cases <= FEW_CASES and not settings.may_vary:
-        requested = 1
     try:
-        workers = open_workers(plan.workers(requested))
+        workers = _opened_workers(settings, plan, where.workers)
         with workers, bars, RunningReport(folder) as report:
             begun_s = perf_counter()
             done = run_campaign(
@@ -600,48 +597,43 @@ def run_and_report(
                 begin=partial(bars.begin, title),
             )
             result = CampaignRun(done, config.gates)
-            search_s = perf_counter() - begun_s
-            _study(done, replace(plan, against=None), workers, search_s, check, bars)
+            plan = replace(plan, against=None)
+            on_part = partial(bars.counted, "careful drivers", unit="failures")
+            known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
+            if known:
+                AVOIDANCE.write_lines(folder, known)
+            on_part = partial(bars.counted, "uniform starts", unit="cases")
+            note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
+            note_explanation(done, plan, check)
             link_latest(folder)
             on_part = partial(bars.counted, "surrogates of the report", unit="levels")
             write_report(done, result.summary, on_part)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
-        if folder.exists():
-            link_latest(folder)
-            address = {"workers": where.workers} if isinstance(where.workers, str) else {}
-            command = call_again("resume", folder, asdict(settings), **address)
-            stop.add_note(f"stopped; go on with {command}")
+        _note_how_to_resume(stop, settings, folder, where)
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
 
 
-def _study(
-    run: Run,
-    plan: SimulationPlan,
-    workers: Workers,
-    search_s: float,
-    check: Callable[[], None],
-    bars: CampaignBars,
-) -> None:
-    """Write what a report has besides the cases: avoidance, share of failures, an explanation.
+def _opened_workers(
+    settings: CampaignSettings, plan: SimulationPlan, requested: AnyWorkers
+) -> Workers:
+    """Return the workers of a campaign: by default one a core, or one where others do not pay."""
+    if requested is None and settings.cases <= FEW_CASES and not settings.may_vary:
+        requested = 1
+    return open_workers(plan.workers(requested))
 
-    Args:
-        run: the campaign.
-        plan: how its cases run, without an earlier version.
-        workers: where they run.
-        search_s: duration of the search in s.
-        check: called between cases; may raise to stop.
-        bars: show the progress.
-    """
-    on_part = partial(bars.counted, "careful drivers", unit="failures")
-    known = avoidance(run, plan, workers=workers, check=check, on_part=on_part)
-    if known:
-        AVOIDANCE.write_lines(run.folder, known)
-    on_part = partial(bars.counted, "uniform starts", unit="cases")
-    note_shares(run, plan, workers, search_s, check, on_part)
-    note_explanation(run, plan, check)
+
+def _note_how_to_resume(
+    stop: BaseException, settings: CampaignSettings, folder: Path, where: c.Execution
+) -> None:
+    """Add the command that resumes a campaign to the exception that stopped it."""
+    if folder.exists():
+        link_latest(folder)
+        address = {"workers": where.workers} if isinstance(where.workers, str) else {}
+        command = call_again("resume", folder, asdict(settings), **address)
+        stop.add_note(f"stopped; go on with {command}")
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
