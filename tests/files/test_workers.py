@@ -230,12 +230,11 @@ def daemonic(monkeypatch):
 
 
 class TestADaemonicProcess:
-    @pytest.mark.parametrize("number", [2, None])
-    def test_runs_a_campaign_itself_with_a_note(self, daemonic, number, tmp_path):
+    def test_runs_a_campaign_itself_with_a_note(self, daemonic, tmp_path):
         keywords: dict[str, Any] = {"cases": 20, "seed": 1, "progress": False}
         alone = api.campaign("design2", out=tmp_path / "alone", **keywords)
         with pytest.warns(Notice, match="in this process"):
-            run = api.campaign("design2", out=tmp_path / "run", workers=number, **keywords)
+            run = api.campaign("design2", out=tmp_path / "run", workers=2, **keywords)
         texts = [(one.folder / OUTCOMES).read_bytes() for one in (alone, run)]
         assert texts[0] == texts[1]
 
