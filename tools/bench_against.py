@@ -114,7 +114,8 @@ class Versions:
         """Return the regressions that a campaign against the old version finds, (k, d)."""
         settings = self.pair.settings(cases, seed)
         models = ControllerModelPair(
-            controller_model_of(settings, self.new), controller_model_of(settings, self.old)
+            controller_model_of(self.new, settings.pool, settings.seed),
+            controller_model_of(self.old, settings.pool, settings.seed),
         )
         sampler = make_sampler(settings.sampler, settings.pool, seed, models)
         young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
@@ -133,7 +134,7 @@ class Versions:
         The failures of the old version's campaign are none, so that campaign need not run.
         """
         settings = replace(self.pair.settings(cases, seed), against=None)
-        model = controller_model_of(settings, self.new)
+        model = controller_model_of(self.new, settings.pool, settings.seed)
         sampler = make_sampler(settings.sampler, settings.pool, seed, model)
         groups: Groups = []
         SearchLoop(sampler, replace(self.new, against=None), cases).run(groups.extend)

@@ -40,6 +40,7 @@ import numpy as np
 from bench_record import add_record_option, append_record
 
 from merge_sumo.analysis.truth import DENSE_CASES, Truth, ground_truth
+from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -47,7 +48,6 @@ from merge_sumo.metrics.fmc import RADIUS, fmc
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.samplers import gpr
-from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import LEVELS, US23
@@ -104,7 +104,7 @@ def search(
 ) -> tuple[list[float], int, float]:
     """Return FMC / truth at SHOWN, the real regions found, and the seconds of the sampler."""
     pool = Pool(levels=(level,), scenario=US23)
-    games = None if name == WITHOUT else ControllerModel(pool, plan.povs, seed)
+    games = None if name == WITHOUT else controller_model_of(plan, pool, seed)
     sampler = make_sampler("coverage" if name == WITHOUT else name, pool, seed, games)
     batch = None if sampler.predictor else BATCH
     seconds = 0.0
@@ -188,7 +188,7 @@ def _failures(
 ) -> tuple[Any, Any]:
     """Return the failures that a sampler finds, (m, d), and their indices, (m,)."""
     pool = Pool(levels=(level,), scenario=US23)
-    sampler = make_sampler(name, pool, seed, ControllerModel(pool, plan.povs, seed))
+    sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
     batch = batch or (None if sampler.predictor else BATCH)
     groups: Groups = []
     SearchLoop(sampler, plan, cases, batch=batch).run(groups.extend)
@@ -271,7 +271,7 @@ def print_cost_per_case() -> dict[str, dict[int, float]]:
         motions[index] = result.trajectory.motion
     figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the model": {}}
     for size in sizes:
-        model = ControllerModel(pool, plan.povs, 0)
+        model = controller_model_of(plan, pool, 0)
         sampler = make_sampler("coverage", pool, 0, model)
         sampler.tell(outcomes[: size - BATCH], motions)
         sampler.ask(sampler.batch_size())  # what the first batch alone has to learn

@@ -24,6 +24,7 @@ from merge_sumo.analysis.truth import (
     ground_truth,
     known_truth,
 )
+from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.in_memory import is_here
@@ -32,8 +33,6 @@ from merge_sumo.metrics.fmc import covered, fmc
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.result import Result
-from merge_sumo.road.merge import centre_lines
-from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import level_name
@@ -96,8 +95,8 @@ def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
     """Run searches in this process."""
     found = []
     for task in tasks:
-        pool, lines = Pool(levels=task.levels, scenario=plan.scenario), centre_lines(plan.road)
-        model = ControllerModel(pool, plan.povs, task.seed, criterion=plan.criterion, lines=lines)
+        pool = Pool(levels=task.levels, scenario=plan.scenario)
+        model = controller_model_of(plan, pool, task.seed)
         sampler, ran = make_sampler(task.name, pool, task.seed, model), SamplerRun([], [])
         batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
         groups: Groups = []

@@ -21,9 +21,14 @@ from merge_sumo.files import TakenError, check_new, check_own, files_now
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import centre_lines, road_for
-from merge_sumo.samplers.base import Sampler
-from merge_sumo.samplers.controller_model import ControllerModel, ControllerModelPair
+from merge_sumo.samplers.base import Predictor, Sampler
+from merge_sumo.samplers.controller_model import (
+    ControllerModel,
+    ControllerModelPair,
+    ModelRollout,
+)
 from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.scenario.case import Pool
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
@@ -225,20 +230,25 @@ def _compared(
 
 def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
     """Return the sampler of a campaign, without outcomes."""
-    model = controller_model_of(settings, plan)
-    predictor = (
-        model
-        if plan.against is None
-        else ControllerModelPair(model, controller_model_of(settings, plan))
-    )
+    model = controller_model_of(plan, settings.pool, settings.seed)
+    predictor: Predictor = model
+    if plan.against is not None:
+        earlier = controller_model_of(plan, settings.pool, settings.seed)
+        predictor = ControllerModelPair(model, earlier)
     sampler = settings.new_sampler(predictor)
     return sampler if settings.repeat == 1 else RepeatingSampler(sampler, settings.repeat)
 
 
-def controller_model_of(settings: CampaignSettings, plan: SimulationPlan) -> ControllerModel:
-    """Return an untrained model of the controller."""
-    lines = centre_lines(plan.road)
-    return ControllerModel(settings.pool, plan.povs, settings.seed, plan.criterion, lines)
+def controller_model_of(plan: SimulationPlan, pool: Pool, seed: int) -> ControllerModel:
+    """Return an untrained model of the controller of a plan.
+
+    Args:
+        plan: how its cases run.
+        pool: the cases.
+        seed: of the model.
+    """
+    rollout = ModelRollout(pool, plan.povs, plan.criterion, centre_lines(plan.road))
+    return ControllerModel(rollout, seed)
 
 
 def case_name(index: int) -> str:

@@ -85,29 +85,6 @@ def features(
 ) -> FloatArray:
     """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation.
 
-    Args:
-        x_pov_m: positions of the POV, (n,).
-        v_pov_mps: its speeds, (n,).
-        x_vut_m: positions of the VUT, (n,).
-        v_vut_mps: its speeds, (n,).
-        svo_rad: social value orientations of the POV, (n,), if the network sees them.
-        scenario: the scenario that is played.
-    """
-    state = x_pov_m, v_pov_mps, x_vut_m, v_vut_mps
-    return np.stack(feature_columns(*state, svo_rad, scenario=scenario), axis=-1)
-
-
-def feature_columns(
-    x_pov_m: FloatArray,
-    v_pov_mps: FloatArray,
-    x_vut_m: FloatArray,
-    v_vut_mps: FloatArray,
-    svo_rad: FloatArray | None = None,
-    *,
-    scenario: Scenario,
-) -> list[FloatArray]:
-    """Return the inputs of a network for n states as 26 arrays (n,), or 28 with an orientation.
-
     All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
     scaled; the VUT's time to M on the level-0 profile, at constant speed and at full
     acceleration; the gap at M that follows from them for a POV that keeps its speed, accelerates
@@ -142,7 +119,7 @@ def feature_columns(
     ]
     if svo_rad is not None:
         columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
-    return columns
+    return np.stack(columns, axis=-1)
 
 
 def prospects(

@@ -18,7 +18,7 @@ much of such a layer takes about as many balls.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -189,23 +189,33 @@ def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
 
 
 def _balls_at(centres: FloatArray) -> IntArray:
-    """Return in how many unit balls around centres, (n, d), places drawn in them lie.
+    """Return in how many unit balls around centres, (n, d), places in them lie, (SAMPLES,).
 
-    A rank-1 sequence (Roberts, 2018) fills the balls more evenly than random numbers do: the error
-    of a volume is a quarter. Each ball has the same number of places.
+    Each ball has the same number of places.
     """
-    number, dimension = np.arange(SAMPLES), centres.shape[1]
+    own = centres[np.arange(SAMPLES) * len(centres) // SAMPLES]
+    places = own + _places_in_ball(centres.shape[1])
+    balls = cKDTree(centres).query_ball_point(places, 1.0, workers=-1, return_length=True)
+    return np.maximum(np.asarray(balls, dtype=np.int64), 1)
+
+
+@cache
+def _places_in_ball(dimension: int) -> FloatArray:
+    """Return places in the unit ball, (SAMPLES, d).
+
+    They are of a rank-1 sequence (Roberts, 2018), which fills a ball more evenly than random
+    numbers: the error of a volume is a quarter.
+    """
     ratio = 2.0
     for _ in range(50):  # the root of ratio ** (d + 2) = ratio + 1
         ratio = (1.0 + ratio) ** (1.0 / (dimension + 2))
     steps = ratio ** -np.arange(1.0, dimension + 2.0)
-    uniform = (0.5 + (number[:, None] + 1) * steps) % 1.0
-    direction = ndtri(np.maximum(uniform[:, :dimension], 1e-12))
-    direction /= np.linalg.norm(direction, axis=1)[:, None]
-    reach = uniform[:, dimension:] ** (1.0 / dimension)
-    places = centres[number * len(centres) // SAMPLES] + reach * direction
-    balls = cKDTree(centres).query_ball_point(places, 1.0, return_length=True)
-    return np.maximum(np.asarray(balls, dtype=np.int64), 1)
+    uniform = (0.5 + np.arange(1, SAMPLES + 1)[:, None] * steps) % 1.0
+    places: FloatArray = ndtri(np.maximum(uniform[:, :dimension], 1e-12))
+    places *= uniform[:, dimension:] ** (1.0 / dimension) / np.linalg.norm(
+        places, axis=1, keepdims=True
+    )
+    return places
 
 
 def _checked(points: ArrayLike) -> FloatArray:

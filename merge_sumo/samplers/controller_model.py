@@ -5,7 +5,6 @@ An ensemble of trees learns the accelerations of the VUT, and rolls cases out ag
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from merge_sumo.drivers.levelk import (
     DECISION_STEPS,
     QNetwork,
     actions_mps2,
-    feature_columns,
+    features,
     prospects,
 )
 from merge_sumo.drivers.policies import load_network
@@ -64,15 +63,15 @@ class Observation:
         """Begin `rows` episodes of a scenario."""
         self._scenario = scenario
         self._step = 0
-        self._past: deque[Inputs] = deque(maxlen=1 + max(LAGS))
+        # A ring of the last states that the past is made of, (steps, 5, R).
+        self._past = np.empty((1 + max(LAGS), 5, rows), dtype=np.float32)
         self._since_jump = np.zeros(rows)
         self._lowest = np.zeros(rows)
         self._highest = np.zeros(rows)
 
     def keep(self, rows: NDArray[np.bool_]) -> None:
         """Drop all episodes but those where `rows`, (R,), is true."""
-        for lag, state in enumerate(self._past):
-            self._past[lag] = state[:, rows]
+        self._past = self._past[:, :, rows]
         self._since_jump = self._since_jump[rows]
         self._lowest = self._lowest[rows]
         self._highest = self._highest[rows]
@@ -107,21 +106,21 @@ class Observation:
 
         # Distance, closing speed, gap on the level-0 profile, speed and acceleration.
         remembered = np.array([inputs[row] for row in (1, 2, 10, 6, 0)], dtype=np.float32)
-        past = self._past
-        while len(past) < max(LAGS):
-            past.append(remembered)
+        past, now = self._past, self._step
+        if now == 0:
+            past[:] = remembered
         # A change of the acceleration within a step that is a new decision.
-        jumped = np.abs(remembered[4] - past[0][4]) > 0.25
-        past.appendleft(remembered)
+        jumped = np.abs(remembered[4] - past[(now - 1) % len(past), 4]) > 0.25
+        past[now % len(past)] = remembered
         self._since_jump = np.where(jumped, 0.0, self._since_jump + 1.0)
         self._lowest = np.minimum(self._lowest, a_last_mps2)
         self._highest = np.maximum(self._highest, a_last_mps2)
-        step = np.full_like(a_last_mps2, self._step)
+        step = np.full_like(a_last_mps2, now)
         inputs += [step, self._since_jump, self._lowest, self._highest]
         for lag in range(1, 1 + EARLIER):
-            inputs.append(past[lag][4])
+            inputs.append(past[(now - lag) % len(past), 4])
         for lag in LAGS:
-            inputs += [*past[lag][:4]]
+            inputs += [*past[(now - lag) % len(past), :4]]
         self._step += 1
         return np.array(inputs, dtype=np.float32).T
 
@@ -148,7 +147,7 @@ class ModelRollout:
             criterion: condition of a failure.
             lines: centre lines of the road.
         """
-        self._pool, self._scenario = pool, pool.scenario
+        self._pool, self.scenario = pool, pool.scenario
         self._criterion, self._lines = criterion, lines
         self._networks: dict[int, QNetwork] = {}
         for level in set(povs.levels) & set(POLICIES):
@@ -160,7 +159,7 @@ class ModelRollout:
         A rollout ends at M: none is possible where the VUT chooses the place of the merge.
         """
         known = level == 0 or level in self._networks
-        return known and self._scenario.lane_m is None
+        return known and self.scenario.lane_m is None
 
     def play(self, points: Mapping[int, FloatArray], drives: Sequence[Drive]) -> FloatArray:
         """Roll each case out with each controller; all advance together, as arrays.
@@ -172,16 +171,16 @@ class ModelRollout:
         Returns:
             Signed gaps (`Outcome.signed_gap`), (controllers, N); NaN where the VUT never arrives.
         """
+        if self._criterion.is_papers:
+            gaps_m, _ = self._play(points, drives)
+            return gaps_m.reshape(len(drives), -1) / self.scenario.dx_crash_m
         cases: list[Case] = []
         for level, of_level in points.items():
             cases += self._pool.cases(of_level, level)
-        shape, cases = (len(drives), len(cases)), cases * len(drives)
-        if self._criterion.is_papers:
-            gaps_m, _ = self._play(cases, drives)
-            return gaps_m.reshape(shape) / self._scenario.dx_crash_m
-        steps = self._scenario.max_steps
-        motion = np.zeros((steps + 1, self._scenario.vehicles, 3, len(cases)))
-        gaps_m, last = self._play(cases, drives, motion)
+        cases *= len(drives)
+        steps = self.scenario.max_steps
+        motion = np.zeros((steps + 1, self.scenario.vehicles, 3, len(cases)))
+        gaps_m, last = self._play(points, drives, motion)
         gaps = np.empty(len(cases))
         for row, case in enumerate(cases):
             of_row = motion[: last[row] + 1, :, :, row].copy()
@@ -190,22 +189,42 @@ class ModelRollout:
                 end, after = End.MERGED, self._follow_up(of_row[-1])
             trajectory = Trajectory(case, of_row, end, after=after)
             gaps[row] = self._criterion.judged(trajectory, self._lines).signed_gap
-        return gaps.reshape(shape)
+        return gaps.reshape(len(drives), -1)
 
     def _follow_up(self, at_m: FloatArray) -> FloatArray | None:
         """Predict the motion after a state at M, (A, 3): all keep their speeds for a reaction."""
-        steps = round(min(REACTION_S, self._scenario.follow_up_s) / DT_S)
+        steps = round(min(REACTION_S, self.scenario.follow_up_s) / DT_S)
         after = np.tile(at_m, (steps + 1, 1, 1))
         after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
         return after if steps else None
 
+    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
+        scenario = self.scenario
+        values = {}
+        for dimension, units in zip(scenario.dimensions(level), points.T, strict=True):
+            values[dimension.field] = dimension.low + units * (dimension.high - dimension.low)
+        n, (v_vut0_mps, _) = len(points), scenario.bounds("v_vut0_mps")
+        x_m, v_mps = np.zeros((2, scenario.vehicles, n))
+        x_m[POV], v_mps[POV] = values["x_pov0_m"], values["v_pov0_mps"]
+        x_m[VUT] = scenario.x_vut0_m
+        v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps)
+        if scenario.vehicles > 2:
+            v_mps[[AHEAD, BEHIND]] = v_mps[POV]
+            x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]
+            x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
+        return x_m, v_mps, values.get("svo_rad", np.zeros(n))
+
     def _play(
-        self, cases: Sequence[Case], drives: Sequence[Drive], motion: FloatArray | None = None
+        self,
+        points: Mapping[int, FloatArray],
+        drives: Sequence[Drive],
+        motion: FloatArray | None = None,
     ) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Roll cases out, an equal number with each controller in turn.
+        """Roll each case out with each controller in turn: R rows.
 
         Args:
-            cases: R cases.
+            points: cases of the unit cube by level, (n, d) each.
             drives: the controllers.
             motion: filled with the states, (steps + 1, A, 3, R). Without it a case also ends where
                 it cannot fail any more.
@@ -213,18 +232,22 @@ class ModelRollout:
         Returns:
             Gaps at M in m, (R,), NaN where the VUT never arrives, and last steps, (R,).
         """
-        scenario = self._scenario
-        x_m, v_mps = np.array([case.starts() for case in cases]).T.copy()
+        scenario = self.scenario
+        starts = [self._starts(level, of_level) for level, of_level in points.items()]
+        x_m, v_mps, svo_rad = (np.concatenate(part, axis=-1) for part in zip(*starts, strict=True))
+        cases = len(svo_rad)
+        x_m, v_mps = np.tile(x_m, len(drives)), np.tile(v_mps, len(drives))
+        svo_rad = np.tile(svo_rad, len(drives))
+        levels = np.repeat(list(points), [len(of_level) for of_level in points.values()])
+        levels = np.tile(levels, len(drives))
         a_mps2 = np.zeros_like(x_m)
-        levels = np.array([case.level for case in cases])
-        svo_rad = np.array([case.svo_rad or 0.0 for case in cases])
-        rows = np.arange(len(cases))
-        first_rows = np.arange(len(cases) // len(drives), len(cases), len(cases) // len(drives))
-        gap_m = np.full(len(cases), np.nan)
-        last = np.full(len(cases), scenario.max_steps)
+        rows = np.arange(len(levels))
+        first_rows = np.arange(cases, len(rows), cases)
+        gap_m = np.full(len(rows), np.nan)
+        last = np.full(len(rows), scenario.max_steps)
         cars = np.flatnonzero(np.arange(len(x_m)) != VUT)
-        held_mps2 = np.zeros((len(cars), len(cases)))
-        observation = Observation(scenario, len(cases))
+        held_mps2 = np.zeros((len(cars), len(rows)))
+        observation = Observation(scenario, len(rows))
         for step in range(scenario.max_steps):
             inputs = observation.step(x_m, v_mps, a_mps2[VUT])
             if step % DECISION_STEPS == 0:
@@ -272,8 +295,8 @@ class ModelRollout:
         svo_rad: FloatArray,
     ) -> FloatArray:
         """Return the accelerations that the cars of the mainline choose, (C, R)."""
-        limited, count = network.limited(self._scenario), len(cars)
-        features = feature_columns(
+        limited, count = network.limited(self.scenario), len(cars)
+        inputs = features(
             x_m[cars].ravel(),
             v_mps[cars].ravel(),
             np.tile(x_m[VUT], count),
@@ -281,7 +304,7 @@ class ModelRollout:
             np.tile(svo_rad, count) if network.sees_svo else None,
             scenario=limited,
         )
-        chosen = network.values_at_once(np.array(features).T).argmax(axis=1)
+        chosen = network.values_at_once(inputs).argmax(axis=1)
         chosen_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
         return chosen_mps2
 
@@ -310,32 +333,16 @@ class ControllerModel:
     levels train the same model.
 
     Example:
-        model = ControllerModel(pool, povs, seed=1)
+        model = ControllerModel(ModelRollout(pool, povs), seed=1)
         model.tell(outcomes, motions)
         gaps = model.predict({0: points})[0]
     """
 
     members = 2 * GROUPS
 
-    def __init__(
-        self,
-        pool: Pool,
-        povs: Povs,
-        seed: int,
-        criterion: Criterion = PAPER_CRITERION,
-        lines: CentreLines | None = None,
-    ) -> None:
-        """Prepare an untrained model.
-
-        Args:
-            pool: the cases.
-            povs: the drivers of the POV.
-            seed: of the trees.
-            criterion: condition of a failure.
-            lines: centre lines of the road.
-        """
-        self._scenario, self._seed = pool.scenario, seed
-        self._rollout = ModelRollout(pool, povs, criterion, lines)
+    def __init__(self, rollout: ModelRollout, seed: int) -> None:
+        """Prepare an untrained model; the seed is that of its trees."""
+        self._rollout, self._seed = rollout, seed
         self._batch: dict[int, int] = {}
         self._motions: dict[int, FloatArray] = {}
         # By group, the cases that its members learned from; by member, its tree.
@@ -413,7 +420,7 @@ class ControllerModel:
         for states, motion in zip(together, motions, strict=True):
             states[: len(motion)] = motion
             states[len(motion) :] = motion[-1]
-        observation = Observation(self._scenario, len(motions))
+        observation = Observation(self._rollout.scenario, len(motions))
         last_mps2 = np.zeros(len(motions))
         inputs = []
         for state in together.transpose(1, 3, 2, 0)[:-1].copy():

@@ -146,9 +146,8 @@ class TestModel:
     def test_predictions_do_not_depend_on_the_order_of_outcomes(self, seen):
         outcomes, motions = seen
         points = np.random.default_rng(4).random((7, 2))
-        at_once, in_parts = (
-            ControllerModel(Pool(levels=(0,), scenario=US23), POVS, 5) for _ in range(2)
-        )
+        rollout = ModelRollout(Pool(levels=(0,), scenario=US23), POVS)
+        at_once, in_parts = ControllerModel(rollout, 5), ControllerModel(rollout, 5)
         at_once.tell(outcomes, motions)
         in_parts.tell(outcomes[30:], motions)
         in_parts.predict({0: points})

@@ -62,9 +62,10 @@ def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m, fail
 def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
     settings, plan, points, outcomes, motions = searched(limit_m, fail_when, 160)
     _, old_plan, _, old, old_motions = searched(limit_m, fail_when, 160, "design1")
-    model = controller_model_of(settings, plan)
+    model = controller_model_of(plan, settings.pool, settings.seed)
     pair = ControllerModelPair(
-        controller_model_of(settings, plan), controller_model_of(settings, old_plan)
+        controller_model_of(plan, settings.pool, settings.seed),
+        controller_model_of(old_plan, settings.pool, settings.seed),
     )
     model.tell(outcomes[:80], motions)
     pair.tell(outcomes[:80], motions)

@@ -37,6 +37,7 @@ from problems import (
     shipped_truth,
 )
 
+from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, regular, replace_own
@@ -45,8 +46,6 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import counted
 from merge_sumo.records import decode
 from merge_sumo.result import Result
-from merge_sumo.road.merge import centre_lines
-from merge_sumo.samplers.controller_model import ControllerModel
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
@@ -224,10 +223,7 @@ def _search(
     def make() -> Any:
         sampler, predictor = sampler_class(task.sampler), None
         if sampler.uses_predictions:
-            lines = centre_lines(plan.road)
-            predictor = ControllerModel(
-                pool, plan.povs, seed, criterion=plan.criterion, lines=lines
-            )
+            predictor = controller_model_of(plan, pool, seed)
         return sampler(pool, seed, predictor)
 
     sampler = WatchedSampler(make, pool, seed, watch)
