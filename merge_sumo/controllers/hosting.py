@@ -1,6 +1,6 @@
-"""A user's controller in a process of its own, so that it can end nothing but itself.
+"""A user's controller in a process of its own, so that its faults end no other process.
 
-Each step is a request to that process and its answer. A process that dies, or does not answer in
+Each step is a request to that process and its reply. A process that dies, or does not reply in
 time, is killed; the running episodes begin again one by one (`simulation/rollout.py`), so that a
 second death is that of one case.
 """
@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
-from merge_sumo.controllers.host import HostReply, HostRequest, decode_answer, encode, packed
+from merge_sumo.controllers.host import HostReply, HostRequest, HostSettings, decode_reply, encode
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
@@ -55,52 +55,38 @@ class ControllerProcess(ChildProcess):
             ProcessDiedError: if the process ended.
             UserError: if the controller cannot be loaded.
         """
-        self._spec, self._options = spec, options
+        self._spec, self._connect_s = spec, options.connect_s
+        self._patience_s = GRACE * options.deadline_s + GRACE_S
+        self._late = f"took longer than the deadline of {options.deadline_s:g} s"
+        name = f"{kind.__module__}:{kind.__qualname__}"
+        hosted = HostSettings(name, spec, options.deadline_s, options.memory_gib)
         # A process that is killed leaves its temporary files: they are in a folder of ours.
         folder = ScratchFolder()
         # The order of sets must not be another one in each run.
         environment = {**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder.name}
         super().__init__(
             "merge_sumo.controllers.host:main",
-            {"memory_gib": options.memory_gib},
+            {"hosted": msgspec.to_builtins(hosted)},
             folder,
             environment,
             log=options.log,
         )
-        name = f"{kind.__module__}:{kind.__qualname__}"
-        request = HostRequest("load", kind=name, spec=spec, deadline_s=options.deadline_s)
-        self.loaded = self.request(request)
+        self.loaded = self._opened()
+
+    def make(self, corridors: int) -> HostReply:
+        """Make the controllers of some corridors; raises as the constructor does."""
+        self.send(encode(HostRequest("make", corridors=corridors)))
+        return self._opened()
 
     def request(self, request: HostRequest) -> HostReply:
-        """Return the answer to a request.
+        """Return the reply to another request.
 
         Raises:
-            ProcessDiedError: if there is none in time, or it cannot be read; the process is killed.
+            ProcessDiedError: if there is none in time, or it is invalid; the process is killed.
             UserError: if the request failed, for the controller's reason.
         """
-        deadline_s, is_opened = self._options.deadline_s, request.action in ("load", "make")
-        patience_s = self._options.connect_s if is_opened else GRACE * deadline_s + GRACE_S
-        answer: HostReply | None
-        try:
-            answer = decode_answer(self.ask(encode(request), patience_s))
-            while answer is None:
-                answer = decode_answer(self.receive(patience_s))
-        except msgspec.MsgspecError:
-            self.kill()
-            raise ProcessDiedError(BROKEN) from None
-        except ProcessDiedError as died:
-            reason = str(died)
-            if died.hung:
-                late = f"{patience_s:g} s" if is_opened else f"the deadline of {deadline_s:g} s"
-                reason = f"took longer than {late}"
-            if is_opened:
-                line = self.output.last_line()
-                printed = f" (it printed: {line})" if line else ""
-                reason = f"opening the VUT {self._spec} {reason}{printed}: look into the VUT"
-            raise ProcessDiedError(reason, hung=died.hung) from died
-        if answer.failed:
-            raise UserError(answer.failed)
-        return answer
+        self.send(encode(request))
+        return self._reply(self._patience_s, self._late)
 
     def close(self) -> None:
         """Let the controllers close, then end the process."""
@@ -109,6 +95,28 @@ class ControllerProcess(ChildProcess):
                 self.request(HostRequest("close"))
                 self.exit_code()
         self.kill()
+
+    def _opened(self) -> HostReply:
+        """Return the reply when the controller is loaded or made."""
+        try:
+            return self._reply(self._connect_s, f"took longer than {self._connect_s:g} s")
+        except ProcessDiedError as died:
+            line = self.output.last_line()
+            printed = f" (it printed: {line})" if line else ""
+            reason = f"opening the VUT {self._spec} {died}{printed}: look into the VUT"
+            raise ProcessDiedError(reason, hung=died.hung) from died
+
+    def _reply(self, patience_s: float, late: str) -> HostReply:
+        reply: HostReply | None = None
+        try:
+            while reply is None:
+                reply = decode_reply(self.receive(patience_s, late))
+        except msgspec.MsgspecError:
+            self.kill()
+            raise ProcessDiedError(BROKEN) from None
+        if reply.failed:
+            raise UserError(reply.failed)
+        return reply
 
 
 class HostedKind(ControllerKind):
@@ -135,14 +143,15 @@ class HostedKind(ControllerKind):
             UserError: if it cannot be loaded.
         """
         super().__init__(spec, options)
-        self._kind, self._process = kind, None
+        self._kind = kind
         self.no_parameters = kind.no_parameters
+        self._process: ControllerProcess | None = None
         if loaded is None:
             self._process = self.process()
             loaded = self._process.loaded
         self._loaded = loaded
         self.max_corridors, self.max_workers = loaded.max_corridors, loaded.max_workers
-        self.code = tuple(Path(os.fsdecode(file)) for file in loaded.files)
+        self.code = paths_of(loaded)
 
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
         """Travel without the process."""
@@ -161,23 +170,23 @@ class HostedKind(ControllerKind):
         """Return a driver that asks the process."""
         return HostedDriver(corridors, self)
 
-    def process(self) -> ControllerProcess:
+    def process(self, *, again: bool = True) -> ControllerProcess:
         """Return the process in which the controller is loaded, or a new one.
 
-        A process that dies may have been killed from outside: it is started once more. Raises
-        `UserError` where that fails.
+        Args:
+            again: whether it is started again if it dies, as it may have been killed from outside.
+
+        Raises:
+            UserError: if there is none.
         """
         if self._process is not None:
             process, self._process = self._process, None
             return process
         try:
-            try:
-                return ControllerProcess(self.spec, self.options, self._kind)
-            except ProcessDiedError as died:
-                if died.hung:
-                    raise
-                return ControllerProcess(self.spec, self.options, self._kind)
+            return ControllerProcess(self.spec, self.options, self._kind)
         except ProcessDiedError as died:
+            if again and not died.hung:
+                return self.process(again=False)
             raise UserError(str(died)) from died
 
     def release(self) -> None:
@@ -193,13 +202,12 @@ class HostedDriver(ControllerDriver):
         super().__init__(corridors)
         self._kind = kind
         self._starts: list[tuple[int, Start]] = []
-        self._answer = HostReply()
+        self._reply = HostReply()
         self._files: set[Path] = set()
-        self._parameters: Mapping[str, float] = {}
         self._process = self._opened()
 
     def reset(self, corridor: int, start: Start) -> None:
-        """Note that an episode begins; the controller is told with the next scene."""
+        """Note that an episode begins; the next request has its start."""
         self._starts.append((corridor, start))
 
     def act(self, scene: Scene) -> FloatArray:
@@ -207,29 +215,30 @@ class HostedDriver(ControllerDriver):
 
         Raises `VutLostError` where the process died.
         """
-        request = HostRequest("act", starts=self._starts, scene=packed(scene))
+        request = HostRequest("act", starts=self._starts, scene=scene)
         self._starts = []
         try:
             if not self._process.alive:
                 self._process = self._opened()
         except UserError as error:  # its files have changed since
             reason = f"started again: {error}"
-            self._answer = HostReply(reasons=dict.fromkeys(range(self.corridors), reason))
+            self._reply = HostReply(reasons=dict.fromkeys(range(self.corridors), reason))
             return np.full(self.corridors, np.nan)
         try:
-            self._answer = self._process.request(request)
-            answers, self._wishes = self._answer.numbers(self.corridors)
+            self._reply = reply = self._process.request(request)
         except (ProcessDiedError, UserError) as error:
             raise VutLostError(str(error)) from None
-        except ValueError:
+        answers, wishes = np.array(reply.accelerations_mps2), reply.wishes
+        self._wishes = None if wishes is None else np.array(wishes, dtype=np.int8)
+        if not len(answers) == self.corridors == len(answers if wishes is None else wishes):
             self._process.kill()
-            raise VutLostError(BROKEN) from None
+            raise VutLostError(BROKEN)
         return answers
 
     def signals(self) -> Mapping[int, Left]:
         """Return the signals of the last answers, by corridor."""
         signals: dict[int, Left] = {}
-        for corridor, left in self._answer.signals.items():
+        for corridor, left in self._reply.signals.items():
             signals[corridor] = as_signals(left)
         return signals
 
@@ -239,13 +248,13 @@ class HostedDriver(ControllerDriver):
 
     def reason(self, corridor: int) -> str | None:
         """Return the error of the controller of a corridor."""
-        return self._answer.reasons.get(corridor)
+        return self._reply.reasons.get(corridor)
 
     def files(self) -> tuple[Path, ...]:
         """Return the files of code that were loaded so far."""
         if self._process.alive:
             with suppress(ProcessDiedError, UserError):
-                self._note(self._process.request(HostRequest("files")))
+                self._files.update(paths_of(self._process.request(HostRequest("files"))))
         return tuple(sorted(self._files))
 
     def close(self) -> None:
@@ -255,13 +264,14 @@ class HostedDriver(ControllerDriver):
     def _opened(self) -> ControllerProcess:
         """Return a process in which the controllers are made."""
         process = self._kind.process()
-        self._note(process.loaded)
+        self._files.update(paths_of(process.loaded))
         try:
-            made = process.request(HostRequest("make", corridors=self.corridors))
+            self._parameters = process.make(self.corridors).parameters
         except ProcessDiedError as died:
             raise UserError(str(died)) from died
-        self._parameters = made.parameters
         return process
 
-    def _note(self, answer: HostReply) -> None:
-        self._files.update(Path(os.fsdecode(file)) for file in answer.files)
+
+def paths_of(reply: HostReply) -> tuple[Path, ...]:
+    """Return the files of a reply."""
+    return tuple(map(Path, map(os.fsdecode, reply.files)))

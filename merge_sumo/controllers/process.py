@@ -1,8 +1,4 @@
-"""Processes that run a controller: started, watched and stopped, with their output in a log.
-
-`Program` is a user's own program. `ChildProcess` runs a function of this package, which answers
-messages.
-"""
+"""Processes that run a controller: started, watched and stopped, with their output in a log."""
 
 from __future__ import annotations
 
@@ -31,7 +27,7 @@ from merge_sumo.spawning import end_with, python_command
 LOG = "controller.log"
 """In the folder of a campaign."""
 MOST_BYTES = 4 << 20
-"""A longer log loses its older part: a controller may print for ever."""
+"""A longer log begins again: a controller may print for ever."""
 LINES = 40
 """Lines of the end of a log in a report."""
 ENDING_S = 2.0
@@ -103,21 +99,12 @@ def end_of(log: Path) -> str:
 
 
 def append(log: Path, content: bytes) -> None:
-    """Add to a log, from any of several processes; OSError when that cannot be done."""
-    if not _is_writable_log(log):
-        return
-    with log.open("ab+", buffering=0) as file:
-        if sys.platform != "win32":  # several processes may write
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX)
-        file.write(content)
-        size = file.seek(0, os.SEEK_END)
-        if size > MOST_BYTES:
-            file.seek(size - MOST_BYTES // 4)
-            end = file.read()
-            file.truncate(0)
-            file.write(b"[the older part of this log was removed]\n" + end)
+    """Add to a log, which begins again when it is long; OSError when that cannot be done."""
+    if _is_writable_log(log):
+        with log.open("ab", buffering=0) as file:
+            if file.tell() > MOST_BYTES:
+                file.truncate(0)
+            file.write(content)
 
 
 class Started:
@@ -211,7 +198,6 @@ class ChildProcess(Started):
         """
         self._folder = folder
         self._socket, theirs = socket.socketpair()
-        self._patience_s = 0.0
         their_lifeline, self._lifeline = os.pipe()
         inherited = {"lifeline": their_lifeline, "connection": theirs.fileno()}
         try:
@@ -234,35 +220,34 @@ class ChildProcess(Started):
         self.alive = True
         self._connection = Connection(os.dup(self._socket.fileno()))
 
-    def ask(self, content: bytes, patience_s: float) -> bytes:
-        """Send a message, and return the answer; see `receive`."""
+    def send(self, content: bytes) -> None:
+        """Send a message; raises `ProcessDiedError` if the process ended."""
         try:
             self._connection.send_bytes(content)
         except OSError:
             raise self._died() from None
-        return self.receive(patience_s)
 
-    def receive(self, patience_s: float) -> bytes:
+    def receive(self, patience_s: float, late: str) -> bytes:
         """Return the next message.
 
         Args:
             patience_s: time for it to come; also for each of its parts, where it is sent in parts.
+            late: the reason of the error if it does not come in time.
 
         Raises:
             ProcessDiedError: if it does not come in time or the process ended; it is then killed.
         """
-        if patience_s != self._patience_s:
-            self._patience_s = patience_s
-            time_us = int(1e6 * min(max(patience_s, 0.01), 1e9))  # 0 would be for ever
-            time = struct.pack("ll", *divmod(time_us, 1_000_000))
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time)
+        # Less than a microsecond would be for ever.
+        seconds, rest_s = divmod(min(max(patience_s, 0.01), 1e9), 1.0)
+        time = struct.pack("ll", int(seconds), int(1e6 * rest_s))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, time)
         try:
             return self._connection.recv_bytes(1 << 24)
         except BlockingIOError:
             if self._process.poll() is not None:
                 raise self._died() from None
             self.kill()
-            raise ProcessDiedError("does not answer", hung=True) from None
+            raise ProcessDiedError(late, hung=True) from None
         except (EOFError, OSError):
             raise self._died() from None
         except BaseException:  # Ctrl-C, too: the answer is awaited no longer

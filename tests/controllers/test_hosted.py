@@ -19,7 +19,7 @@ from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
 
 from merge_sumo.controllers.controller import Start
-from merge_sumo.controllers.host import HostRequest, decode_request, encode, packed, unpacked
+from merge_sumo.controllers.host import HostRequest, decode_request, encode
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
@@ -188,14 +188,12 @@ def test_the_lane_and_who_has_merged_reach_the_process_and_the_rest_of_the_case_
     lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
     case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane)
     sent = scene(2)._replace(merged=np.array([False, True]))
-    request = decode_request(
-        encode(HostRequest("act", starts=[(1, Start.of(case))], scene=packed(sent)))
-    )
+    request = decode_request(encode(HostRequest("act", starts=[(1, Start.of(case))], scene=sent)))
     ((corridor, start),) = request.starts
     assert (corridor, start) == (1, Start.of(case))
     assert start.seen.lane_end_m == 130.0
     assert {"level", "svo_rad"}.isdisjoint(start.__struct_fields__)
-    told = unpacked(request.scene)
+    told = request.scene
     assert told.merged.tolist() == [False, True]
     assert told.facing is None
     assert np.array_equal(told.x_m, sent.x_m)

@@ -164,10 +164,8 @@ def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(write_vut):
 
 def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(write_vut):
     source = """
-from merge_sumo.controllers.host import HostReply
-HostReply.of = lambda driver, scene: HostReply(
-    accelerations_mps2=driver.act(scene).tobytes(), wishes=bytes([7, 7])
-)
+from merge_sumo.controllers.host import HostReply, _Host
+_Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], wishes=[7, 7])
 def Vut(seen):
     return 1.0, True
 """

@@ -126,7 +126,8 @@ class Child(ChildProcess):
             ProcessDiedError: if there is no answer in time, or the process is gone.
             UserError: if it cannot do it.
         """
-        content = self.ask(msgspec.msgpack.encode((action, values)), patience_s)
+        self.send(msgspec.msgpack.encode((action, values)))
+        content = self.receive(patience_s, "took too long for a question")
         answer = msgspec.msgpack.decode(content, type=Answer)
         if answer.refused:
             self.kill()

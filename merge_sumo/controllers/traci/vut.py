@@ -248,13 +248,12 @@ class TraciVut(Driver):
         try:
             answer = self._child.do(action, patience_s, **values)
         except ProcessDiedError as died:
+            reason = f"the SUMO that answers the controller {died}"
             if died.hung:
-                raise FaultError(
-                    "the SUMO that answers the controller took too long for a question"
-                ) from died
+                raise FaultError(reason) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
-            raise VutLostError(f"the SUMO that answers the controller {died}") from died
+            raise VutLostError(reason) from died
         for note in answer.notes:
             self._note(note)
         self._in_vain.update(answer.in_vain)
