@@ -11,7 +11,7 @@ import numpy as np
 
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.surface import Grid, Surface, nodes
-from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.fmc import fmc_growth, radius_for
 from merge_sumo.metrics.measures import Measure, measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
@@ -168,17 +168,16 @@ def _coordinate(c: Coordinate) -> dict[str, Any]:
 
 def _search(model: ReportModel) -> dict[str, Any]:
     """Return the coverage of each level after numbers of cases."""
-    # Points of a curve in the chart of the search, at most.
-    # Balls that are counted for these curves: of more failures they have fewer points.
-    number = min(20, max(20_000 // max(len(model.worst), 1), 1))
-    steps = sorted({len(model.run.outcomes) * step // number for step in range(number + 1)})
+    outcomes = len(model.run.outcomes)
+    steps = [outcomes * step // 20 for step in range(21)]
     levels = []
     for level in model.levels:
-        at = [o for o in model.worst if o.case.level == level]
-        points = to_unit((o.case for o in at), level, model.run.scenario)
-        place = np.array([o.index for o in at], dtype=np.int64)
-        covered = [round(fmc(points[place < step]), 5) for step in steps]
-        levels.append({"level": level, "fmc": covered})
+        failures = [o for o in model.worst if o.case.level == level]
+        failures.sort(key=lambda outcome: outcome.index)
+        points = to_unit([o.case for o in failures], level, model.run.scenario)
+        growth = np.concatenate([[0.0], fmc_growth(points)])
+        found = np.searchsorted([o.index for o in failures], steps)
+        levels.append({"level": level, "fmc": growth[found].round(5).tolist()})
     return {"cases": steps, "levels": levels}
 
 

@@ -19,6 +19,7 @@ from merge_sumo.metrics.fmc import (
     ball_volume,
     covered,
     fmc,
+    fmc_growth,
     growth_bound,
     has_neighbour,
     radius_for,
@@ -223,3 +224,11 @@ class TestTheBoundOfGrowth:
             growths.append(after - before)
         assert np.mean(growths) <= np.mean(bounds)
         assert np.mean(growths) >= 0.4 * np.mean(bounds)
+
+
+@pytest.mark.parametrize("dims", [1, 2, 3, 4])
+def test_growth_is_the_fmc_of_the_first_points(dims):
+    points = np.random.default_rng(dims).random((150, dims))
+    growth = fmc_growth(points)
+    for n in (1, 50, 150):
+        assert growth[n - 1] == pytest.approx(fmc(points[:n]), rel=0.02)
