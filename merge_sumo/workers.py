@@ -16,7 +16,7 @@ import sys
 import tempfile
 import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from concurrent.futures.process import ProcessPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -166,7 +166,7 @@ class Workers(AbstractContextManager["Workers"]):
         lost: Callable[[T], R],
         *,
         chunk: int | None = None,
-    ) -> Generator[tuple[int, R], None, None]:
+    ) -> Iterator[R]:
         """Run a function on items, some chunks ahead of the one whose results are read.
 
         Args:
@@ -176,19 +176,17 @@ class Workers(AbstractContextManager["Workers"]):
             chunk: items that a worker takes at a time; by default `chunk_size`.
 
         Yields:
-            Place in `items` and result, in order.
+            The results, in the order of the items.
         """
         size = chunk or self.chunk_size(len(items))
         ahead = 1 if self._executor is None else CHUNKS_AHEAD * self.count
         jobs: deque[Job[T, R]] = deque()
-        place = first = 0
-        while place < len(items):
+        first = 0
+        while jobs or first < len(items):
             while first < len(items) and len(jobs) < ahead:
                 jobs.append(self.submit(function, [items[first : first + size]], lost))
                 first += size
-            for result in self.collect(jobs.popleft()):
-                yield place, result
-                place += 1
+            yield from self.collect(jobs.popleft())
 
     def _retry(self, job: Job[T, R], items: Sequence[T]) -> list[R]:
         """Run items with nothing else in their worker; halve them where it dies."""

@@ -21,7 +21,6 @@ import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -140,10 +139,7 @@ class Versions:
         SearchLoop(sampler, replace(self.new, against=None), cases).run(groups.extend)
         ran = chain.from_iterable(groups)
         failing = [one.outcome.case for one in ran if one.outcome.failed]
-        passes = [
-            _passes(episode)
-            for _, episode in sorted(evaluate(self.old, failing), key=itemgetter(0))
-        ]
+        passes = [_passes(episode) for episode in evaluate(self.old, failing)]
         return self._points(case for case, broke in zip(failing, passes, strict=True) if broke)
 
     def _points(self, cases: Iterable[Case]) -> FloatArray:
@@ -151,10 +147,7 @@ class Versions:
 
 
 def _failed(plan: SimulationPlan, cases: Sequence[Case]) -> Any:
-    failed = np.zeros(len(cases), dtype=bool)
-    for place, verdict in evaluate(plan, cases, None, _has_failed):
-        failed[place] = verdict
-    return failed
+    return np.array(list(evaluate(plan, cases, None, _has_failed)), dtype=bool)
 
 
 def _has_failed(episode: Episode) -> bool:

@@ -132,7 +132,7 @@ def truth(most: int) -> Iterator[dict[str, float]]:
         while cases <= most:
             points: Any = rng.random((cases, 2))
             start, memory = time.perf_counter(), 0.0
-            for _, (_, _, now) in evaluate(plan, pool.cases(points, 0), workers, margin_and_memory):
+            for _, _, now in evaluate(plan, pool.cases(points, 0), workers, margin_and_memory):
                 memory = max(memory, now)
             spent = time.perf_counter() - start
             yield {
@@ -159,8 +159,7 @@ def two_workers() -> dict[str, list[float]]:
             return time.perf_counter() - start
 
         def rate(workers: Workers, count: int) -> float:
-            counts = dict(workers.run(compute, [1.0] * count, never, chunk=1))
-            return float(sum(counts.values()))
+            return float(sum(workers.run(compute, [1.0] * count, never, chunk=1)))
 
         seconds(one), seconds(two)
         for _ in range(ROUNDS):

@@ -166,7 +166,7 @@ def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
     known = run.trajectories(outcome.index for outcome in run.outcomes)
     in_sumo = [*known.values()]
     fresh = uniform(settings, cases - len(in_sumo), seed)
-    in_sumo += [result.trajectory for _, result in sorted(evaluate(plan, fresh))] if fresh else []
+    in_sumo += [result.trajectory for result in evaluate(plan, fresh)] if fresh else []
     largest_m, largest_mps = largest_deviations(plan, in_sumo)
     with HighwayEnvSimulator(plan) as simulator:
         ran = simulator.run([trajectory.case for trajectory in in_sumo])

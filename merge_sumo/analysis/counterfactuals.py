@@ -147,13 +147,13 @@ def avoidance(
         size = min(chunk, max(few, math.ceil(len(failing) / processes.count)))
         run_some = partial(run_counterfactuals, plan)
         # Nothing is known of a failure that ended every worker that ran it.
-        with closing(processes.run(run_some, failing, lambda _: None, chunk=size)) as results:
-            for place, one in results:
-                if one is not None:
-                    avoided.append(one)
-                if (done := place + 1) % size == 0 or done == len(failing):
-                    on_part(done, len(failing))
-                    check()
+        results = processes.run(run_some, failing, lambda _: None, chunk=size)
+        for done, one in enumerate(results, start=1):
+            if one is not None:
+                avoided.append(one)
+            if done % size == 0 or done == len(failing):
+                on_part(done, len(failing))
+                check()
     return sorted(avoided, key=lambda one: one.index)
 
 

@@ -299,8 +299,8 @@ class _Search:
             try:
                 vut = plan.vut if own else plan.vut.with_spec(spec)
                 ran = evaluate(replace(plan, vut=vut), cases, self._workers, pass_of)
-                for place, passed in ran:
-                    passes[spec, cases[place]] = passed
+                for case, passed in zip(cases, ran, strict=True):
+                    passes[spec, case] = passed
             except UserError:
                 if own:
                     raise

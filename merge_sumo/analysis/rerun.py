@@ -122,7 +122,7 @@ def _ran(
     """Run the cases of outcomes, in their order; return what became of them by index."""
     by_index = dict[int, Episode]()
     cases = [outcome.case for outcome in outcomes]
-    for old, (_, now) in zip(outcomes, evaluate(plan, cases, workers), strict=True):
+    for old, now in zip(outcomes, evaluate(plan, cases, workers), strict=True):
         by_index[old.index] = now.at(old.index, old.batch)
         on_cases(1)
     return by_index

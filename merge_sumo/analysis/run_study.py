@@ -106,7 +106,7 @@ class RunStudy:
             keep: gives the part of an episode that is kept.
         """
         results = []
-        for _, result in evaluate(plan, cases, self.workers, keep):
+        for result in evaluate(plan, cases, self.workers, keep):
             results.append(result)
             self.on_cases(1)
         return results

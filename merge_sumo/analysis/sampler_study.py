@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import accumulate, chain, islice
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 
@@ -219,13 +219,13 @@ class Study:
             self.plan.povs.check_level(level)
         plan = self.plan.for_cases(batch or COMPARED_BATCH)
         shown = title(str(plan.vut.spec), levels)
-        by_place: dict[int, SamplerRun] = {}
         with workers_or_here(self.workers) as processes:
-            for place, one in processes.run(partial(search, plan), tasks, _lost_search, chunk=1):
-                by_place[place] = one
-                self.on_part(shown, len(by_place), len(tasks), "runs", tasks[place].name)
-        found = iter(by_place[place] for place in range(len(tasks)))
-        return {name: list(islice(found, seeds)) for name in samplers}
+            searches = processes.run(partial(search, plan), tasks, _lost_search, chunk=1)
+            found: dict[str, list[SamplerRun]] = {name: [] for name in samplers}
+            for number, (task, one) in enumerate(zip(tasks, searches, strict=True), start=1):
+                found[task.name].append(one)
+                self.on_part(shown, number, len(tasks), "runs", task.name)
+        return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -147,10 +147,8 @@ def note_shares(
             for level, rng in streams.items():
                 on_part(done, total)
                 uniform = uniform_cases(plan.scenario, level, size, rng)
-                results: list[tuple[bool, bool]] = []
                 try:
-                    for _, result in evaluate(plan, uniform, processes, end_of):
-                        results.append(result)
+                    results = list(evaluate(plan, uniform, processes, end_of))
                 except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
                     return
                 counts[level] += (size, *np.sum(results, axis=0))

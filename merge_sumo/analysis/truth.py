@@ -197,7 +197,8 @@ def _run(
     margins, in_sumo = np.full(len(points), np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
     cases = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
-    for place, (margin, by_sumo, loaded) in evaluate(plan, cases, workers, _margin_of):
+    results = evaluate(plan, cases, workers, _margin_of)
+    for place, (margin, by_sumo, loaded) in enumerate(results):
         margins[place] = margin
         in_sumo += by_sumo
         files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}

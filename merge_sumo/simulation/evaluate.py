@@ -88,21 +88,21 @@ def lost(plan: SimulationPlan, case: Case) -> Episode:
 @overload
 def evaluate(
     plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None = None
-) -> Iterator[tuple[int, Episode]]: ...
+) -> Iterator[Episode]: ...
 @overload
 def evaluate(
     plan: SimulationPlan,
     cases: Sequence[Case],
     workers: Workers | None,
     keep: Callable[[Episode], R],
-) -> Iterator[tuple[int, R]]: ...
+) -> Iterator[R]: ...
 def evaluate(
     plan: SimulationPlan,
     cases: Sequence[Case],
     workers: Workers | None = None,
     keep: Callable[[Episode], Any] | None = None,
-) -> Iterator[tuple[int, Any]]:
-    """Simulate cases on workers; return (place in `cases`, result) in order, as they end.
+) -> Iterator[Any]:
+    """Simulate cases on workers; return their results in order, as they end.
 
     Args:
         plan: how they run.

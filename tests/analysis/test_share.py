@@ -40,7 +40,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     points = np.random.default_rng(99).random((20_000, 2))
     pool = campaign_settings(vut="design1").pool
     many = evaluate(plan, pool.cases(points, 0), None, end_of)
-    known = sum(fails for _, (fails, _) in many) / len(points)
+    known = sum(fails for fails, _ in many) / len(points)
     low, high = level.interval
     assert low < known < high
     assert (level.cases, level.failures > 0) == (2000, True)
@@ -116,7 +116,7 @@ def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
 
     def ran(_plan, cases, _workers, _keep):
         now_s[0] += 1.0
-        return enumerate([(place == 0, False) for place in range(len(cases))])
+        return [(place == 0, False) for place in range(len(cases))]
 
     monkeypatch.setattr(share, "perf_counter", lambda: now_s[0])
     monkeypatch.setattr(share, "evaluate", ran)

@@ -37,9 +37,15 @@ def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
     )
     points = np.random.default_rng(7).random((cases, 2))
     plan = resolve(settings).with_engine("kinematic")
-    ran = sorted(evaluate(plan, settings.pool.cases(points, 0)))
-    outcomes = [one.at(place, 0).outcome for place, one in ran]
-    return settings, plan, points, outcomes, {place: one.trajectory.motion for place, one in ran}
+    ran = list(evaluate(plan, settings.pool.cases(points, 0)))
+    outcomes = [one.at(place, 0).outcome for place, one in enumerate(ran)]
+    return (
+        settings,
+        plan,
+        points,
+        outcomes,
+        {place: one.trajectory.motion for place, one in enumerate(ran)},
+    )
 
 
 @pytest.mark.parametrize(("limit_m", "fail_when"), [*LIMITS, (6.0, PAPER)])

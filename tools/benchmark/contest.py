@@ -595,9 +595,9 @@ def benchmark(
     missing = [task for task in tasks if task not in found]
     title = "searches" + (f" ({len(found)} there already)" if found else "")
     searches = workers.run(run_searches, missing, _lost, chunk=1)
-    for ended, (number, one) in enumerate(searches, start=1):
+    for ended, one in enumerate(searches, start=1):
         write_found(place, one)
-        found[missing[number]] = one
+        found[missing[ended - 1]] = one
         on_step(title, ended, len(missing), "searches")
     by_sampler: dict[str, dict[str, list[Found]]] = {one.spec: {} for one in entered}
     for task in tasks:
@@ -609,11 +609,11 @@ def benchmark(
 def _entered(samplers: Sequence[str], limit_s: float, workers: Workers) -> list[Entrant]:
     """Return the samplers, each once; `UserError` for one that breaks the contract."""
     specs = list(dict.fromkeys(samplers))
-    entered = dict(workers.run(partial(entrants, limit_s=limit_s), specs, lost_entrant, chunk=1))
-    for one in entered.values():
+    entered = list(workers.run(partial(entrants, limit_s=limit_s), specs, lost_entrant, chunk=1))
+    for one in entered:
         if one.fault is not None:
             raise UserError(one.fault)
-    return [entered[place] for place in range(len(specs))]
+    return entered
 
 
 def _checked_truths(settings: BenchmarkSettings, on_step: OnStep) -> dict[str, ProblemTruth]:
