@@ -99,7 +99,7 @@ def _volume(cases: bytes, dimension: int) -> float:
 
 
 def fmc_growth(points: ArrayLike) -> FloatArray:
-    """Return the FMC of the first 1, 2, ... n of some points, sampled to within 2 %, for charts.
+    """Return the FMC of the first 1, 2, ... n of some points, sampled to within 3 %, for charts.
 
     Args:
         points: failures in the order in which they were found, (n, d), as those of `fmc`.

@@ -231,4 +231,4 @@ def test_growth_is_the_fmc_of_the_first_points(dims):
     points = np.random.default_rng(dims).random((150, dims))
     growth = fmc_growth(points)
     for n in (1, 50, 150):
-        assert growth[n - 1] == pytest.approx(fmc(points[:n]), rel=0.02)
+        assert growth[n - 1] == pytest.approx(fmc(points[:n]), rel=0.03)
