@@ -6,7 +6,7 @@ which the POV is faster than `GUILTY_MPS`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from textwrap import dedent, indent
 
 GUILTY_MPS = 34.0
@@ -21,12 +21,10 @@ class Misbehaviour:
     Attributes:
         source: of a module with the VUT `Vut`.
         reason: part of the `error` of a guilty case; None where it ends as if nothing had been.
-        refused: whether it is no VUT at all: `reason` is then part of the sentence.
     """
 
     source: str
     reason: str | None = None
-    refused: bool = False
 
 
 CLASS = """
@@ -59,22 +57,15 @@ def code(text: str, spaces: int) -> str:
     return indent(dedent(text).strip() or "pass", " " * spaces)
 
 
-def acts(
-    body: str, reason: str | None = None, setup: str = "", methods: str = "", **how
-) -> Misbehaviour:
+def acts(body: str, reason: str | None = None, methods: str = "") -> Misbehaviour:
     """Return a class that does it while it acts."""
     source = CLASS.format(limit=GUILTY_MPS, act=code(body, 12), methods=code(methods, 4))
-    return Misbehaviour(source=dedent(setup) + source, reason=reason, **how)
+    return Misbehaviour(source=source, reason=reason)
 
 
-def batched(body: str, reason: str | None = None, **how) -> Misbehaviour:
+def batched(body: str, reason: str | None = None) -> Misbehaviour:
     source = BATCHED.format(limit=GUILTY_MPS, act=code(body, 12))
-    return Misbehaviour(source=source, reason=reason, **how)
-
-
-def loads(setup: str, reason: str | None = None, **how) -> Misbehaviour:
-    """Return a module that does it while it is loaded."""
-    return replace(acts("", reason, setup=setup, **how), refused=reason is not None)
+    return Misbehaviour(source=source, reason=reason)
 
 
 STUBBORN = """
@@ -118,5 +109,4 @@ CATALOGUE = {
     "changes directory": acts("import os; os.chdir('/')"),
     "close that hangs": acts("", methods="def close(self):\n    while True: pass"),
     "batched: dies": batched("import os; os._exit(3)", "exit code 3"),
-    "loading: dies": loads("import os; os._exit(0)", "ended its process with exit code 0"),
 }
