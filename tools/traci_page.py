@@ -45,8 +45,8 @@ controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lan
 `setPreviousSpeed` and `moveToXY` say what [a vehicle model of the controller's own]\
 (../tutorials/traci-controller.md#a-vehicle-model-of-your-own) has reached after the step; they go \
 before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Other commands are \
-accepted without effect (with one note in `controller.log`; the last lines of a campaign name \
-those that could move a vehicle in SUMO), or refused with a reason, as an error of that command; \
+accepted without effect (the last lines of a campaign name those that could move a vehicle in \
+SUMO), or refused with a reason, as an error of that command; \
 the connection stays open. [Why SUMO decides](../decisions/traci-server.md).
 """
 

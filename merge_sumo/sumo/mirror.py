@@ -1,7 +1,6 @@
-"""A second SUMO with the net as it is in its file, in which a TraCI client sees and commands cars.
+"""A second SUMO with the original net, in which a TraCI client sees and commands cars.
 
-The SUMO of a campaign hosts copies of two lanes under other names. This one has the whole road by
-the ids of the file, and decides what commands to the VUT mean. After each of its steps the vehicles
+It decides on the motion that follows from commands to the VUT; after each of its steps the vehicles
 are put where those of the campaign are.
 """
 
@@ -70,7 +69,6 @@ class MirrorSimulation:
         departed: vehicles that departed since they were last read; and `arrived`.
         merged: whether the VUT has left the acceleration lane of a road with one.
         wants_to_merge: whether SUMO has put the VUT on the mainline in its last step.
-        was_forced: whether the VUT was at the end of the acceleration lane in it.
         by_sumo: whether SUMO's own driver chose the speed of the VUT in it.
     """
 
@@ -86,7 +84,7 @@ class MirrorSimulation:
         self.at_m: dict[str, float] = {}
         self.departed: list[str] = []
         self.arrived: list[str] = []
-        self.merged = self.wants_to_merge = self.was_forced = self.by_sumo = False
+        self.merged = self.wants_to_merge = self.by_sumo = False
         on_ramp = {piece.lane for piece in self.road.ramp.pieces}
         self._mainline = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
         """Lanes of the mainline alone: there a VUT has left the acceleration lane."""
@@ -159,11 +157,11 @@ class MirrorSimulation:
         self.call("poi.add", name, *point[:2], COLOURS[0])
         try:
             self.call("poi.subscribeContext", name, domain, range_m, [ID_COUNT])
-            found = self.call("poi.getContextSubscriptionResults", name)
+            found = set(self.call("poi.getContextSubscriptionResults", name))
             self.call("poi.unsubscribeContext", name, domain, range_m)
         finally:
             self.call("poi.remove", name)
-        return sorted(set(found) - {name})
+        return sorted(found - {name})
 
     def enter(self, states: Mapping[str, State]) -> None:
         """Make a step in which the vehicles depart, and put them into their states."""
@@ -197,10 +195,10 @@ class MirrorSimulation:
             return None
         v_mps = float(vehicle.getSpeed(VUT_ID))
         on_mainline = self.has_lane and vehicle.getLaneID(VUT_ID) in self._mainline
-        self.was_forced = self.has_lane and VUT_ID in moved
-        self.wants_to_merge = on_mainline and not self.was_forced
+        is_forced = self.has_lane and VUT_ID in moved
+        self.wants_to_merge = on_mainline and not is_forced
         own_mps = vehicle.getSpeedWithoutTraCI(VUT_ID)
-        self.by_sumo = bool(own_mps == v_mps) and not self.was_forced
+        self.by_sumo = bool(own_mps == v_mps) and not is_forced
         return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
@@ -241,17 +239,17 @@ class MirrorSimulation:
 
         SUMO would stop them there.
         """
+        moved: list[str] = []
         if not self.road.lane_drop:
-            return []
-        ends, goes_on = self.road.mainline, self.road.ramp
+            return moved
+        ends, continues = self.road.mainline, self.road.ramp
         if self.road.ramp_approach.yields:
-            ends, goes_on = goes_on, ends
+            ends, continues = continues, ends
         _, end_m = self.road.lane_m or (0.0, 0.0)
-        target = next(piece for piece in reversed(goes_on.pieces) if piece.start_m < end_m)
-        moved = []
+        *_, target = filter(lambda piece: piece.start_m < end_m, continues.pieces)
         for name, x_m in self.at_m.items():
-            next_m = (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S
-            if self.path(name) is ends and x_m < end_m <= x_m + next_m:
+            next_m = x_m + (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S
+            if self.path(name) is ends and x_m < end_m <= next_m:
                 self._libsumo.vehicle.moveTo(name, target.lane, target.length_m + x_m - end_m)
                 moved.append(name)
         return moved
@@ -263,17 +261,20 @@ class MirrorSimulation:
         edge, _, lane = point.lane.rpartition("_")
         # SUMO lets none depart faster than the limit; it gets its own speed after the step.
         own_mps = self._libsumo.vehicletype.getMaxSpeed(name)
-        fastest_mps = min(path.piece(x_m).speed_limit_mps, own_mps)
-        speed = {"departSpeed": str(min(v_mps, fastest_mps))}
-        if edge != edges_of(path)[0]:
-            return {"departLane": "best", **speed}
-        return {"departLane": lane, "departPos": str(point.position_m), **speed}
+        departure = {"departSpeed": str(min(v_mps, path.piece(x_m).speed_limit_mps, own_mps))}
+        if edge == edges_of(path)[0]:
+            return {**departure, "departLane": lane, "departPos": str(point.position_m)}
+        return {**departure, "departLane": "best"}
 
 
 def edges_of(path: LanePath) -> list[str]:
     """Return the edges of a path, without those inside junctions."""
-    edges = [piece.lane.rpartition("_")[0] for piece in path.pieces if not piece.is_internal]
-    return list(dict.fromkeys(edges))
+    edges: list[str] = []
+    for piece in path.pieces:
+        edge = piece.lane.rpartition("_")[0]
+        if not piece.is_internal and edge not in edges:
+            edges.append(edge)
+    return edges
 
 
 def _types(road: Corridor, scenario: Scenario) -> bytes:

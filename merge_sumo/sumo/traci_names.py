@@ -7,6 +7,7 @@ import inspect
 import sys
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -48,7 +49,7 @@ def functions() -> dict[tuple[int, int], tuple[str, ...]]:
     command.
     """
     traci = load_traci()
-    found: dict[tuple[int, int], list[str]] = {}
+    found: dict[tuple[int, int], tuple[str, ...]] = {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # some functions are deprecated
         for name, domain in sorted(vars(traci).items()):
@@ -58,13 +59,9 @@ def functions() -> dict[tuple[int, int], tuple[str, ...]]:
             for function, call in inspect.getmembers(domain, inspect.ismethod):
                 sent = None if function.startswith("_") else _sent(domain, call)
                 if sent is not None:
-                    found.setdefault(sent, []).append(f"{name}.{function}")
+                    found[sent] = *found.get(sent, ()), f"{name}.{function}"
             domain._connection = own_connection
-    return {numbers: tuple(names) for numbers, names in found.items()}
-
-
-class _SentError(Exception):
-    """Ends a call when its command is known."""
+    return found
 
 
 class _Recorder:
@@ -73,12 +70,13 @@ class _Recorder:
     sent: tuple[int, int] | None = None
 
     def _sendCmd(self, command: int, variable: Any, *_: Any) -> None:  # noqa: N802 (TraCI's name)
-        if isinstance(variable, int):
+        if self.sent is None and isinstance(variable, int):
             self.sent = command, variable
-        raise _SentError
+        raise InterruptedError
 
 
 def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
+    """Return the numbers of the command that a function sends; None if it sends none."""
     needed, options = 0, {}
     for parameter in inspect.signature(call).parameters.values():
         if parameter.default is True:
@@ -87,12 +85,10 @@ def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
             needed += 1
     recorder = domain._connection = _Recorder()
     for example in EXAMPLES:
-        try:
+        with suppress(Exception):  # it takes other values, or sends nothing
             call(*[example] * needed, **options)
-        except _SentError:
+        if recorder.sent is not None:
             break
-        except Exception:  # noqa: S112 (it takes other values, or sends nothing)
-            continue
     return recorder.sent
 
 

@@ -17,7 +17,6 @@ import numpy as np
 import pytest
 import traci
 from support.controllers import (
-    RAW_CLIENT,
     STOCK_CLIENT,
     assert_drives_as_level0,
     free_port,
@@ -29,8 +28,7 @@ from support.raw_traci import Client, GoneError
 from support.vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.controllers.traci import child
-from merge_sumo.controllers.traci.child import user_of
+from merge_sumo.controllers.traci import vut
 from merge_sumo.controllers.traci.vut import TraciVut
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
@@ -57,12 +55,12 @@ class Played:
         thread = threading.Thread(target=self._client, args=(client,))
         thread.start()
         options = ControllerOptions(deadline_s=deadline_s, connect_s=10.0)
-        vut = TraciVut(road_of(), US23, self.port, None, options)
+        driver = TraciVut(road_of(), US23, self.port, None, options)
         try:
             for _ in range(episodes):
-                self._episode(vut, steps)
+                self._episode(driver, steps)
         finally:
-            vut.close()
+            driver.close()
             thread.join()
         if self.error is not None:
             raise self.error
@@ -73,14 +71,14 @@ class Played:
         except (Exception, SystemExit) as error:
             self.error = error
 
-    def _episode(self, vut, steps):
-        vut.begin(0, CASE)
+    def _episode(self, driver, steps):
+        driver.begin(0, CASE)
         x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
         for step in range(steps):
             columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
-            a = vut.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
+            a = driver.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
             if not np.isfinite(a):
-                self.reasons.append(vut.reason(0))
+                self.reasons.append(driver.reason(0))
                 return
             self.accelerations.append(a)
             a = min(max(a, US23.a_min_mps2), US23.a_max_mps2)
@@ -289,48 +287,27 @@ def test_who_asks_and_asks_and_makes_no_step_has_until_the_deadline():
     assert reason.endswith("within the deadline of 0.3 s")
 
 
-@pytest.mark.slow
-def test_a_program_that_ends_while_its_client_goes_on_is_an_error_of_every_case(tmp_path):
-    leaves = "client.step()\nif os.fork():\n    os._exit(0)\nclient.drive(10_000)\n"
-    command = program(tmp_path, RAW_CLIENT + leaves)
-    with none_left():
-        trajectories = run_cases(factory("traci:" + command), cases_of(3))
-    for trajectory in trajectories:
-        assert trajectory.end is End.VUT_ERROR
-        assert "ended with exit code 0, and its connection is still open" in trajectory.error
-
-
-@pytest.mark.skipif(not child.KNOWS_USERS, reason="needs /proc/net/tcp")
-class TestTheUserOfAConnection:
+@pytest.mark.skipif(not vut.KNOWS_USERS, reason="needs /proc/net/tcp")
+class TestUsersOfAConnection:
     @pytest.mark.parametrize(
         ("family", "source", "target"),
         [
-            (socket.AF_INET, "127.0.0.1", "127.0.0.1"),
             (socket.AF_INET, "127.0.0.2", "127.0.0.1"),
             (socket.AF_INET6, "::ffff:127.0.0.1", "::ffff:127.0.0.1"),
         ],
     )
-    def test_is_known(self, family, source, target):
+    def test_are_known(self, family, source, target):
         with socket.create_server(("127.0.0.1", 0)) as listener, socket.socket(family) as client:
             client.bind((source, 0))
             client.connect((target, listener.getsockname()[1]))
             with listener.accept()[0] as connection:
-                assert user_of(connection) == os.geteuid()
+                assert vut.users_of(connection) == {os.geteuid()}
                 client.close()
-                assert user_of(connection) is None, "it is gone"
+                assert vut.users_of(connection) == set(), "it is gone"
 
-    def test_who_is_another_is_not_served(self, monkeypatch, tmp_path):
-        server = child.Server(tmp_path)
-        monkeypatch.setattr(child, "user_of", lambda _: os.geteuid() + 1)
-        monkeypatch.setattr(child, "MirrorSimulation", lambda _: NoSumo())
-        port = server.answer("listen", {"port": 0}).port
-        with socket.create_connection(("127.0.0.1", port)):
-            answer = server.answer("accept", {"wait_s": 0.1, "deadline_s": 1.0})
-        server.drop()
-        assert not answer.accepted
-        assert answer.notes[0].startswith(f"a process of the user {os.geteuid() + 1} connected")
-
-
-class NoSumo:
-    def load(self) -> None:
-        """Load nothing: no client comes so far."""
+    def test_that_are_others_are_not_served(self, monkeypatch, tmp_path):
+        log = tmp_path / "controller.log"
+        monkeypatch.setattr(vut, "users_of", lambda _: {os.geteuid(), os.geteuid() + 1})
+        with pytest.raises(UserError, match="before it connected"):
+            run_cases(factory("traci:" + raw_client(), connect_s=1.0, log=log), cases_of(1))
+        assert "note: another user's connection is not served" in log.read_text()

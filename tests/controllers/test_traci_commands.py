@@ -20,13 +20,9 @@ from support.traci_pair import Drive
 from support.vut_contract import factory, in_process, run_on
 
 from merge_sumo.controllers.traci import protocol
-from merge_sumo.controllers.traci.session import (
-    STAYED,
-    NotFiniteError,
-)
+from merge_sumo.controllers.traci.session import NotFiniteError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.imperfection import Actuation
-from merge_sumo.scenario.trajectory import End
 
 SCRIPTS: dict[str, list[tuple]] = {
     "limits of the vehicle": [
@@ -243,11 +239,6 @@ traci.close()
 
 class TestOnAnAccelerationLane:
     PAGE = Path(__file__).parents[2] / "docs/tutorials/traci-controller.md"
-    STAYS = """
-while traci.simulation.getMinExpectedNumber() > 0:
-    traci.simulationStep()
-traci.close()
-"""
 
     def test_the_controller_of_the_tutorial_merges_into_a_gap(self, tmp_path):
         page = self.PAGE.read_text("utf-8")
@@ -257,12 +248,3 @@ traci.close()
         assert after_the_pov.error is None
         assert -60.0 < after_the_pov.x_vut_m[-1] < 20.0
         assert after_the_pov.x_pov_m[-2] - after_the_pov.x_vut_m[-2] > 25.0
-
-    @pytest.mark.slow
-    def test_without_a_lane_change_it_comes_to_the_end_and_a_note_says_why(self, tmp_path):
-        log = tmp_path / "controller.log"
-        vut = factory("traci:" + program(tmp_path, STOCK_CLIENT + self.STAYS), log=log)
-        (trajectory,) = run_on(vut, named_scenario("us23-lane"), 0, 1, corridors=1)
-        assert trajectory.end is End.MERGED
-        assert trajectory.x_vut_m[-1] >= 130.0
-        assert log.read_text().splitlines() == [f"note: {STAYED}"]

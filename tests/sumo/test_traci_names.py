@@ -32,7 +32,7 @@ class TestQuestions:
         assert len(answers) > 500
         left_out = {q for q, both in answers.items() if "merge-sumo does not answer" in both[1]}
         programs = ("ProgramLogics", "CompleteRedYellowGreenDefinition", "ControlledLinks")
-        needless = ("Constraint", "WalkingDistance", "find", *programs)
+        needless = ("Constraint", "Distance", "find", *programs)
         others = {q for q in left_out if q[0] != "gui"}
         assert all(any(part in function for part in needless) for _, function in others)
         differ = {q for q, both in answers.items() if both[0] != both[1]} - left_out

@@ -7,9 +7,9 @@ big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html).
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from functools import partial
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
 from merge_sumo.sumo.binding import SUMO_VERSION
@@ -23,13 +23,15 @@ API_VERSION = 22
 VERSION, STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
 GET_VEHICLE, GET_JUNCTION, SET_VEHICLE = 0xA4, 0xA9, 0xC4
 OK, ERROR = 0x00, 0xFF
-NUMBERS = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d"}
-"""Forms of `struct` by the types of numbers."""
-STRING, STRING_LIST, COMPOUND, DOUBLE_LIST, COLOR = 0x0C, 0x0E, 0x0F, 0x10, 0x11
+VALUES = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d", 0x0C: "s"}
+LISTS = {0x0E: "s", 0x10: "d"}
+"""Forms of `Reader.value` by the types of values, and of the items of lists."""
+COMPOUND, COLOR = 0x0F, 0x11
 LON_LAT, ROAD = 0x00, 0x04
+POSITIONS = "dd", "dd", "ddd", "ddd", "sdB"
 PLACES = "goGOr"
-"""Letters of `pack` by the types of positions: on earth, in the plane, both with height, and on a
-road."""
+"""Forms, and letters of `pack`, by the types of positions: on earth, in the plane, both with
+height, and on a road."""
 
 
 class ProtocolError(Exception):
@@ -68,41 +70,37 @@ class Reader:
         start, self._at = self._at, self._at + count
         return self._data[start : self._at]
 
-    def number(self, form: str) -> Any:
-        """Return the next number, in a form of `struct`."""
-        form = f"!{form}"
-        (value,) = struct.unpack(form, self.raw(struct.calcsize(form)))
-        return value
+    def value(self, form: str) -> Any:
+        """Return the next value: a number in a form of `struct`, or a string for "s"."""
+        if form == "s":
+            return self.string()
+        (number,) = struct.unpack(f"!{form}", self.raw(struct.calcsize(f"!{form}")))
+        return number
 
     def string(self) -> str:
         """Return the next string."""
         try:
-            return self.raw(self.number("i")).decode("utf-8")
+            return self.raw(self.value("i")).decode("utf-8")
         except UnicodeDecodeError as error:
             raise ProtocolError("a string is not UTF-8") from error
 
     def count(self) -> int:
         """Return the number of values of a compound, whose type is next."""
-        if self.number("B") != COMPOUND:
+        if self.value("B") != COMPOUND:
             raise ProtocolError("a compound was expected")
         return self._length()
 
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value, with a type before it; a compound is a list of its values."""
-        kind = self.number("B")
-        if kind in NUMBERS:
-            return self.number(NUMBERS[kind])
-        if kind == STRING:
-            return self.string()
+        kind = self.value("B")
+        if kind in VALUES:
+            return self.value(VALUES[kind])
+        if kind in LISTS:
+            return tuple(self._items(partial(self.value, LISTS[kind])))
         if kind == COLOR:
             return tuple(self.raw(4))
-        if kind in (STRING_LIST, DOUBLE_LIST):
-            item = self.string if kind == STRING_LIST else partial(self.number, "d")
-            return tuple(self._items(item))
-        if kind <= ROAD:
-            form = "dd" if PLACES[kind].islower() else "ddd"
-            road, form = ([self.string()], "dB") if kind == ROAD else ([], form)
-            return Position(kind, [*road, *map(self.number, form)])
+        if kind < len(POSITIONS):
+            return Position(kind, list(map(self.value, POSITIONS[kind])))
         if kind == COMPOUND and nesting < MAX_NESTING:
             return self._items(partial(self.typed, nesting + 1))
         raise ProtocolError(f"a value of type 0x{kind:02x} is not expected here")
@@ -124,7 +122,7 @@ class Reader:
         return [read() for _ in range(self._length())]
 
     def _length(self) -> int:
-        length: int = self.number("i")
+        length: int = self.value("i")
         if not 0 <= length <= self.left:
             raise ProtocolError(f"{length} items were announced where {self.left} bytes are left")
         return length
@@ -153,9 +151,9 @@ def commands_of(body: bytes) -> list[Command]:
     reader = Reader(body)
     commands: list[Command] = []
     while reader.left or not commands:
-        length, head = reader.number("B"), 1
+        length, head = reader.value("B"), 1
         if length == 0:
-            length, head = reader.number("i"), 5
+            length, head = reader.value("i"), 5
         if length <= head:
             raise ProtocolError(f"a command of {length} bytes was announced")
         identifier, *_ = content = reader.raw(length - head)
@@ -226,16 +224,19 @@ def packed(function: str, answer: Any) -> bytes:
     name = function.partition(".")[2]
     try:
         if name in FIELDS:
-            return _fields(FIELDS[name], answer or NOBODY)
+            return compound(len(FIELDS[name]), pack(FIELDS[name], *(answer or NO_VEHICLE)))
         if name in ROWS:
-            return _rows(ROWS[name], answer)
-        if name in OBJECTS:
-            form, attributes = OBJECTS[name]
-            values = attrgetter(*attributes.split())
-            return _rows(form, list(map(values, answer)))
-        if name in LAYOUTS:
-            return LAYOUTS[name](answer)
-        return pack(_form_of(answer), answer)
+            form, values = ROWS[name]
+            content = pack("i", len(answer))
+            for row in answer:
+                content += pack(form, *values(row))
+            return compound(1 + len(answer) * len(form), content)
+        if name == "getNeighbors":
+            content = b""
+            for neighbour, gap_m in answer:
+                content += string(neighbour) + struct.pack("!d", gap_m)
+            return compound(len(answer), content)
+        return pack("p" if name in POLYGONS else _form_of(answer), answer)
     except (TypeError, ValueError, AttributeError, struct.error) as error:
         raise ProtocolError("there is no form for the answer") from error
 
@@ -254,69 +255,30 @@ def _form_of(answer: Any) -> str:
     return {2: "o", 3: "O"}.get(len(answer), "f")
 
 
-def _fields(form: str, values: Iterable[Any]) -> bytes:
-    """Return values as one compound."""
-    return compound(len(form), pack(form, *values))
-
-
-def _rows(form: str, rows: Sequence[Iterable[Any]]) -> bytes:
-    """Return rows of values as one compound that begins with their number."""
-    content = pack("i", len(rows))
-    for row in rows:
-        content += pack(form, *row)
-    return compound(1 + len(rows) * len(form), content)
-
-
-def _links(answer: Sequence[Sequence[Any]]) -> bytes:
-    """Pack links: libsumo has the lane inside the junction at another position than the wire."""
-    return _rows("ssBBBssd", [(link[0], link[4], *link[1:4], *link[5:]) for link in answer])
-
-
-def _neighbours(answer: Sequence[tuple[str, float]]) -> bytes:
-    content = b""
-    for name, gap_m in answer:
-        content += string(name) + struct.pack("!d", gap_m)
-    return compound(len(answer), content)
-
-
-def _lights(answer: Sequence[Sequence[Any]]) -> bytes:
-    """Pack traffic lights: libsumo has a state as a letter, the wire as its number."""
-    return _rows("sidb", [(*light, ord(state)) for *light, state in answer])
-
-
-def _polygon(answer: Sequence[Sequence[float]]) -> bytes:
-    return pack("p", answer)
-
-
-NOBODY = "", -1.0
+NO_VEHICLE = "", -1.0
 """The leader or follower of a vehicle that has none."""
-STOP = "lane endPos stoppingPlaceID stopFlags duration until"
 FIELDS = {
     "getLeader": "sd",
     "getFollower": "sd",
     "getLaneChangeState": "ii",
     "getParameterWithKey": "ss",
 }
-ROWS = {"getBestLanes": "sddbBl", "getJunctionFoes": "sddddssBB"}
-OBJECTS = {
-    "getNextStops": ("sdsidd", STOP),
-    "getStops": (
-        "sdsiddddddsssssd",
-        f"{STOP} startPos intendedArrival arrival depart split join actType tripId line speed",
-    ),
-    "getCollisions": (
-        "ssssddssd",
-        "collider victim colliderType victimType colliderSpeed victimSpeed type lane pos",
-    ),
+"""Letters of `pack` of the answers that are one compound, by function."""
+POLYGONS = ("getShape", "getNetBoundary")
+STOP = "lane endPos stoppingPlaceID stopFlags duration until"
+STOPS = f"{STOP} startPos intendedArrival arrival depart split join actType tripId line speed"
+COLLISION = "collider victim colliderType victimType colliderSpeed victimSpeed type lane pos"
+LINK = "ssBBBssd", itemgetter(0, 4, 1, 2, 3, 5, 6, 7)
+"""libsumo has the lane inside the junction at another position than the wire."""
+ROWS: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "getBestLanes": ("sddbBl", tuple),
+    "getJunctionFoes": ("sddddssBB", tuple),
+    "getNextStops": ("sdsidd", attrgetter(*STOP.split())),
+    "getStops": ("sdsiddddddsssssd", attrgetter(*STOPS.split())),
+    "getCollisions": ("ssssddssd", attrgetter(*COLLISION.split())),
+    "getNextLinks": LINK,
+    "getLinks": LINK,
+    # libsumo has the state of a light as a letter, the wire as its number.
+    "getNextTLS": ("sidb", lambda light: (*light[:3], ord(light[3]))),
 }
-LAYOUTS: dict[str, Callable[[Any], bytes]] = {
-    "getNeighbors": _neighbours,
-    "getNextLinks": _links,
-    "getLinks": _links,
-    "getNextTLS": _lights,
-    "getShape": _polygon,
-    "getNetBoundary": _polygon,
-}
-"""Layouts of the answers whose form does not follow from their type in Python, by the name of the
-function: letters of `pack` of one compound, of rows, of rows of objects by their attributes, and
-functions for the rest."""
+"""Of answers that are rows, the letters of a row, and its values from what libsumo answers."""

@@ -1,16 +1,16 @@
 """A VUT behind TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
 
-A process with a second SUMO serves it (`child.py`), in which its commands mean what they mean in
-SUMO. A client makes a step by `simulationStep`, so client and rollout go in lockstep: the speed
-that SUMO gives the VUT in that step becomes the acceleration of eq. (4), the lane on which SUMO has
-it says whether it wants to merge, and the step is answered when the rollout has made it. Between
-two episodes the road is empty for one step.
+A process with a second SUMO serves it (`child.py`), in which its commands have SUMO's meaning. Each
+`simulationStep` of the client is a step of the rollout: the speed that SUMO gives the VUT becomes
+the acceleration of eq. (4), and its lane in SUMO the merge request. Between two episodes the road
+is empty for one step.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import socket
 import sys
 from collections.abc import Collection
 from contextlib import suppress
@@ -29,8 +29,7 @@ from merge_sumo.controllers.process import (
     split_command,
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.controllers.traci.child import HOST, START_S, WORK_S, Answer, Child, FaultError
-from merge_sumo.drivers.actuation import ROUNDING_MPS2
+from merge_sumo.controllers.traci.child import Child, FaultError, Reply
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
@@ -40,10 +39,17 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.world import World
 
+HOST = "127.0.0.1"
 DEFAULT_PORT = 8813
 """Port of TraCI clients that are given no other."""
+KNOWS_USERS = sys.platform == "linux"
+"""Whether the system tells the user of a connection; elsewhere the first client is served."""
 LOOK_S = 0.1
 """Time between two looks whether a program that is waited for has ended."""
+START_S = 60.0
+"""Time that the serving process has to start, on whatever machine."""
+WORK_S = 10.0
+"""Time that SUMO has for the questions of a controller in a step, in addition to the deadline."""
 
 
 class TraciKind(ControllerKind):
@@ -73,7 +79,7 @@ class TraciKind(ControllerKind):
         """
         super().__init__(spec, options)
         self._command, self._port = None, 0
-        if is_port(spec.argument):
+        if self.waits(spec.argument):
             self._port = int(spec.argument or DEFAULT_PORT)
             if not 1 <= self._port <= 65535:
                 raise UserError(f"{spec}: the port is a number from 1 to 65535")
@@ -87,7 +93,7 @@ class TraciKind(ControllerKind):
     @classmethod
     def waits(cls, argument: str) -> bool:
         """Return whether an argument names the port at which a user's client is waited for."""
-        return is_port(argument)
+        return not argument or argument.isdecimal()
 
     def driver(self, _corridors: int, world: object) -> Driver:
         """Return a driver in a world of SUMO."""
@@ -95,11 +101,6 @@ class TraciKind(ControllerKind):
             raise UserError(f"{self.spec} drives in a SUMO world only")
         road, scenario = world.road, world.scenario
         return TraciVut(road, scenario, self._port, self._command, self.options)
-
-
-def is_port(argument: str) -> bool:
-    """Return whether an argument names the port at which the user's client is waited for."""
-    return not argument or argument.isdecimal()
 
 
 class TraciVut(Driver):
@@ -132,16 +133,15 @@ class TraciVut(Driver):
         self._child = Child(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
         self._begins_m[VUT] = -road.ramp.before_m
-        self._lane_m = scenario.lane_m
-        self._limits_mps2 = scenario.a_min_mps2, scenario.a_max_mps2
+        self._listener: socket.socket | None = None
+        self._client: socket.socket | None = None
         self._program: Program | None = None
-        self._connected = False
         self._reason: str | None = None
-        self._noted: set[str] = set()
         self._in_vain: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
-        self._starting, self._seed = True, 0
+        self._seed: int | None = None
+        """Seed of an episode that begins."""
         self._patience_s = options.connect_s
         try:
             self._connect()
@@ -154,8 +154,7 @@ class TraciVut(Driver):
 
     def begin(self, corridor: int, case: Case) -> None:
         """Note that the next scene is the first of an episode."""
-        self._reason = None
-        self._starting, self._seed = True, case.told_seed
+        self._reason, self._seed = None, case.told_seed
         self._before_mps.clear()
         self._in_vain.clear()
 
@@ -180,10 +179,10 @@ class TraciVut(Driver):
     def close(self) -> None:
         """Let the client see the last arrival and end; then end it."""
         ends = True
-        if self._connected:
+        if self._client is not None:
             with suppress(FaultError, VutLostError):
                 ends = self._ask("farewell").closed
-        self._stop_program(grace=ends)
+        self._disconnect(grace=ends)
         self._child.kill()
 
     def _acceleration_mps2(self, scene: Scene) -> float:
@@ -196,57 +195,40 @@ class TraciVut(Driver):
             states[name] = x, v, (v - self._before_mps.get(name, v)) / DT_S
             self._before_mps[name] = v
         merged = scene.merged is not None and bool(scene.merged[0])
-        if self._starting:
-            self._starting = False
-            answer = self._enter(states=states, merged=merged, seed=self._seed)
-        else:
-            answer = self._ask("step", states=states, merged=merged)
-        if self._program is not None and (ended := self._program.ended(0.0)):
-            raise FaultError(f"{ended}, and its connection is still open")
+        reply = self._step(self._seed, states=states, merged=merged)
+        self._seed = None
         if scene.merged is not None:
-            self._wishes = np.array([MERGE if answer.merge else STAY], dtype=np.int8)
-        wanted_mps = answer.v_mps
+            self._wishes = np.array([MERGE if reply.merge else STAY], dtype=np.int8)
+        wanted_mps = reply.v_mps
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
-        if self._lane_m is not None and answer.by_sumo and not (merged or answer.merge):
+        lane_m = self._scenario.lane_m
+        if lane_m is not None and reply.by_sumo and not (merged or reply.merge):
             # As `SumoVut` does: by eq. (4) SUMO's driver would come a little beyond the lane's end.
-            room_m = self._lane_m[1] - END_MARGIN_M - (x_m[VUT] + v_mps[VUT] * DT_S)
-            stops_mps = stopping_mps(np.array(room_m), -self._limits_mps2[0])
+            room_m = lane_m[1] - END_MARGIN_M - (x_m[VUT] + v_mps[VUT] * DT_S)
+            stops_mps = stopping_mps(np.array(room_m), -self._scenario.a_min_mps2)
             wanted_mps = min(wanted_mps, float(stops_mps))
-        return self._checked((wanted_mps - v_mps[VUT]) / DT_S)
+        return float((wanted_mps - v_mps[VUT]) / DT_S)
 
-    def _checked(self, acceleration_mps2: float) -> float:
-        """Return an acceleration that is finite, and note one outside the limits."""
-        if not math.isfinite(acceleration_mps2):
-            raise FaultError(f"the controller asked for an acceleration of {acceleration_mps2}")
-        low_mps2, high_mps2 = self._limits_mps2
-        if not low_mps2 - ROUNDING_MPS2 <= acceleration_mps2 <= high_mps2 + ROUNDING_MPS2:
-            self._note(
-                f"the speed that the controller reached or set takes an acceleration outside "
-                f"{low_mps2:g} to {high_mps2:g} m/s2, the scenario's limits: it is clipped, and "
-                "clipped_steps counts such steps up to M"
-            )
-        return acceleration_mps2
-
-    def _enter(self, **values: Any) -> Answer:
-        """Let the vehicles depart, for the client that is connected or for a new one.
+    def _step(self, seed: int | None, **values: Any) -> Reply:
+        """Make a step, by the client that is connected or by a new one.
 
         A controller may run once per episode: a goodbye on an empty road is not a fault.
         """
         for _ in range(2):
-            if not self._connected:
+            if self._client is None:
                 self._connect()
-            answer = self._ask("step", **values)
-            if not answer.closed:
-                return answer
-            self._connected = False
+            reply = self._ask("step", seed=seed, **values)
+            if seed is None or not reply.closed:
+                return reply
+            self._client = None
         raise FaultError("the controller closed the connection before the vehicles departed")
 
-    def _ask(self, action: str, patience_s: float = 0.0, **values: Any) -> Answer:
-        """Return the answer of the child process; raises `FaultError` and `VutLostError`."""
+    def _ask(self, action: str, patience_s: float = 0.0, **values: Any) -> Reply:
+        """Return the reply of the serving process; raises `FaultError` and `VutLostError`."""
         patience_s += self._options.deadline_s + WORK_S
         try:
-            answer = self._child.do(action, patience_s, **values)
+            reply = self._child.request(action, patience_s, **values)
         except ProcessDiedError as died:
             reason = f"the SUMO that answers the controller {died}"
             if died.hung:
@@ -254,13 +236,11 @@ class TraciVut(Driver):
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
             raise VutLostError(reason) from died
-        for note in answer.notes:
-            self._note(note)
-        self._in_vain.update(answer.in_vain)
-        if not answer.fault:
-            return answer
-        text = answer.fault
-        if answer.gone and self._program is not None and (ended := self._program.ended(0.5)):
+        self._in_vain.update(reply.in_vain)
+        if not reply.fault or reply.closed:
+            return reply
+        text = reply.fault
+        if reply.gone and self._program is not None and (ended := self._program.ended(0.5)):
             text += f"; {ended}"
         raise FaultError(text)
 
@@ -274,10 +254,18 @@ class TraciVut(Driver):
         self._patience_s = min(patience_s, self._options.deadline_s)
         if not self._child.alive:
             self._child = Child(self._road, self._scenario)
-        port = self._ask("listen", START_S, port=self._port).port
+        if self._listener is None:
+            try:
+                self._listener = socket.create_server((HOST, self._port))
+            except OSError as error:
+                raise UserError(
+                    f"cannot listen on {HOST}:{self._port} ({error.strerror}): choose another "
+                    "port, traci:PORT"
+                ) from error
         if self._program is not None and not self._accept(self._options.deadline_s):
-            self._stop_program(grace=True)
-        if not self._connected:
+            self._program.stop(ENDING_S)
+        if self._client is None:
+            port: int = self._listener.getsockname()[1]
             if self._command is not None:
                 self._program = Program(self._command, port, self._log)
                 self._log = self._log or Path(os.devnull)  # the same text again is not shown
@@ -286,57 +274,66 @@ class TraciVut(Driver):
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
                 )
             if not self._accept(patience_s):
-                raise FaultError(self._why_none_came(port, patience_s))
+                reason = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
+                if self._program is not None:
+                    reason += (
+                        ": the command is told the port as {port} and in MERGE_SUMO_PORT, for "
+                        "traci.init(PORT) or traci.start(..., port=PORT)"
+                    )
+                    if ended := self._program.ended(0.0):
+                        reason = f"{ended} (before it connected)"
+                raise FaultError(reason)
         self._patience_s = self._options.connect_s
 
     def _accept(self, patience_s: float) -> bool:
-        """Return whether a client connects; a program that has ended is not waited for."""
+        """Return whether a client of this user connects; a program that ends is not waited for."""
+        assert self._listener is not None, "listening"  # noqa: S101
         until = monotonic() + patience_s
-        while not self._connected:
-            wait_s = max(min(LOOK_S, until - monotonic()), 0.001)
-            deadline_s = self._options.deadline_s
-            answer = self._ask("accept", START_S, wait_s=wait_s, deadline_s=deadline_s)
-            self._connected = answer.accepted
-            if monotonic() > until or (self._program and self._program.ended(0.0)):
-                break
-        return self._connected
-
-    def _why_none_came(self, port: int, patience_s: float) -> str:
-        """Return why no client is connected, and end what was started."""
-        ended = self._program.ended(0.0) if self._program else ""
-        self._disconnect()
-        if ended:
-            return f"{ended} (before it connected)"
-        late = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
-        if self._command is None:
-            return late
-        return (
-            f"{late}: the command is told the port as {{port}} and in MERGE_SUMO_PORT, for "
-            "traci.init(PORT) or traci.start(..., port=PORT)"
-        )
-
-    def _note(self, sentence: str) -> None:
-        """Add a sentence to the log of the controller, once for all its starts."""
-        if sentence in self._noted:
-            return
-        self._noted.add(sentence)
-        if self._options.log is None:
-            sys.stderr.write(f"note: {sentence}\n")
-        else:
+        while True:
+            self._listener.settimeout(max(min(LOOK_S, until - monotonic()), 0.001))
             with suppress(OSError):
-                append(self._options.log, f"note: {sentence}\n".encode())
+                client, _ = self._listener.accept()
+                if not KNOWS_USERS or users_of(client) == {os.geteuid()}:
+                    client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                    self._client = client
+                    deadline_s = self._options.deadline_s
+                    self._ask("serve", START_S, client=client, deadline_s=deadline_s)
+                    return True
+                client.close()
+                if self._options.log is not None:
+                    append(self._options.log, b"note: another user's connection is not served\n")
+            if monotonic() > until or (self._program and self._program.ended(0.0)):
+                return False
 
-    def _disconnect(self) -> None:
+    def _disconnect(self, *, grace: bool = False) -> None:
         """End the program, then close the port and the connection.
 
         In this order: a client that is ended while it waits does not complain of it.
         """
-        self._stop_program(grace=False)
-        self._connected = False
-        with suppress(ProcessDiedError):
-            self._child.do("drop", WORK_S)
-
-    def _stop_program(self, *, grace: bool) -> None:
         if self._program is not None:
             self._program.stop(ENDING_S if grace else 0.0)
             self._program = None
+        if self._client is not None:
+            with suppress(OSError):  # it is closed
+                self._client.shutdown(socket.SHUT_RDWR)
+            self._client = None
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
+
+
+def users_of(client: socket.socket) -> set[int]:
+    """Return the users of the connections from the port of a client to the port of its server.
+
+    On other addresses of this machine there may be several. Empty where the client is gone.
+    """
+    users = set()
+    ports = [f"{port:04X}" for _, port in (client.getpeername()[:2], client.getsockname()[:2])]
+    for table in ("tcp", "tcp6"):
+        with suppress(OSError), Path("/proc/self/net", table).open() as rows:
+            for row in rows:
+                _, local, remote, *columns = row.split()
+                ends = [local.rpartition(":")[2], remote.rpartition(":")[2]]
+                if ends == ports and columns[6] != "0":  # its inode
+                    users.add(int(columns[4]))
+    return users
