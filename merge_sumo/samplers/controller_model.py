@@ -345,6 +345,8 @@ class ControllerModel:
         self._rollout, self._seed = rollout, seed
         self._batch: dict[int, int] = {}
         self._motions: dict[int, FloatArray] = {}
+        # Inputs and accelerations of the steps of the cases that are learned.
+        self._steps: dict[int, tuple[Inputs, FloatArray]] = {}
         # By group, the cases that its members learned from; by member, its tree.
         self._cases: dict[int, list[int]] = {}
         self._trees: dict[int, Any] = {}
@@ -378,12 +380,14 @@ class ControllerModel:
         from sklearn.tree import ExtraTreeRegressor
 
         self._has_learned = True
-        for group in range(GROUPS):
-            cases = self._learned_by(group)
+        learned = [self._learned_by(group) for group in range(GROUPS)]
+        self._keep_steps(set().union(*learned))
+        for group, cases in enumerate(learned):
             if cases == self._cases.get(group):
                 continue
             self._cases[group] = cases
-            inputs, accelerations = self._steps([self._motions[index] for index in cases])
+            inputs = np.concatenate([self._steps[index][0] for index in cases])
+            accelerations = np.concatenate([self._steps[index][1] for index in cases])
             for member, seen in ((group, inputs[:, :-PAST_INPUTS]), (GROUPS + group, inputs)):
                 seed = (self._seed * self.members + member) % 2**32
                 # Each node of a tree chooses among half of the inputs.
@@ -406,29 +410,27 @@ class ControllerModel:
             return cases
         return [index for index in cases if index % GROUPS != group]
 
-    def _steps(self, motions: Sequence[FloatArray]) -> tuple[Inputs, FloatArray]:
-        """Return the inputs and accelerations of the VUT in all steps of motions.
-
-        Args:
-            motions: (T + 1, A, 3) each.
-
-        Returns:
-            Inputs, (steps, inputs), and accelerations in m/s2, (steps,), motion by motion.
-        """
-        lengths = np.array([len(motion) for motion in motions])
-        together = np.empty((len(motions), lengths.max(), *motions[0].shape[1:]))
+    def _keep_steps(self, cases: set[int]) -> None:
+        """Keep the steps of some cases, by index, and forget those of others."""
+        self._steps = {index: self._steps[index] for index in cases & set(self._steps)}
+        new = sorted(cases - set(self._steps))
+        if not new:
+            return
+        motions = [self._motions[index] for index in new]
+        together = np.empty((len(new), max(map(len, motions)), *motions[0].shape[1:]))
         for states, motion in zip(together, motions, strict=True):
             states[: len(motion)] = motion
             states[len(motion) :] = motion[-1]
-        observation = Observation(self._rollout.scenario, len(motions))
-        last_mps2 = np.zeros(len(motions))
+        observation = Observation(self._rollout.scenario, len(new))
+        last_mps2 = np.zeros(len(new))
         inputs = []
         for state in together.transpose(1, 3, 2, 0)[:-1].copy():
             inputs.append(observation.step(state[0], state[1], last_mps2))
             last_mps2 = state[2, VUT]
-        is_step = np.arange(len(inputs)) < lengths[:, None] - 1
-        accelerations = together[:, :-1, VUT, 2]
-        return np.stack(inputs, axis=1)[is_step], accelerations[is_step]
+        for index, motion, of_case in zip(new, motions, np.stack(inputs, axis=1), strict=True):
+            steps = len(motion) - 1
+            # A copy: a view would keep the inputs of all.
+            self._steps[index] = of_case[:steps].copy(), motion[:steps, VUT, 2]
 
 
 class ControllerModelPair:
