@@ -477,11 +477,11 @@ def check_scenario(config: c.CheckScenario) -> Shown:
 @verb(c.Train)
 def train(config: c.Train) -> PolicyChecks:
     """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
-    from merge_sumo.training.helix import checks_of
+    from merge_sumo.training.helix import train_and_check
 
     scenario = None if config.scenario is None else changed_scenario(config.scenario)
     with Bars(shown=config.progress) as bars:
-        return checks_of(config, scenario, bars.counted, bars.say)
+        return train_and_check(config, scenario, bars.counted, bars.say)
 
 
 # What the verbs share

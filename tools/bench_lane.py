@@ -89,8 +89,8 @@ def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
             for pov in (load_driver("pov1", k), Level0Pov(k))
         )
         shifted = starts - np.array([place_m, 0.0, place_m, 0.0])
-        best = best_response(Game("pov", None, reward), shifted)
         got, kept = (parts.of("pov", np.zeros(k)) for parts in (reached, unmoved))
+        best = best_response(Game("pov", None, reward), shifted, got)
         regret = (best - got) / (best - kept).mean()
         means[f"{place_m:.0f}"] = float(regret.mean())
         crash = -reward.weights.crash / 2

@@ -75,8 +75,7 @@ def export_onnx(
     if network.sees_svo:
         inputs.append(helper.make_tensor_value_info("svo_rad", TensorProto.DOUBLE, ["N", 1]))
         orientation = _Column(graph, "svo_rad")
-    x_pov, v_pov, x_vut, v_vut = state
-    traced: Any = features(x_pov, v_pov, x_vut, v_vut, orientation, scenario=played)
+    traced: Any = features(state, orientation, scenario=played)
     hidden = traced.name
     last = len(network.layers) - 1
     for place, (weight, bias) in enumerate(network.layers):

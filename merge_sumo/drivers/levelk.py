@@ -75,10 +75,7 @@ def actions_mps2(scenario: AccelerationLimits) -> FloatArray:
 
 
 def features(
-    x_pov_m: FloatArray,
-    v_pov_mps: FloatArray,
-    x_vut_m: FloatArray,
-    v_vut_mps: FloatArray,
+    state: Sequence[FloatArray] | FloatArray,
     svo_rad: FloatArray | None = None,
     *,
     scenario: Scenario,
@@ -95,15 +92,13 @@ def features(
     units. The numbers below are those of the paper's scenario, whose units are 1.
 
     Args:
-        x_pov_m: positions of the POV, (n,).
-        v_pov_mps: its speeds, (n,).
-        x_vut_m: positions of the VUT, (n,).
-        v_vut_mps: its speeds, (n,).
+        state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
         svo_rad: social value orientations of the POV, (n,), if the network sees them.
         scenario: the scenario that is played.
     """
     unit = Units.of(scenario)
-    times, gaps, v_level0, v_full = prospects(x_pov_m, v_pov_mps, x_vut_m, v_vut_mps, scenario)
+    x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state
+    times, gaps, v_level0, v_full = prospects(state, scenario)
     v_hw = scenario.v_hw_min_mps
     columns = [
         x_pov_m / (100.0 * unit.length) + 1.0,
@@ -123,19 +118,12 @@ def features(
 
 
 def prospects(
-    x_pov_m: FloatArray,
-    v_pov_mps: FloatArray,
-    x_vut_m: FloatArray,
-    v_vut_mps: FloatArray,
-    scenario: Scenario,
+    state: Sequence[FloatArray] | FloatArray, scenario: Scenario
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
     """Predict times, gaps and speeds at M for n states, every array of shape (n,).
 
     Args:
-        x_pov_m: positions of the POV, (n,).
-        v_pov_mps: its speeds, (n,).
-        x_vut_m: positions of the VUT, (n,).
-        v_vut_mps: its speeds, (n,).
+        state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
         scenario: the scenario that is played.
 
     Returns:
@@ -144,6 +132,7 @@ def prospects(
         until the first of these times, and that keeps its speed until the others; the speeds of
         the VUT at M in m/s on the level-0 profile and at full acceleration.
     """
+    x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state
     a_min, a_max = scenario.a_min_mps2, scenario.a_max_mps2
     a_level0, v_cruise = scenario.level0_a_mps2, scenario.level0_v_mps
     unit = Units.of(scenario)
@@ -316,14 +305,10 @@ class LevelKDriver(Driver):
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
         if not due.size:
             return self._held
-        inputs = features(
-            scene.x_pov_m[due],
-            scene.v_pov_mps[due],
-            scene.x_vut_m[due],
-            scene.v_vut_mps[due],
-            self._svo_rad[due] if self.network.sees_svo else None,
-            scenario=self._limited,
-        )
+        columns = scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps
+        state = [column[due] for column in columns]
+        svo_rad = self._svo_rad[due] if self.network.sees_svo else None
+        inputs = features(state, svo_rad, scenario=self._limited)
         actions = self.network.greedy(inputs)
         self._held[due] = np.where(actions < 0, np.nan, actions_mps2(self._limited)[actions])
         return self._held

@@ -97,7 +97,7 @@ class Observation:
             traffic.append(conflicting)
             for car in (POV, AHEAD, BEHIND):
                 traffic += [x_m[car] - x_vut, v_mps[car]]
-        times_s, gaps_m, v_level0, v_full = prospects(x_pov, v_pov, x_vut, v_vut, scenario)
+        times_s, gaps_m, v_level0, v_full = prospects((x_pov, v_pov, x_vut, v_vut), scenario)
         inputs = [a_last_mps2, x_pov - x_vut, v_pov - v_vut, x_pov, v_pov, x_vut, v_vut, *times_s]
         for gap_m in gaps_m:
             # Small gaps decide; larger ones are compressed beyond 80 m.
@@ -296,14 +296,10 @@ class ModelRollout:
     ) -> FloatArray:
         """Return the accelerations that the cars of the mainline choose, (C, R)."""
         limited, count = network.limited(self.scenario), len(cars)
-        inputs = features(
-            x_m[cars].ravel(),
-            v_mps[cars].ravel(),
-            np.tile(x_m[VUT], count),
-            np.tile(v_mps[VUT], count),
-            np.tile(svo_rad, count) if network.sees_svo else None,
-            scenario=limited,
-        )
+        vut = np.tile(x_m[VUT], count), np.tile(v_mps[VUT], count)
+        state = (x_m[cars].ravel(), v_mps[cars].ravel(), *vut)
+        seen_rad = np.tile(svo_rad, count) if network.sees_svo else None
+        inputs = features(state, seen_rad, scenario=limited)
         chosen = network.values_at_once(inputs).argmax(axis=1)
         chosen_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
         return chosen_mps2

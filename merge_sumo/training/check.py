@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
-from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
-from merge_sumo.drivers.levelk import LevelKDriver, QNetwork
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import load_network
+from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.paper import is_close
 from merge_sumo.road.merge import road_for
-from merge_sumo.scenario.case import Case, FloatArray, from_unit
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.rollout import Rollout
-from merge_sumo.sumo.world import World
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.plan import SimulationPlan
+from merge_sumo.simulation.povs import Povs
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
-from merge_sumo.training.reward import Reward, RewardParts, Role
+from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 
 CHECK_CASES = 300
-CORRIDORS = 32
+OPPONENTS: dict[str, tuple[Role, str]] = {
+    "pov1": ("pov", "level0"),
+    "vut1": ("vut", "level0"),
+    "pov2": ("pov", "vut1"),
+    "vut2": ("vut", "pov1"),
+}
+"""Role and opponent of each network, in the order of the helix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,11 +39,14 @@ class PolicyCheck:
     """A driver compared with its best response, over random cases of the pool.
 
     Attributes:
+        cases: number of cases.
         mean_return: mean return of the driver, played in SUMO.
-        mean_level0: mean return of level-0 behaviour in the driver's place.
+        mean_best: mean return of the best response.
+        mean_level0: mean return of level-0 behaviour in place of the driver.
         mean_regret: mean of best - return, as a share of the mean gain of the best response over
             level-0 behaviour.
         p99_regret: 99th percentile of the same.
+        collisions: number of collisions.
         avoidable_collisions: those in cases where the best response has none.
     """
 
@@ -68,94 +79,80 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> RewardParts:
     return RewardParts(*parts)
 
 
-def play(
-    cases: list[Case], make_pov: type[Driver] | QNetwork, make_vut: type[Driver] | QNetwork
-) -> list[Trajectory]:
-    """Play cases of one scenario in SUMO between two drivers.
-
-    Args:
-        cases: cases of one scenario.
-        make_pov: class of the POV's driver, or the network by which it acts.
-        make_vut: the same of the VUT.
-
-    Returns:
-        The trajectories, in the order of the cases.
-    """
-    scenario = cases[0].scenario
-    pov, vut = (
-        LevelKDriver(CORRIDORS, make) if isinstance(make, QNetwork) else make(CORRIDORS)
-        for make in (make_pov, make_vut)
-    )
-    with World(CORRIDORS, road_for(scenario), scenario=scenario) as world:
-        return Rollout(world, pov, vut, cases).run()
-
-
 def check_policy(
     name: str,
-    folder: Path | None = None,
+    folder: Path,
     count: int = CHECK_CASES,
     *,
     scenario: Scenario,
-) -> PolicyCheck:
-    """Compare a network of a folder with its best response.
-
-    Args:
-        name: name of the network, such as "pov1".
-        folder: the folder; by default the shipped policies.
-        count: number of random cases of the pool.
-        scenario: the scenario that is played.
-    """
-    opponent = {"pov2": "vut1", "vut2": "pov1"}.get(name)
-    known = None if opponent is None else load_network(opponent, folder)
-    return check_network(name, load_network(name, folder), known, Reward.of(scenario), count)
-
-
-def check_network(
-    name: str, network: QNetwork, opponent: QNetwork | None, reward: Reward, count: int
+    weights: RewardWeights | None = None,
 ) -> PolicyCheck:
     """Compare a network with its best response.
 
     Args:
         name: name of the network, such as "pov1".
-        network: the network.
-        opponent: network of its opponent; None for level 0.
-        reward: the reward of the game.
+        folder: folder of the networks.
         count: number of random cases of the pool.
+        scenario: the scenario that is played.
+        weights: weights of the reward; by default those of the scenario.
     """
-    level, scenario = 2 if name == "pov2" else 1, of_two(reward.scenario)
+    scenario = of_two(scenario)
+    reward = Reward(weights or RewardWeights.of(scenario), scenario)
+    role, other = OPPONENTS[name]
+    level = 2 if name == "pov2" else 1
     points = np.random.default_rng(20_201).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
-    role: Role = "pov" if name.startswith("pov") else "vut"
     is_pov = role == "pov"
-    level0 = Level0Pov if is_pov else Level0Vut
-    other = opponent or (Level0Vut if is_pov else Level0Pov)
-
-    def played(driver: type[Driver] | QNetwork) -> tuple[FloatArray, list[Trajectory]]:
-        trajectories = play(cases, *((driver, other) if is_pov else (other, driver)))
-        return returns_of(trajectories, reward).of(role, svo_rad), trajectories
-
-    reached, trajectories = played(network)
+    trajectories = _play(cases, *((name, other) if is_pov else (other, name)), folder)
+    reached = returns_of(trajectories, reward).of(role, svo_rad)
     collided = np.array([is_close(one) for one in trajectories])
-    unmoved, _ = played(level0)
+    unmoved = _play(cases, *(("level0", other) if is_pov else (other, "level0")), folder)
+    level0 = returns_of(unmoved, reward).of(role, svo_rad)
+    network = load_network(name, folder)
+    opponent = None if other == "level0" else load_network(other, folder)
     game = Game(role, opponent, reward, network.a_min_mps2)
-    start = np.array([[x for at in case.starts() for x in at] for case in cases])
+    start = np.array([np.ravel(case.starts()) for case in cases])
     if opponent is None:
-        best = best_response(game, start)
+        best = best_response(game, start, reached)
     else:
-        # The driver's own games are some that a search may find.
         searched, _ = beam_search(game, start, svo_rad, network)
         rolled_out = game.play(start, svo_rad, game.improved(greedy(network, game.scenario)))
+        # The games of the driver are some that a search may find.
         best = np.maximum(np.maximum(searched, rolled_out), reached)
-    gain = float((best - unmoved).mean())
+    gain = float((best - level0).mean())
     regret = (best - reached) / gain
     return PolicyCheck(
         cases=count,
         mean_return=float(reached.mean()),
         mean_best=float(best.mean()),
-        mean_level0=float(unmoved.mean()),
+        mean_level0=float(level0.mean()),
         mean_regret=float(regret.mean()),
         p99_regret=float(np.quantile(regret, 0.99)),
         collisions=int(collided.sum()),
         avoidable_collisions=int((collided & (best > -reward.weights.crash / 2)).sum()),
     )
+
+
+def _play(cases: list[Case], pov: str, vut: str, folder: Path) -> list[Trajectory]:
+    """Run cases in SUMO.
+
+    Args:
+        cases: the cases.
+        pov: name of the network that drives the POV, or "level0".
+        vut: the same of the VUT.
+        folder: folder of the networks.
+    """
+    scenario, level = cases[0].scenario, int(pov[-1])
+    plan = SimulationPlan(
+        scenario=scenario,
+        road=road_for(scenario),
+        vut=load(f"level{vut[-1]}", ControllerOptions(policies=folder)),
+        povs=Povs(policies=folder),
+        criterion=Criterion(),
+    )
+    played = []
+    for case in cases:
+        svo_rad = case.svo_rad if level == 2 else None
+        played.append(replace(case, level=level, svo_rad=svo_rad))
+    return simulate(plan, played, attrgetter("trajectory"))

@@ -8,7 +8,7 @@ What differs from the textbook, and why:
 - The target network follows by Polyak averaging, and that average is what is kept.
 - Exploring starts (`game.exploring_starts`).
 - psi is drawn again for every replayed transition: the reward is stored in its three parts.
-- No discount: every game ends.
+- No discount, because every game ends.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
-from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
-from merge_sumo.training.game import Game, exploring_starts
-from merge_sumo.training.reward import RewardParts, Role
+from merge_sumo.training.game import Game, IntArray, exploring_starts
+from merge_sumo.training.reward import RewardParts
 
 SQUASH_BELOW = -2.0
 GAMES = 64
@@ -50,10 +50,7 @@ class DdqnSettings:
     the transitions are in."""
     last_exploration: float = 0.1  # share of random actions from then on
     gradient_norm: float = 10.0  # bound to which the gradient is clipped
-    midway: float = 0.6
-    """Share of games that begin mid-way at the start; falls linearly to `last_midway` when half
-    of the transitions are in. Coverage first, then precision where a pool case leads."""
-    last_midway: float = 0.6  # share of games that begin mid-way from then on
+    midway: float = 0.6  # share of games that begin mid-way
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -90,46 +87,97 @@ def unsquash(squashed: Tensor) -> Tensor:
     return torch.where(squashed >= SQUASH_BELOW, squashed, SQUASH_BELOW - torch.expm1(depth))
 
 
-class ReplayBuffer:
-    """All transitions so far: features before and after, action, reward in parts, end."""
+TRANSITION = np.dtype(
+    [
+        ("action", np.int64),
+        ("before", np.float32, FEATURES),
+        ("after", np.float32, FEATURES),
+        ("parts", np.float32, 3),
+        ("continues", np.float32),
+    ]
+)
+"""Features before and after a decision, its action, the parts of the reward, and whether the game
+continues."""
 
-    def __init__(self, size: int) -> None:
-        """Make room for `size` transitions."""
-        self.before = np.zeros((size, FEATURES), dtype=np.float32)
-        self.after = np.zeros((size, FEATURES), dtype=np.float32)
-        self.parts = np.zeros((size, 3), dtype=np.float32)
-        self.action = np.zeros(size, dtype=np.int64)
-        self.goes_on = np.zeros(size, dtype=np.float32)
+
+class _Games:
+    """Games that are played at once, and the transitions of all games so far."""
+
+    def __init__(
+        self, game: Game, rng: np.random.Generator, settings: DdqnSettings, *, sees_svo: bool
+    ) -> None:
+        self.game, self.rng, self.midway, self.sees_svo = game, rng, settings.midway, sees_svo
+        self.transitions = np.zeros(settings.transitions, TRANSITION)
         self.filled = 0
+        self.state = np.zeros((GAMES, 4))
+        self.decisions = np.zeros(GAMES, dtype=np.int64)
+        self.svo_rad, self.returns = np.zeros((2, GAMES))
+        self.ended: list[tuple[float, bool]] = []
+        self._begin(np.arange(GAMES))
 
     @property
     def full(self) -> bool:
-        """Whether there is no room left."""
-        return self.filled == len(self.action)
+        return self.filled == len(self.transitions)
 
-    def add(
-        self,
-        before: FloatArray,
-        action: np.ndarray,
-        parts: FloatArray,
-        after: FloatArray,
-        goes_on: np.ndarray,
-    ) -> None:
-        """Add a transition per game, as far as there is room.
+    def _begin(self, which: IntArray) -> None:
+        n, scenario = len(which), self.game.scenario
+        self.state[which] = exploring_starts(n, self.rng, self.midway, scenario=scenario)
+        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, n) * self.sees_svo
+        self.decisions[which] = 0
+        self.returns[which] = 0.0
 
-        Args:
-            before: features before the decision, (n, 26).
-            action: actions, (n,).
-            parts: rewards in their three parts, (n, 3).
-            after: features after the decision, (n, 26).
-            goes_on: whether the game continues, (n,).
-        """
-        rows = slice(self.filled, min(self.filled + len(action), len(self.action)))
-        n = rows.stop - rows.start
-        self.before[rows], self.after[rows] = before[:n], after[:n]
-        self.parts[rows], self.action[rows] = parts[:n], action[:n]
-        self.goes_on[rows] = goes_on[:n]
-        self.filled = rows.stop
+    def play(self, online: nn.Sequential, epsilon: float) -> None:
+        """Take one decision in every game, a random one with probability epsilon."""
+        psi = self.svo_rad if self.sees_svo else None
+        before = features(self.state.T, psi, scenario=self.game.of_agent)
+        with torch.no_grad():
+            action = online(torch.from_numpy(before.astype(np.float32))).argmax(-1).numpy()
+        random = self.rng.integers(0, ACTIONS, GAMES)
+        action = np.where(self.rng.random(GAMES) < epsilon, random, action)
+        a_mps2 = self.game.actions_mps2[action]
+        self.state, parts, over = self.game.decide(self.state, self.svo_rad, a_mps2)
+        after = features(self.state.T, scenario=self.game.of_agent)
+        rows = self.transitions[self.filled : self.filled + GAMES]
+        n = len(rows)
+        rows["action"], rows["continues"] = action[:n], ~over[:n]
+        rows["before"], rows["after"] = before[:n, :FEATURES], after[:n]
+        rows["parts"] = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)[:n]
+        self.filled += n
+        self.returns += parts.of(self.game.role, self.svo_rad)
+        self.decisions += 1
+        again = np.flatnonzero(over | (self.decisions >= self.game.max_decisions))
+        if again.size:
+            crashed = parts.safe[again] < -self.game.reward.weights.crash / 2
+            self.ended += zip(self.returns[again].tolist(), crashed.tolist(), strict=True)
+            self._begin(again)
+
+    def recent(self) -> tuple[float, float]:
+        """Return mean return and share of crashes of the games that ended last."""
+        self.ended = self.ended[-2000:]
+        if not self.ended:
+            return math.nan, math.nan
+        mean_return, crash_share = np.mean(self.ended, axis=0).tolist()
+        return mean_return, crash_share
+
+    def loss(self, online: nn.Sequential, target: nn.Sequential, batch: int) -> Tensor:
+        """Return the loss of the online network on some transitions."""
+        rows = self.transitions[self.rng.integers(0, self.filled, batch)]
+        before, after = rows["before"], rows["after"]
+        svo_rad: np.ndarray = np.zeros(batch, dtype=np.float32)
+        if self.sees_svo:
+            svo_rad = self.rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
+            columns = np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0
+            before, after = np.column_stack([before, *columns]), np.column_stack([after, *columns])
+        reward = RewardParts(*rows["parts"].T).of(self.game.role, svo_rad)
+        inputs = torch.from_numpy(np.ascontiguousarray(after))
+        with torch.no_grad():
+            # Double: the online network picks the action, the target network rates it.
+            picked = online(inputs).argmax(-1, keepdim=True)
+            rated = unsquash(target(inputs).gather(1, picked)[:, 0])
+            goal = squash(torch.from_numpy(reward) + torch.from_numpy(rows["continues"]) * rated)
+        action = torch.from_numpy(rows["action"])[:, None]
+        q = online(torch.from_numpy(np.ascontiguousarray(before))).gather(1, action)[:, 0]
+        return nn.functional.smooth_l1_loss(q, goal)
 
 
 def train(
@@ -138,13 +186,13 @@ def train(
     settings: DdqnSettings | None = None,
     *,
     sees_svo: bool = False,
-    on_progress: Callable[[TrainingProgress], None] | None = None,
+    on_progress: Callable[[TrainingProgress], None] = lambda _: None,
 ) -> QNetwork:
     """Train the agent of a game and return its network; same seed, same weights.
 
     Args:
         game: the game.
-        seed: of the weights and of the games.
+        seed: seed of the weights and of the games.
         settings: by default those of the shipped policies.
         sees_svo: whether the network sees psi of the POV.
         on_progress: called after every thousand updates.
@@ -153,42 +201,36 @@ def train(
     # One thread: the result must not depend on the number of cores.
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    rng = np.random.default_rng(seed)
     inputs = FEATURES + SVO_FEATURES * sees_svo
     online, target = make_network(inputs, s.width), make_network(inputs, s.width)
     target.load_state_dict(online.state_dict())
     optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
-    replay = ReplayBuffer(s.transitions)
-    collector = _Collector(game, rng, s.midway, sees_svo=sees_svo)
-    loss = torch.zeros(())
+    games = _Games(game, np.random.default_rng(seed), s, sees_svo=sees_svo)
     update = 0
     while update < s.updates:
-        if not replay.full:
-            explored = min(2.0 * replay.filled / s.transitions, 1.0)
-            epsilon = s.exploration + explored * (s.last_exploration - s.exploration)
-            collector.midway = s.midway + explored * (s.last_midway - s.midway)
-            collector.collect(online, epsilon, replay)
-        share = (replay.filled - s.warm_up) / (s.transitions - s.warm_up)
-        due = s.updates if replay.full else int(s.updates * s.collecting * share)
+        if not games.full:
+            explored = min(2.0 * games.filled / s.transitions, 1.0)
+            games.play(online, s.exploration + explored * (s.last_exploration - s.exploration))
+        share = (games.filled - s.warm_up) / (s.transitions - s.warm_up)
+        due = s.updates if games.full else int(s.updates * s.collecting * share)
         while update < due:
             cosine = 0.5 * (1.0 + math.cos(math.pi * update / s.updates))
             rate = s.last_learning_rate + (s.learning_rate - s.last_learning_rate) * cosine
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (update + 1) / 500)
-            loss = _loss(online, target, replay, s.batch, rng, game.role, sees_svo=sees_svo)
+            loss = games.loss(online, target, s.batch)
             descend(optimiser, loss, online, target, s.gradient_norm, s.polyak)
             update += 1
-            if on_progress and update % 1000 == 0:
-                mean_return, crash_share = collector.recent()
-                on_progress(
-                    TrainingProgress(
-                        done=update,
-                        total=s.updates,
-                        loss=float(loss.detach()),
-                        mean_return=mean_return,
-                        crash_share=crash_share,
-                    )
+            if update % 1000 == 0:
+                mean_return, crash_share = games.recent()
+                progress = TrainingProgress(
+                    done=update,
+                    total=s.updates,
+                    loss=float(loss.detach()),
+                    mean_return=mean_return,
+                    crash_share=crash_share,
                 )
+                on_progress(progress)
     return export(target, game.a_min_mps2)
 
 
@@ -203,12 +245,12 @@ def descend(
     """Take one gradient step.
 
     Args:
-        optimiser: of the weights of the network.
-        loss: what is to fall.
+        optimiser: optimiser of the weights of the network.
+        loss: the loss.
         network: the network.
-        average: the network whose weights follow.
-        gradient_norm: the bound to which the gradient is clipped.
-        polyak: the share of the weights that the average takes over.
+        average: network with the average of the weights.
+        gradient_norm: bound to which the gradient is clipped.
+        polyak: share of the weights that the average takes over.
     """
     weights: list[Tensor] = list(network.parameters())
     averages: list[Tensor] = list(average.parameters())
@@ -220,98 +262,8 @@ def descend(
         torch._foreach_lerp_(averages, weights, polyak)
 
 
-class _Collector:
-    """Plays games and writes what happened into the replay."""
-
-    def __init__(
-        self, game: Game, rng: np.random.Generator, midway: float, *, sees_svo: bool
-    ) -> None:
-        self.game, self.rng, self.midway, self.sees_svo = game, rng, midway, sees_svo
-        self.state = np.zeros((GAMES, 4))
-        self.decisions = np.zeros(GAMES, dtype=np.int64)
-        self.svo_rad, self.returns = np.zeros((2, GAMES))
-        self.ended: list[tuple[float, bool]] = []
-        self._begin(np.arange(GAMES))
-
-    def _begin(self, which: np.ndarray) -> None:
-        n, scenario = len(which), self.game.scenario
-        self.state[which] = exploring_starts(n, self.rng, self.midway, scenario=scenario)
-        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, n) * self.sees_svo
-        self.decisions[which] = 0
-        self.returns[which] = 0.0
-
-    def collect(self, online: nn.Sequential, epsilon: float, replay: ReplayBuffer) -> None:
-        """Take one decision in every game, a random one with probability epsilon.
-
-        Args:
-            online: network that decides.
-            epsilon: probability of a random action.
-            replay: buffer that takes the transitions.
-        """
-        before = features(*self.state.T, scenario=self.game.of_agent)
-        seen = before
-        if self.sees_svo:
-            seen = np.column_stack([before, *_svo_columns(self.svo_rad)])
-        with torch.no_grad():
-            action = online(torch.from_numpy(seen.astype(np.float32))).argmax(-1).numpy()
-        random = self.rng.integers(0, ACTIONS, GAMES)
-        action = np.where(self.rng.random(GAMES) < epsilon, random, action)
-        a_mps2 = self.game.actions_mps2[action]
-        self.state, parts, over = self.game.decide(self.state, self.svo_rad, a_mps2)
-        in_parts = np.stack([parts.safe, parts.pov_ego, parts.vut_ego], axis=1)
-        after = features(*self.state.T, scenario=self.game.of_agent)
-        replay.add(before, action, in_parts, after, ~over)
-        self.returns += parts.of(self.game.role, self.svo_rad)
-        self.decisions += 1
-        again = np.flatnonzero(over | (self.decisions >= self.game.max_decisions))
-        if again.size:
-            crash = self.game.reward.weights.crash
-            self.ended += zip(
-                self.returns[again].tolist(), (parts.safe[again] < -crash / 2).tolist(), strict=True
-            )
-            self._begin(again)
-
-    def recent(self) -> tuple[float, float]:
-        """Return mean return and share of crashes of the games that ended last."""
-        last = self.ended = self.ended[-2000:]
-        mean_return, crash_share = np.mean(last, axis=0).tolist() if last else (math.nan, math.nan)
-        return mean_return, crash_share
-
-
-def _loss(
-    online: nn.Sequential,
-    target: nn.Sequential,
-    replay: ReplayBuffer,
-    batch: int,
-    rng: np.random.Generator,
-    role: Role,
-    *,
-    sees_svo: bool,
-) -> Tensor:
-    rows = rng.integers(0, replay.filled, batch)
-    before, after = replay.before[rows], replay.after[rows]
-    svo_rad: np.ndarray = np.zeros(batch, dtype=np.float32)
-    if sees_svo:
-        svo_rad = rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
-        columns = _svo_columns(svo_rad)
-        before, after = np.column_stack([before, *columns]), np.column_stack([after, *columns])
-    reward = RewardParts(*replay.parts[rows].T).of(role, svo_rad)
-    with torch.no_grad():
-        # Double: the online network picks the action, the target network rates it.
-        picked = online(torch.from_numpy(after)).argmax(-1, keepdim=True)
-        rated = unsquash(target(torch.from_numpy(after)).gather(1, picked)[:, 0])
-        goal = squash(torch.from_numpy(reward) + torch.from_numpy(replay.goes_on[rows]) * rated)
-    action = torch.from_numpy(replay.action[rows])[:, None]
-    q = online(torch.from_numpy(before)).gather(1, action)[:, 0]
-    return nn.functional.smooth_l1_loss(q, goal)
-
-
-def _svo_columns(svo_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0
-
-
 def make_network(inputs: int, width: int) -> nn.Sequential:
-    """Return a network with two hidden layers, at random."""
+    """Return a network with two hidden layers and random weights."""
     return nn.Sequential(
         nn.Linear(inputs, width),
         nn.ReLU(),
@@ -323,21 +275,15 @@ def make_network(inputs: int, width: int) -> nn.Sequential:
 
 def export(network: nn.Sequential, a_min_mps2: float | None = None) -> QNetwork:
     """Return a torch network as one that acts in numpy, with its limit of braking."""
-    layers = [
-        (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
-        for layer in network
-        if isinstance(layer, nn.Linear)
-    ]
-    return QNetwork(layers, a_min_mps2)
+    arrays = [parameter.detach().numpy().copy() for parameter in network.parameters()]
+    return QNetwork(list(zip(arrays[::2], arrays[1::2], strict=True)), a_min_mps2)
 
 
 def as_torch(network: QNetwork) -> nn.Sequential:
     """Return a network as one that torch trains, in float32; the inverse of `export`."""
     width, inputs = network.layers[0][0].shape
     model = make_network(inputs, width)
-    linear = [layer for layer in model if isinstance(layer, nn.Linear)]
     with torch.no_grad():
-        for layer, (weight, bias) in zip(linear, network.layers, strict=True):
-            layer.weight.copy_(torch.from_numpy(weight))
-            layer.bias.copy_(torch.from_numpy(bias))
+        for parameter, values in zip(model.parameters(), chain(*network.layers), strict=True):
+            parameter.copy_(torch.from_numpy(values))
     return model

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork
+from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
@@ -37,7 +37,13 @@ FPS = round(1.0 / (DECISION_STEPS * DT_S))
 
 
 class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
-    """One merging game, `merge_sumo/Merge-v0`."""
+    """One merging game, `merge_sumo/Merge-v0`.
+
+    Example:
+        game = MergeEnv("vut")
+        observation, _ = game.reset(seed=1)
+        observation, reward, terminated, truncated, _ = game.step(5)
+    """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
 
@@ -57,23 +63,32 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
             opponent: "level0", or a policy such as "vut1" or "pov1".
             svo: psi of a POV of level 2, in rad, or "random" for one drawn for every game; psi is
                 then part of the observation.
-            weights: of the reward; by default those of the scenario.
+            weights: weights of the reward; by default those of the scenario.
             render_mode: "rgb_array" for pictures; `gymnasium.make` takes "human" for a window, too.
             scenario: the scenario that is played; its timeout truncates a game.
 
         Raises:
             UserError: if these do not make a game.
         """
+        others = {"pov": "vut", "vut": "pov"}
+        if role not in others:
+            raise UserError(f"there is no role {role!r}: choose pov or vut")
+        if opponent != "level0" and not opponent.startswith(others[role]):
+            raise UserError(
+                f"a {role} cannot play against {opponent!r}: choose level0 or a {others[role]}"
+            )
         if role == "vut" and svo is not None:
             raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
-        if not (svo is None or svo == "random" or _is_psi(svo)):
+        is_psi = isinstance(svo, int | float) and SVO.low <= svo < SVO.high
+        if not (svo is None or svo == "random" or is_psi):
             raise UserError(f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2")
-        if render_mode not in (None, *self.metadata["render_modes"]):
+        if render_mode not in (None, "rgb_array"):
             raise UserError(
                 f"there is no render_mode {render_mode!r}: choose 'rgb_array', or leave it out"
             )
+        network = None if opponent == "level0" else load_network(opponent)
         reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
-        self.game = Game(role, _opponent(role, opponent), reward)
+        self.game = Game(role, network, reward)
         self.svo, self.render_mode = svo, render_mode
         unit = Units.of(scenario)
         units = np.array([unit.length, unit.speed, unit.length, unit.speed])
@@ -101,7 +116,11 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         return self._observed(), {}
 
     def step(self, action: np.int64) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        """Take one decision; `UserError` for what is not an action."""
+        """Take one decision.
+
+        Raises:
+            UserError: if it is not an action.
+        """
         if not self.action_space.contains(action):
             raise UserError(
                 f"an action is a whole number from 0 to {ACTIONS - 1}: not {action!s:.60}"
@@ -117,24 +136,8 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         return None if self._picture is None else self._picture.frame(self._state[0])
 
     def _observed(self) -> FloatArray:
-        seen = self._state[0]
+        state = self._state[0]
         if self.svo is not None:
-            seen = np.append(seen, self._svo_rad)
-        bounded: FloatArray = np.clip(seen, *self._bounds)
+            state = np.append(state, self._svo_rad)
+        bounded: FloatArray = np.clip(state, *self._bounds)
         return bounded
-
-
-def _is_psi(svo: object) -> bool:
-    return isinstance(svo, int | float) and SVO.low <= svo < SVO.high
-
-
-def _opponent(role: Role, opponent: str) -> QNetwork | None:
-    """Return the network that plays against `role`; None for level 0."""
-    if role not in ("pov", "vut"):
-        raise UserError(f"there is no role {role!r}: choose pov or vut")
-    if opponent == "level0":
-        return None
-    wanted = "vut" if role == "pov" else "pov"
-    if not opponent.startswith(wanted):
-        raise UserError(f"a {role} cannot play against {opponent!r}: choose level0 or a {wanted}")
-    return load_network(opponent)

@@ -1,8 +1,8 @@
 """The merging game as a function of states: eq. (4) and a known opponent, thousands at once.
 
-SUMO follows eq. (4) to 1e-9, so what is played here is what happens there (`check.py` looks). A
-level-k driver knows its opponent, the driver of level k-1, so it can play the game out: that is
-what refinement (`refine`) and the search for a best response (`best_response`) do.
+SUMO follows eq. (4) to 1e-9, so a game has the same course there (`check.py` compares them). A
+level-k driver knows its opponent, the driver of level k-1, so refinement (`refine`) and the search
+for a best response (`best_response`) can play the game to its end.
 
 A state is [x_POV, v_POV, x_VUT, v_VUT], in m and m/s; a decision lasts 0.5 s.
 """
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
 from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork, actions_mps2, features
 from merge_sumo.scenario.case import FloatArray
+from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import DT_S, Scenario, Units
 from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
 
@@ -25,22 +26,39 @@ IntArray = NDArray[np.int64]
 
 
 def of_two(scenario: Scenario) -> Scenario:
-    """Return a scenario without other cars: a level is a driver's answer to the VUT alone."""
-    return replace(scenario, headway_ahead_s=None, headway_behind_s=None)
+    """Return a scenario of a POV and a VUT alone, with perfect sensors and actuators."""
+    return replace(
+        scenario,
+        headway_ahead_s=None,
+        headway_behind_s=None,
+        sense=Sensing(),
+        act=Actuation(),
+    )
 
 
 Policy = Callable[[FloatArray, FloatArray], IntArray]
-"""The places in `actions_mps2`, (n,), that are chosen in states, (n, 4), for psi, (n,)."""
+"""Chooses actions, (n,), as indices of `actions_mps2`, in states, (n, 4), for psi, (n,)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Game:
-    """A game of an agent: its role, the opponent that it knows, and the reward."""
+    """A game of an agent.
 
-    role: Role  # "pov" or "vut"
-    opponent: QNetwork | None  # the network of level k-1, or None for the level-0 driver
-    reward: Reward  # of the scenario that is played
-    a_min_mps2: float | None = None  # hardest braking of the agent; None for the scenario's
+    Example:
+        game = Game("pov", None, Reward.of(US23))
+        returns = game.play(state, svo_rad, greedy(network, US23))
+
+    Attributes:
+        role: what the agent drives, "pov" or "vut".
+        opponent: the network of level k-1; None for the level-0 driver.
+        reward: the reward of the scenario that is played.
+        a_min_mps2: hardest braking of the agent; None for that of the scenario.
+    """
+
+    role: Role
+    opponent: QNetwork | None
+    reward: Reward
+    a_min_mps2: float | None = None
 
     @property
     def scenario(self) -> Scenario:
@@ -97,21 +115,20 @@ class Game:
             As `advance`.
         """
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
-        of_pov, reward = self.role == "pov", self.reward
-        learned = None
+        reward, scenario = self.reward, self.scenario
+        other = np.zeros(len(state))
         if self.opponent is not None:
-            choices = actions_mps2(self.opponent.limited(self.scenario))
-            learned = choices[greedy(self.opponent, self.scenario)(state, svo_rad)]
+            choices = actions_mps2(self.opponent.limited(scenario))
+            other = choices[greedy(self.opponent, scenario)(state, svo_rad)]
         safe, pov_ego, vut_ego = np.zeros((3, len(state)))
         live = np.ones(len(state), dtype=bool)
         for _ in range(DECISION_STEPS):
-            if learned is not None:
-                other = learned
-            elif of_pov:
-                other = level0_acceleration(v_vut, self.scenario)
+            if self.role == "vut":
+                a_pov, a_vut = other, a_mps2
+            elif self.opponent is None:
+                a_pov, a_vut = a_mps2, level0_acceleration(v_vut, scenario)
             else:
-                other = np.zeros_like(v_vut)
-            a_pov, a_vut = (a_mps2, other) if of_pov else (other, a_mps2)
+                a_pov, a_vut = a_mps2, other
             pov_ego += live * reward.pov_step(v_pov, a_pov)
             vut_ego += live * reward.vut_step(v_vut, a_vut)
             x_pov = x_pov + live * v_pov * DT_S
@@ -140,21 +157,18 @@ class Game:
             state: states, (n, 4).
             svo_rad: psi of the POV, (n,).
             policy: chooses the actions.
-            first: actions, (n,), that come before those of the policy, if any.
+            first: actions, (n,), before those of the policy, if any.
             held: number of decisions for which these are held.
         """
         returns, index = np.zeros(len(state)), np.arange(len(state))
-        actions = self.actions_mps2
         for decision in range(self.max_decisions):
             if first is not None and decision < held:
                 action = first[index]
             else:
                 action = policy(state, svo_rad)
-            state, reward, over = self.advance(state, svo_rad, actions[action])
+            state, reward, over = self.advance(state, svo_rad, self.actions_mps2[action])
             returns[index] += reward
             index, state, svo_rad = index[~over], state[~over], svo_rad[~over]
-            if not index.size:
-                break
         return returns
 
     def action_returns(
@@ -165,7 +179,7 @@ class Game:
         Args:
             state: states, (n, 4).
             svo_rad: psi of the POV, (n,).
-            policy: chooses the actions that follow.
+            policy: chooses the actions after it.
             held: number of decisions for which an action is held.
         """
         repeated, psi = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
@@ -174,7 +188,12 @@ class Game:
 
     def improved(self, policy: Policy) -> Policy:
         """Return the policy that plays every action out before it chooses (Tesauro, 1996)."""
-        return lambda state, svo_rad: self.action_returns(state, svo_rad, policy).argmax(axis=1)
+
+        def choose(state: FloatArray, svo_rad: FloatArray) -> IntArray:
+            returns = self.action_returns(state, svo_rad, policy)
+            return np.asarray(returns.argmax(axis=1))
+
+        return choose
 
 
 def greedy(network: QNetwork, scenario: Scenario) -> Policy:
@@ -199,8 +218,7 @@ def inputs_of(
         scenario: the scenario that is played.
     """
     psi = svo_rad if network.sees_svo else None
-    x_pov, v_pov, x_vut, v_vut = state.T
-    return features(x_pov, v_pov, x_vut, v_vut, psi, scenario=network.limited(scenario))
+    return features(state.T, psi, scenario=network.limited(scenario))
 
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
@@ -227,9 +245,8 @@ def exploring_starts(
 ) -> FloatArray:
     """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
 
-    Most of the former are states from which both would reach M together, because that is where
-    a small error of Q is a collision; some are anywhere, because a black-box VUT brings the
-    drivers there.
+    Mid-way, both vehicles would mostly reach M together, because a small error of Q is a collision
+    there. Some states are anywhere, because a black-box VUT leads the drivers to them.
 
     Args:
         n: number of states.
@@ -238,27 +255,22 @@ def exploring_starts(
         scenario: the scenario that is played.
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
-    x_vut0, a = scenario.x_vut0_m, scenario.level0_a_mps2
+    speed, x_vut0 = unit.speed, scenario.x_vut0_m
     (x_low, _), (v_low, v_high) = scenario.x_pov0_m, scenario.v_pov0_mps
     x_vut = rng.uniform(x_vut0, -1.0 * unit.length, n)
     v_vut0 = _starting_speeds(n, rng, scenario)
-    on_profile = np.sqrt(v_vut0**2 + 2.0 * a * (x_vut - x_vut0)) + rng.normal(
-        0.0, 3.0 * unit.speed, n
-    )
-    v_vut = np.where(
-        rng.random(n) < 0.6,
-        on_profile,
-        rng.uniform(2.0 * unit.speed, scenario.v_hw_max_mps, n),
-    ).clip(unit.speed, scenario.v_hw_max_mps + unit.speed)
-    v_pov = np.where(
-        rng.random(n) < 0.7,
-        rng.uniform(v_low - 5.0 * unit.speed, v_high + 2.0 * unit.speed, n),
-        rng.uniform(v_low - 17.0 * unit.speed, v_high + 7.0 * unit.speed, n),
-    ).clip(0.0)
-    gap = wide_gap * np.where(
-        rng.random(n) < 0.7, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n)
-    )
-    x_pov = gap - v_pov * level0_time_to(-x_vut, v_vut, scenario)
+    on_profile = np.sqrt(v_vut0**2 + 2.0 * scenario.level0_a_mps2 * (x_vut - x_vut0))
+    on_profile += rng.normal(0.0, 3.0 * speed, n)
+    follows = rng.random(n) < 0.6
+    v_vut = np.where(follows, on_profile, rng.uniform(2.0 * speed, scenario.v_hw_max_mps, n))
+    v_vut = v_vut.clip(speed, scenario.v_hw_max_mps + speed)
+    likely = rng.random(n) < 0.7
+    near = rng.uniform(v_low - 5.0 * speed, v_high + 2.0 * speed, n)
+    far = rng.uniform(v_low - 17.0 * speed, v_high + 7.0 * speed, n)
+    v_pov = np.where(likely, near, far).clip(0.0)
+    together = rng.random(n) < 0.7
+    gap = np.where(together, rng.normal(0.0, 25.0, n), rng.uniform(-120.0, 120.0, n))
+    x_pov = wide_gap * gap - v_pov * level0_time_to(-x_vut, v_vut, scenario)
     x_pov = x_pov.clip(x_low - 80.0 * unit.length, 150.0 * unit.length)
     states = np.stack([x_pov, v_pov, x_vut, v_vut], axis=1)
     return np.where(rng.random((n, 1)) < midway, states, pool_starts(n, rng, scenario))

@@ -1,24 +1,21 @@
 """The double helix: each level-k driver is trained against level k-1 (Wang et al., Fig. 2b).
 
-The two networks of a level do not depend on each other and are trained in parallel, in a process
-each. A network is first trained by DDQN (`ddqn`), then refined (`refine`), then checked in SUMO.
+The two networks of a level are trained in parallel, in a process each: first by DDQN (`ddqn`), then
+by refinement (`refine`). Then they are checked in SUMO (`check`).
 """
 
 from __future__ import annotations
 
 import hashlib
-import json
-import queue
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from contextlib import suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from functools import partial
 from importlib.metadata import version
 from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from safetensors.numpy import save
@@ -36,33 +33,20 @@ from merge_sumo.drivers.policies import (
     scenario_record,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.files import (
-    cannot_write,
-    check_own,
-    make_folder,
-    replace_own,
-    write_new,
-)
+from merge_sumo.files import cannot_write, check_own, make_folder, replace_own, write_new
 from merge_sumo.printable import quoted
 from merge_sumo.records import to_json, to_plain
 from merge_sumo.result import Result
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
-from merge_sumo.spawning import forget_safe_path, without_cwd
-from merge_sumo.training.check import CHECK_CASES, PolicyCheck, check_network, check_policy
+from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
+from merge_sumo.training.check import CHECK_CASES, OPPONENTS, PolicyCheck, check_policy
 from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
-from merge_sumo.training.reward import Reward, RewardWeights, Role
+from merge_sumo.training.reward import Reward, RewardWeights
 from merge_sumo.workers import leave_signals_to_parent
 
-OPPONENTS: dict[str, tuple[Role, str]] = {
-    "pov1": ("pov", "level0"),
-    "vut1": ("vut", "level0"),
-    "pov2": ("pov", "vut1"),
-    "vut2": ("vut", "pov1"),
-}
-"""Role and opponent of each network, in the order of the helix."""
 PAIRS: tuple[tuple[str, ...], ...] = (NETWORKS[:2], NETWORKS[2:])
 """The networks of a level, which do not depend on each other."""
 LOG = ".training.jsonl"
@@ -85,12 +69,8 @@ LEVEL_SETTINGS = {
     ),
 }
 """Settings by the level of the driver. An opponent that reacts makes the game harder: level 2 takes
-more games, nearly all from the pool's own starts, and more updates. Level 1 is refined less: with
-more refinement, level 2 stayed farther from its own best response (`policies/README.md`)."""
-
-
-_Task = tuple[str, Game, int, TrainingSettings]
-"""Name, game, seed and settings of a network, for the process that trains it."""
+more games, nearly all from starts of the pool, and more updates. Level 1 is refined less: with more
+refinement, level 2 stayed farther from its own best response (`policies/README.md`)."""
 
 
 def train_library(
@@ -102,14 +82,14 @@ def train_library(
     *,
     scenario: Scenario,
     a_min_mps2: float | None = None,
-    on_progress: Callable[[TrainingProgress], None] | None = None,
-    on_done: Callable[[str, PolicyCheck | None], None] | None = None,
+    on_progress: Callable[[TrainingProgress], None] = lambda _: None,
+    on_done: Callable[[str, str], None] = lambda *_: None,
 ) -> None:
     """Train networks into a folder, in the order of the helix; finished ones are kept.
 
-    A network that the folder's manifest already has with the same scenario, seed, weights,
-    settings and opponent is not trained again, so an interrupted training goes on with what is not
-    finished. Next to each network lies a log, `<name>.training.jsonl`.
+    A network that the manifest of the folder already has with the same scenario, seed, weights,
+    settings and opponent is not trained again, so an interrupted training continues with what is
+    not finished. Each network has a log next to it, `NAME.training.jsonl`.
 
     Args:
         folder: folder of the networks and their manifest.
@@ -118,9 +98,9 @@ def train_library(
         weights: weights of the reward; by default those of the scenario.
         settings: settings of every network; by default those of its level.
         scenario: the scenario that is played.
-        a_min_mps2: hardest braking of the POVs; the VUTs keep the scenario's limit.
+        a_min_mps2: hardest braking of the POVs; the VUTs keep the limit of the scenario.
         on_progress: called with the progress of each network.
-        on_done: called with the name of each network and its check, None for one that was there.
+        on_done: called with the name of each network and "ready" or "there already".
 
     Raises:
         UserError: if the limit does not fit the scenario, the scenario has no road, an opponent is
@@ -134,47 +114,51 @@ def train_library(
             f"{scenario.a_min_mps2:g} to below 0, such as `a_min` {scenario.a_min_mps2 / 2:g}"
         )
     reward = Reward(weights or RewardWeights.of(scenario), scenario)
-    road_for(scenario)  # on which it is checked in the end
+    road_for(scenario)  # the check needs it in the end
     _take(folder)
     for level, pair in enumerate(PAIRS, start=1):
         of_level = settings or LEVEL_SETTINGS[level]
-        plans = {
-            name: _plan(folder, name, seed, reward, of_level, a_min_mps2)
-            for name in pair
-            if name in names
-        }
-        tasks: list[_Task] = []
+        plans = {}
+        for name in pair:
+            if name in names:
+                plans[name] = _plan(folder, name, seed, reward, of_level, a_min_mps2)
+        tasks: dict[str, _Task] = {}
         for name, plan in plans.items():
-            known = read_manifest(folder).get(name, {})
-            if not _is_of(known, plan):
-                if known:
-                    raise UserError(
-                        f"{folder} has a {name} of another scenario, seed, opponent or setting: "
-                        "choose another folder with `out`, or remove it first"
-                    )
-                role, opponent = OPPONENTS[name]
+            known = read_manifest(folder).get(name)
+            if known is None:
+                opponent = plan["opponent"]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                game = Game(role, network, reward, plan.get(LIMIT))
-                tasks.append((name, game, seed, of_level))
-            elif on_done is not None:
-                on_done(name, None)
-        for trained, network, check, seconds in _train_in_parallel(folder, tasks, on_progress):
-            entry = {**plans[trained], "training_s": round(seconds, 1)}
-            _keep(folder, trained, network, entry, check)
-            if on_done is not None:
-                on_done(trained, check)
+                game = Game(plan["role"], network, reward, plan.get(LIMIT))
+                tasks[name] = game, seed, of_level
+            elif not _is_of(known, plan):
+                raise UserError(
+                    f"{folder} has a {name} of another scenario, seed, opponent or setting: "
+                    "choose another folder with `out`, or remove it first"
+                )
+        for name, network, seconds in _train_in_parallel(folder, tasks, on_progress):
+            _keep(folder, name, network, {**plans[name], "training_s": round(seconds, 1)})
+        for name in plans:
+            entry = read_manifest(folder)[name]
+            if "check" in entry:
+                on_done(name, "there already")
+                continue
+            count = of_level.check_cases
+            check = check_policy(name, folder, count, scenario=scenario, weights=reward.weights)
+            _write_entry(folder, name, {**entry, "check": to_plain(check)})
+            on_done(name, "ready")
 
 
 def _take(folder: Path) -> None:
-    """Create a folder of policies with an empty manifest, which marks the folder as ours.
+    """Create a folder of policies with an empty manifest.
 
-    Raises `UserError` for a folder that has other contents and no manifest.
+    Raises:
+        UserError: if the folder has other contents and no manifest.
     """
     make_folder(folder, exist_ok=True)
     manifest = folder / MANIFEST
     files = [folder / f"{name}{end}" for name in NETWORKS for end in (LOG, WEIGHTS)]
     check_own(manifest, *files)
-    if read_manifest(folder) or manifest.is_file():
+    if manifest.is_file():
         return
     try:
         if any(folder.iterdir()):
@@ -187,10 +171,10 @@ def _take(folder: Path) -> None:
 
 
 def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
-    """Return whether the entry of a manifest, perhaps empty, follows a plan."""
-    others = plan.keys() - {"scenario"}
-    same = all(known.get(key) == plan.get(key) for key in {*others, LIMIT})
-    return same and plays_as(scenario_of(known), scenario_of(plan))
+    """Return whether the entry of a manifest follows a plan."""
+    if not plays_as(scenario_of(known), scenario_of(plan)):
+        return False
+    return all(known.get(key) == plan.get(key) for key in {*plan, LIMIT} - {"scenario"})
 
 
 def _plan(
@@ -201,12 +185,13 @@ def _plan(
     settings: TrainingSettings,
     a_min_mps2: float | None,
 ) -> dict[str, Any]:
-    """Return everything that decides the weights of a network; a POV may brake less."""
+    """Return everything that decides the weights of a network."""
     role, opponent = OPPONENTS[name]
-    limit = a_min_mps2 if role == "pov" else None
-    of_limit = "" if a_min_mps2 is None else f" --a-min {a_min_mps2:g}"
-    scenario = reward.scenario
-    of_scenario = "" if plays_as(scenario, US23) else f" --scenario {quoted(scenario.name)}"
+    scenario, command = reward.scenario, f"merge-sumo train --only {name} --seed {seed}"
+    if not plays_as(scenario, US23):
+        command += f" --scenario {quoted(scenario.name)}"
+    if a_min_mps2 is not None:
+        command += f" --a-min {a_min_mps2:g}"
     opponent_sha256 = None
     if opponent != "level0":
         entry = read_manifest(folder).get(opponent)
@@ -218,8 +203,8 @@ def _plan(
                 f"{scenario_of(entry).name}: choose another folder with `out`"
             )
         opponent_sha256 = entry["sha256"]
-    return {
-        "command": f"merge-sumo train --only {name} --seed {seed}{of_scenario}{of_limit}",
+    plan = {
+        "command": command,
         "scenario": scenario_record(scenario),
         "role": role,
         "opponent": opponent,
@@ -227,107 +212,95 @@ def _plan(
         "seed": seed,
         "reward_weights": to_plain(reward.weights),
         "settings": to_plain(settings),
-        **({} if limit is None else {LIMIT: limit}),
     }
+    if a_min_mps2 is not None and role == "pov":
+        plan[LIMIT] = a_min_mps2
+    return plan
 
 
-_Trained = tuple[str, QNetwork, PolicyCheck, float]
-"""Name, network, its check against the best response, and the seconds of the training."""
+_Task = tuple[Game, int, TrainingSettings]
+"""Game, seed and settings of a network, for the process that trains it."""
+_Trained = tuple[str, QNetwork, float]
+"""Name, network, and the seconds of the training."""
 
 
 def _train_in_parallel(
-    folder: Path, tasks: list[_Task], on_progress: Callable[[TrainingProgress], None] | None
+    folder: Path, tasks: dict[str, _Task], on_progress: Callable[[TrainingProgress], None]
 ) -> list[_Trained]:
-    """Train networks in a process each; write their logs while they train."""
-    if not tasks:
-        return []
+    """Train networks in a process each; write their logs while they train.
+
+    Raises:
+        UserError: if the log cannot be written, or a process ends before its network is trained.
+    """
+    # Spawned, because libsumo's simulation must not be forked.
     context = get_context("spawn")
-    for name, *_ in tasks:
-        _log(folder, name, "w")
-    with without_cwd():
-        reports = context.Queue()
-        # Spawned, because libsumo's simulation must not be forked.
-        pool = ProcessPoolExecutor(len(tasks), context, _report_into, (reports,))
-        results = [pool.submit(_train_one, *task) for task in tasks]
-    with pool:
-        running: set[Future[_Trained]] = set(results)
-        try:
-            while running:
-                running = wait(running, timeout=0.2).not_done
-                with suppress(queue.Empty):
-                    while True:
-                        progress: TrainingProgress = reports.get_nowait()
-                        line = json.dumps(to_plain(progress)) + "\n"
-                        _log(folder, progress.network, "a", line)
-                        if on_progress is not None:
-                            on_progress(progress)
-        except BaseException:
+    trained: list[_Trained] = []
+    names: dict[Connection, str] = {}
+    logs = dict.fromkeys(tasks, b"")
+    with ExitStack() as opened:
+        for name, task in tasks.items():
+            receiver, sender = context.Pipe(duplex=False)
+            process = context.Process(target=_train_one, args=(sender, name, *task))
+            with without_main(), without_cwd():
+                process.start()
             # An interrupted training does not wait for the hour that a process still needs.
-            for process in list(pool._processes.values()):
-                process.kill()
-            raise
-        return [result.result() for result in results]
+            opened.callback(process.kill)
+            sender.close()
+            names[receiver] = name
+        while names:
+            for receiver in cast(list[Connection], wait(list(names))):
+                name = names[receiver]
+                try:
+                    message = receiver.recv()
+                except EOFError as error:
+                    raise UserError(
+                        f"the process that trains {name} has ended: free memory, then run the "
+                        "command again"
+                    ) from error
+                if isinstance(message, TrainingProgress):
+                    logs[name] += to_json(message)
+                    replace_own(folder / f"{name}{LOG}", logs[name])
+                    on_progress(message)
+                else:
+                    trained.append(message)
+                    del names[receiver]
+    return trained
 
 
-def _log(folder: Path, name: str, mode: str, line: str = "") -> None:
-    """Begin the log of a network's training, or append to it; `UserError` if that fails."""
-    path = folder / f"{name}{LOG}"
-    try:
-        with path.open(mode, encoding="utf-8") as log:
-            log.write(line)
-    except OSError as error:
-        raise cannot_write(path, error) from error
-
-
-_reports: Any = None
-"""The queue to which a training process reports."""
-
-
-def _report_into(reports: Any) -> None:
-    global _reports  # noqa: PLW0603 (one process, one queue)
-    _reports = reports
+def _train_one(
+    sender: Connection, name: str, game: Game, seed: int, settings: TrainingSettings
+) -> None:
+    """Train a network by DDQN and refine it; send the progress, then the result."""
     forget_safe_path()
     leave_signals_to_parent()
 
-
-def _train_one(name: str, game: Game, seed: int, settings: TrainingSettings) -> _Trained:
-    """Train a network by DDQN, refine it, check it in SUMO."""
-
-    def report(now: TrainingProgress) -> None:
-        _reports.put(replace(now, network=name))
+    def report(progress: TrainingProgress) -> None:
+        sender.send(replace(progress, network=name))
 
     started = time.perf_counter()
     network = train(game, seed, settings.ddqn, sees_svo=name == "pov2", on_progress=report)
     network = refine(game, network, seed, settings.refine, report)
-    seconds = time.perf_counter() - started
-    check = check_network(name, network, game.opponent, game.reward, settings.check_cases)
-    return name, network, check, seconds
+    sender.send((name, network, time.perf_counter() - started))
 
 
-def _keep(
-    folder: Path, name: str, network: QNetwork, entry: dict[str, Any], check: PolicyCheck
-) -> None:
+def _keep(folder: Path, name: str, network: QNetwork, entry: dict[str, Any]) -> None:
     """Write a network, then its entry in the manifest."""
-    tensors = {
-        f"{i}.{part}": tensor.astype("float32")
-        for i, layer in enumerate(network.layers)
-        for part, tensor in zip(("weight", "bias"), layer, strict=True)
-    }
+    tensors = {}
+    for i, (weight, bias) in enumerate(network.layers):
+        tensors[f"{i}.weight"] = weight.astype("float32")
+        tensors[f"{i}.bias"] = bias.astype("float32")
     if network.a_min_mps2 is not None:
         # In the file, so that its hash covers the limit, too.
         tensors[LIMIT] = np.array([network.a_min_mps2])
     content = save(tensors)
     replace_own(folder / f"{name}{WEIGHTS}", content)
-    packages = ("torch", "numpy", "libsumo")
-    known = {
-        **read_manifest(folder),
-        name: {
-            **entry,
-            "sha256": hashlib.sha256(content).hexdigest(),
-            "versions": {package: version(package) for package in packages},
-            "check": to_plain(check),
-        },
-    }
+    versions = {package: version(package) for package in ("torch", "numpy", "libsumo")}
+    sha256 = hashlib.sha256(content).hexdigest()
+    _write_entry(folder, name, {**entry, "sha256": sha256, "versions": versions})
+
+
+def _write_entry(folder: Path, name: str, entry: dict[str, Any]) -> None:
+    known = {**read_manifest(folder), name: entry}
     entries = {name: known[name] for name in NETWORKS if name in known}
     replace_own(folder / MANIFEST, to_json({"networks": entries}, indent=2))
 
@@ -337,66 +310,74 @@ class PolicyChecks(Result, dict[str, PolicyCheck]):
 
     def lines(self) -> list[str]:
         """Return a table of the checks."""
-        return [
-            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0",
-            *(
-                f"{name:<7}  {one.mean_regret:11.2%}  {one.p99_regret:10.2%}  "
-                f"{one.collisions:10d}  {one.avoidable_collisions:9d}  "
-                f"{one.mean_return:11.3f}  {one.mean_best:.3f}  {one.mean_level0:.3f}"
-                for name, one in self.items()
-            ),
+        lines = [
+            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
         ]
+        for name, check in self.items():
+            lines.append(
+                f"{name:<7}  {check.mean_regret:11.2%}  {check.p99_regret:10.2%}  "
+                f"{check.collisions:10d}  {check.avoidable_collisions:9d}  "
+                f"{check.mean_return:11.3f}  {check.mean_best:.3f}  {check.mean_level0:.3f}"
+            )
+        return lines
 
 
-def checks_of(
-    asked: config.Train,
+def train_and_check(
+    settings: config.Train,
     scenario: Scenario | None,
     on_part: Callable[[str, int, int, str, str], None],
     say: Callable[[str], None],
 ) -> PolicyChecks:
-    """Train the learned drivers, or measure those that are there, and return what each loses.
+    """Train the learned drivers, or only check those in a folder.
 
     Args:
-        asked: what is trained.
-        scenario: the scenario that is asked for.
-        on_part: told how far it is, as of studies.
-        say: told which networks are ready.
+        settings: what is trained.
+        scenario: the scenario; None for the paper's.
+        on_part: called with the name of a part, the progress in it, its total and unit, and a note.
+        say: called with a sentence about each network.
+
+    Returns:
+        The regret of each network.
 
     Raises:
-        UserError: for a network or a folder that is not known.
+        UserError: for an unknown network, or an unknown folder.
     """
-    wanted = set(asked.only or NETWORKS)
+    wanted = set(settings.only or NETWORKS)
     if unknown := wanted - set(NETWORKS):
         raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
-    names, played = [name for name in NETWORKS if name in wanted], scenario or US23
-    folder = policies_of(played) if asked.out is None else Path(asked.out)
-    if not asked.check:
+    names, played = tuple(name for name in NETWORKS if name in wanted), scenario or US23
+    folder = policies_of(played) if settings.out is None else Path(settings.out)
+    if not settings.check:
+        if settings.out is None and not plays_as(played, US23):
+            raise UserError(
+                f"the shipped policies are for {US23.name}: name with `out` a folder for those for "
+                f"{played.name}"
+            )
 
         def progressed(now: TrainingProgress) -> None:
             on_part(f"{now.network} {now.stage}", now.done, now.total, "updates", now.note)
 
-        if asked.out is None and not plays_as(played, US23):
-            raise UserError(
-                f"the shipped policies are for {US23.name}: say with `out` where those for "
-                f"{played.name} are to go"
-            )
         train_library(
-            *(folder, tuple(names), asked.seed),
+            *(folder, names, settings.seed),
             scenario=played,
-            a_min_mps2=asked.a_min,
+            a_min_mps2=settings.a_min,
             on_progress=progressed,
-            on_done=lambda n, check: say(f"{n} is {'there already' if check is None else 'ready'}"),
+            on_done=lambda name, state: say(f"{name} is {state}"),
         )
     manifest = read_manifest(folder)
-    if missing := [name for name in names if name not in manifest]:
-        raise UserError(f"{folder} has no {missing[0]}: run `merge-sumo train` to make it")
+    for name in names:
+        if name not in manifest:
+            raise UserError(f"{folder} has no {name}: run `merge-sumo train` to make it")
     trained_for = scenario_of(manifest[names[0]])
     if scenario is None and not plays_as(trained_for, US23):
         raise UserError(
             f"{folder} was trained for {trained_for.name}: say with `scenario` in which one to "
             f"check it, or {US23.name}"
         )
-    if asked.check:
-        checked = partial(check_policy, count=asked.cases, scenario=played)
-        return PolicyChecks({name: checked(name, folder) for name in names})
-    return PolicyChecks({name: PolicyCheck(**manifest[name]["check"]) for name in names})
+    checks = PolicyChecks()
+    for name in names:
+        if settings.check:
+            checks[name] = check_policy(name, folder, settings.cases, scenario=played)
+        else:
+            checks[name] = PolicyCheck(**manifest[name]["check"])
+    return checks

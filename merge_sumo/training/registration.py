@@ -9,8 +9,8 @@ from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S
 
 ENV_ID = "merge_sumo/Merge-v0"
 
-# The environments themselves are imported when one is made. They truncate a game by the timeout of
-# its scenario: here stands what no scenario exceeds, for the wrappers that ask for a limit.
+# The environment truncates a game by the timeout of its scenario. Wrappers that ask for a limit get
+# one that no scenario exceeds.
 registration.register(
     ENV_ID,
     entry_point="merge_sumo.training.env:MergeEnv",

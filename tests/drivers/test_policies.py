@@ -90,9 +90,8 @@ def states(n):
 
 class TestOtherScenarios:
     def test_in_a_merge_of_half_the_size_they_see_the_same_and_act_half(self):
-        x_pov, v_pov, x_vut, v_vut = (states(20_000) / 2).T
-        half = features(x_pov, v_pov, x_vut, v_vut, scenario=HALF)
-        assert np.array_equal(half, features(*states(20_000).T, scenario=US23))
+        half = features(states(20_000).T / 2, scenario=HALF)
+        assert np.array_equal(half, features(states(20_000).T, scenario=US23))
         assert np.array_equal(actions_mps2(HALF), actions_mps2(US23) / 2)
 
     @pytest.mark.parametrize("name", ["pov1", "vut1"])
@@ -101,8 +100,9 @@ class TestOtherScenarios:
         game, network = Game(role, None, Reward.of(SMALLER)), load_network(name)
         start = pool_starts(60, np.random.default_rng(2), SMALLER)
         psi = np.zeros(len(start))
-        best = best_response(game, start)
-        scaled = best - game.play(start, psi, greedy(network, SMALLER))
+        reached = game.play(start, psi, greedy(network, SMALLER))
+        best = best_response(game, start, reached)
+        scaled = best - reached
         unscaled = best - game.play(start, psi, greedy(network, US23))
         assert scaled.mean() < 0.02
         assert unscaled.mean() > 5.0 * scaled.mean()
@@ -123,7 +123,7 @@ class TestALimitOfBraking:
         assert QNetwork(self.LAYERS).limited(US23) is US23
         # The gap at M of a POV that brakes for the 8.125 s of a VUT at 22.4 m/s: columns 13 to 15.
         at = [np.array([v]) for v in (-273.0, 33.0, -182.0, 22.4)]
-        whole, half = (features(*at, scenario=s)[0] for s in (US23, limited.limited(US23)))
+        whole, half = (features(at, scenario=s)[0] for s in (US23, limited.limited(US23)))
         assert np.flatnonzero(whole != half).tolist() == [13, 14, 15]
 
     def test_holds_in_a_simulation_in_which_the_vut_brakes_harder(self):

@@ -158,9 +158,9 @@ class TestATruth:
 def test_greedy_actions_of_many_rows_are_those_of_one_row(name):
     rng, n = np.random.default_rng(1), 4000
     network = load_network(name)
-    x_pov, v_pov, x_vut, v_vut = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
+    state = rng.uniform([-340, 0, -182, 0], [200, 60, 0, 45], (n, 4)).T
     svo_rad = rng.uniform(0.0, 1.5, n) if network.sees_svo else None
-    inputs = features(x_pov, v_pov, x_vut, v_vut, svo_rad, scenario=US23)
+    inputs = features(state, svo_rad, scenario=US23)
     inputs[7] = np.inf
     values = network.values(inputs)
     expected = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)

@@ -104,8 +104,7 @@ class Pov:
             m = END_M if now.x_vut >= 0.0 else 0.0
             state = (now.x_pov - m, now.v_pov, now.x_vut - m, now.v_vut)
             svo = np.array([self.case.svo_rad]) if self.case.level == 2 else None
-            x_pov, v_pov, x_vut, v_vut = (np.array([each]) for each in state)
-            inputs = features(x_pov, v_pov, x_vut, v_vut, svo, scenario=ROAD)
+            inputs = features(np.array([state]).T, svo, scenario=ROAD)
             values = NETWORKS[self.case.level].values(inputs)[0]
             self.held = float(actions_mps2(ROAD)[int(values.argmax())])
         return self.held
