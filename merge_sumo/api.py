@@ -606,8 +606,7 @@ def run_and_report(
             note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
             note_explanation(done, plan, check)
             link_latest(folder)
-            on_part = partial(bars.counted, "surrogates of the report", unit="levels")
-            write_report(done, result.summary, on_part)
+            write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         _note_how_to_resume(stop, settings, folder, where)
         raise

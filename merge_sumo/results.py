@@ -32,8 +32,8 @@ from merge_sumo.metrics.summary import (
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import Fact, facts_of, headline
-from merge_sumo.reports.text import comparison_headline, episode_lines, transitions
+from merge_sumo.reports.facts import Fact, facts_of
+from merge_sumo.reports.text import comparison_headline, episode_lines, headline, transitions
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import coordinates

@@ -1,63 +1,61 @@
-"""The cause of a case in words: what happened in it, and what would have avoided it until when.
+"""The cause of a case in words, and the regions of the pool where cases fail.
 
-Every place that shows a case begins with these words. All of them but those of an error are of
-letters, digits and `,.:;`, so that a label in sumo-gui can hold them.
-
-They follow from the recorded speeds and from the order at M. A vehicle brakes where its speed falls
-`BRAKED_MPS` below the highest it had before; it begins when it last had that speed. It accelerates
-where it does not brake and its speed rises as much. So the jitter of a network is not taken for a
-decision.
+A vehicle brakes where its speed falls `BRAKED_MPS` below the highest speed before; it begins when
+it last had that speed. It accelerates where it does not brake and its speed rises as much.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import partial
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
-from merge_sumo.scenario.case import Case, Coordinate, FloatArray, coordinates
+from merge_sumo.printable import sentence
+from merge_sumo.scenario.case import Case, FloatArray, coordinates
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 BRAKED_MPS = 1.0
-"""Loss of speed from which a vehicle is said to brake, and gain from which to accelerate."""
+"""Change of speed that counts as braking or accelerating; the jitter of a network is smaller."""
 ROUNDING_MPS = 1e-6
 
 
 class Kind(StrEnum):
-    """Kinds of failures under the paper's rule; each such failure is of exactly one.
+    """Kinds of failures under the paper's rule; each such failure is of exactly one."""
 
-    "Together" is within the scenario's limit at M, a way out full braking or acceleration.
-    """
+    STALEMATE = "stalemate"
+    SQUEEZE = "squeeze"
+    POV_BRAKES = "only the POV brakes"
+    LATE_BRAKE = "late brake"
+    WEAK_BRAKE = "weak brake"
 
-    meaning: str
 
-    STALEMATE = "stalemate", "both brake, and the VUT begins while a way out is left"
-    SQUEEZE = "squeeze", "neither loses 1 m/s, and both arrive together"
-    POV_BRAKES = "only the POV brakes", "the VUT loses less than 1 m/s, and both arrive together"
-    LATE_BRAKE = "late brake", "the VUT begins to brake when no way out is left"
-    WEAK_BRAKE = "weak brake", "only the VUT brakes, and begins while a way out is left"
-
-    def __new__(cls, name: str, meaning: str) -> Self:
-        """Make a kind of its name, and keep what it means."""
-        kind = str.__new__(cls, name)
-        kind._value_, kind.meaning = name, meaning
-        return kind
+MEANINGS = {
+    Kind.STALEMATE: "both brake, and the VUT begins while a way out is left",
+    Kind.SQUEEZE: "neither loses 1 m/s, and both arrive together",
+    Kind.POV_BRAKES: "the VUT loses less than 1 m/s, and both arrive together",
+    Kind.LATE_BRAKE: "the VUT begins to brake when no way out is left",
+    Kind.WEAK_BRAKE: "only the VUT brakes, and begins while a way out is left",
+}
+"""A way out is full braking or full acceleration that keeps the scenario's limit at M."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """The course of an episode: when VUT and POV began to brake, or whether they gained speed.
+    """The conduct of both vehicles in an episode.
 
-    A failure under the paper's rule has a kind; no other episode has one.
+    Attributes:
+        vut_brakes_s: time at which the VUT began to brake; None where it did not.
+        pov_brakes_s: the same of the POV.
+        vut_accelerates: whether the VUT accelerated.
+        pov_accelerates: the same of the POV.
+        kind: kind of a failure under the paper's rule, else None.
     """
 
     vut_brakes_s: float | None
@@ -70,14 +68,17 @@ class Diagnosis:
 def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
     """Return which vehicle braked in an episode and which kind of failure it was.
 
-    In traffic the POV is the car that the measures are of: the nearest to the VUT at the end.
+    In traffic the POV is the car that is nearest to the VUT at the end.
     """
-    trajectory = trajectory.facing(VEHICLES.index(measures.nearest))
-    vut_mps, pov_mps = trajectory.v_vut_mps, trajectory.v_pov_mps
-    vut_s, pov_s = _brakes_s(vut_mps), _brakes_s(pov_mps)
-    kind = _kind(vut_s, pov_s, measures.last_avoidable_s) if measures.is_close else None
-    accelerates = vut_s is None and _gains(vut_mps), pov_s is None and _gains(pov_mps)
-    return Diagnosis(vut_s, pov_s, *accelerates, kind)
+    seen = trajectory.facing(VEHICLES.index(measures.nearest))
+    vut_s, pov_s = _brakes_s(seen.v_vut_mps), _brakes_s(seen.v_pov_mps)
+    return Diagnosis(
+        vut_s,
+        pov_s,
+        vut_s is None and _gains(seen.v_vut_mps),
+        pov_s is None and _gains(seen.v_pov_mps),
+        _kind(vut_s, pov_s, measures.last_avoidable_s) if measures.is_close else None,
+    )
 
 
 def _brakes_s(v_mps: FloatArray) -> float | None:
@@ -91,7 +92,7 @@ def _brakes_s(v_mps: FloatArray) -> float | None:
 
 
 def _gains(v_mps: FloatArray) -> bool:
-    """Return whether a vehicle of speeds (T + 1,) became faster than it had been."""
+    """Return whether a vehicle of speeds (T + 1,) became faster by `BRAKED_MPS`."""
     gained_mps = v_mps - np.minimum.accumulate(v_mps)
     return bool(gained_mps.max() >= BRAKED_MPS - ROUNDING_MPS)
 
@@ -104,70 +105,28 @@ def _kind(vut_s: float | None, pov_s: float | None, way_out_until_s: float | Non
     return Kind.WEAK_BRAKE if pov_s is None else Kind.STALEMATE
 
 
-@dataclass(frozen=True, slots=True)
-class Feature:
-    """An axis of regions in words: a coordinate of the pool, or the time it makes for.
-
-    Attributes:
-        decimals: with which bounds are written.
-    """
-
-    name: str
-    unit: str
-    decimals: int
-    value: Callable[[Case], float]
-
-
 DECIMALS = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
-"""With which bounds of regions are written, by unit."""
+"""Decimals of the bounds of regions, by unit."""
 NAMED = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
 MOST_BOXES = 10
 """Leaves of the decision tree of a level."""
 FEWEST_FAILURES = 3
-"""Failures that make a region worth a sentence; of fewer, the cases speak for themselves."""
-
-Bounds = tuple[tuple[Feature, float, float], ...]
-"""(feature, low, high), rounded as it is written; infinite where nothing bounds it."""
-
-
-def _value(coordinate: Coordinate, case: Case) -> float:
-    return coordinate.of(case) or 0.0
-
-
-def _due_s(row: int, case: Case) -> float:
-    x_m, v_mps = case.starts()[row]
-    return -x_m / v_mps if v_mps > 0.0 else case.scenario.timeout_s
-
-
-def features(scenario: Scenario, level: int) -> tuple[Feature, ...]:
-    """Return the axes in which regions of a level are bounded.
-
-    Besides the coordinates it is the time at which a car would reach M at constant speed:
-    failures lie in bands along which it is the same.
-    """
-    own = [
-        Feature(c.name, c.unit, DECIMALS.get(c.unit, c.digits), partial(_value, c))
-        for c in coordinates(scenario, (level,))
-    ]
-    due = [
-        Feature(f"{NAMED[row]} due at M (at constant speed)", "s", 2, partial(_due_s, row))
-        for row in range(scenario.vehicles)
-        if row != VUT
-    ]
-    x, v, *others = own
-    return (*due, v, x, *others)
+"""Failures of the smallest region."""
 
 
 @dataclass(frozen=True, slots=True)
 class FailureBox:
-    """A region of the pool where at least half of the cases that ran failed.
+    """A region of the pool where at least half of the cases fail.
 
     Attributes:
-        indices: cases of the run inside, by the bounds as written.
+        level: POV level.
+        where: the bounds of the region in words.
+        indices: the cases inside, by these bounds.
+        failures: number of failing cases inside.
     """
 
     level: int
-    bounds: Bounds
+    where: str
     indices: tuple[int, ...]
     failures: int
 
@@ -176,27 +135,34 @@ class FailureBox:
         """Number of cases inside."""
         return len(self.indices)
 
-    @property
-    def where(self) -> str:
-        """The bounds in words."""
-        parts = []
-        for axis, *bounds in self.bounds:
-            low, high = (f"{bound:.{axis.decimals}f}" for bound in bounds)
-            is_bounded = [math.isfinite(bound) for bound in bounds]
-            if all(is_bounded):
-                parts.append(f"{axis.name} between {low} and {high} {axis.unit}")
-            elif any(is_bounded):
-                side = f"above {low}" if is_bounded[0] else f"below {high}"
-                parts.append(f"{axis.name} {side} {axis.unit}")
-        return " and ".join(parts) or "anywhere"
+
+def _quantities(cases: Sequence[Case], scenario: Scenario) -> dict[tuple[str, str], list[float]]:
+    """Return the values of cases of a level by name and unit of each quantity.
+
+    With the coordinates there is the time at which a car would reach M at constant speed: failures
+    lie in bands of equal time.
+    """
+    values = {}
+    for row in range(scenario.vehicles):
+        if row != VUT:
+            due_s = []
+            for case in cases:
+                x_m, v_mps = case.starts()[row]
+                due_s.append(-x_m / v_mps if v_mps > 0.0 else scenario.timeout_s)
+            values[f"{NAMED[row]} due at M (at constant speed)", "s"] = due_s
+    x, v, *others = coordinates(scenario, (cases[0].level,))
+    for coordinate in (v, x, *others):
+        own = [coordinate.of(case) or 0.0 for case in cases]
+        values[coordinate.name, coordinate.unit] = own
+    return values
 
 
 def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
-    """Return where a level's failures lie, as boxes of the pool, those with most failures first.
+    """Return where the failures of a level lie, the region with most failures first.
 
-    A small decision tree (scikit-learn, Gini, balanced classes) tells failing cases from the
-    others; its leaves with at least as many failures as other cases are the boxes, joined where
-    siblings are. The shares are of cases that a sampler chose: they are no probabilities.
+    A small decision tree (scikit-learn, Gini, balanced classes) separates failing from other
+    cases. Its leaves in which at least half of the cases fail are the regions; failing siblings
+    are joined. The shares are of cases that a sampler chose: they are no probabilities.
     """
     judged = [o for o in outcomes if o.case.level == level and o.margin is not None]
     failed = np.array([o.failed for o in judged], dtype=bool)
@@ -204,110 +170,141 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
         return []
     from sklearn.tree import DecisionTreeClassifier
 
-    axes = features(judged[0].case.scenario, level)
-    places = np.array([[feature.value(o.case) for feature in axes] for o in judged])
+    cases = [outcome.case for outcome in judged]
+    quantities = _quantities(cases, cases[0].scenario)
+    places = np.array(list(quantities.values())).T
     tree = DecisionTreeClassifier(
         max_leaf_nodes=MOST_BOXES,
         min_samples_leaf=FEWEST_FAILURES,
         class_weight="balanced",
         random_state=0,
     ).fit(places, failed)
-    leaf = tree.apply(places)
-    failing = {node for node in set(leaf.tolist()) if failed[leaf == node].mean() >= 0.5}
     boxes = []
-    for bounds in _leaf_boxes(tree.tree_, failing, len(axes)):
-        # Rounding may move a case over a bound: what is counted is what is written.
-        low, high = (
-            [round(x, axis.decimals) for axis, x in zip(axes, side.tolist(), strict=True)]
-            for side in bounds
-        )
-        inside = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1)).tolist()
+    for lows, highs in _failing_leaves(tree.tree_, tree.apply(places), failed):
+        words = []
+        inside = np.ones(len(judged), dtype=bool)
+        for (name, unit), values, low, high in zip(quantities, places.T, lows, highs, strict=True):
+            # Rounding may move a case over a bound: the written bound decides.
+            least, most = (f"{bound:.{DECIMALS.get(unit, 2)}f}" for bound in (low, high))
+            inside &= (values >= float(least)) & (values <= float(most))
+            if np.isfinite(low) and np.isfinite(high):
+                words.append(f"{name} between {least} and {most} {unit}")
+            elif np.isfinite(low):
+                words.append(f"{name} above {least} {unit}")
+            elif np.isfinite(high):
+                words.append(f"{name} below {most} {unit}")
         failures = int(failed[inside].sum())
         if failures >= FEWEST_FAILURES:
-            indices = tuple(judged[place].index for place in inside)
-            written = tuple(zip(axes, low, high, strict=True))
-            boxes.append(FailureBox(level, written, indices, failures))
+            indices = tuple(judged[place].index for place in np.flatnonzero(inside))
+            where = " and ".join(words) or "anywhere"
+            boxes.append(FailureBox(level, where, indices, failures))
     return sorted(boxes, key=lambda box: -box.failures)
 
 
-def _leaf_boxes(tree: Any, failing: set[int], dims: int) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield the lower and upper bounds, (d,), of the failing leaves; siblings that fail are one."""
+def _failing_leaves(
+    tree: Any, leaf: FloatArray, failed: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the lower and upper bounds, (d,), of the failing leaves; failing siblings are one.
 
-    def all_fail(node: int) -> bool:
-        if tree.children_left[node] < 0:
-            return node in failing
-        return all_fail(tree.children_left[node]) and all_fail(tree.children_right[node])
-
-    rest = [(0, np.full(dims, -np.inf), np.full(dims, np.inf))]
+    Args:
+        tree: nodes as scikit-learn has them; children come after their parent.
+        leaf: leaf of each case, (n,).
+        failed: whether each case failed, (n,).
+    """
+    fails = np.zeros(tree.node_count, dtype=bool)
+    for node in reversed(range(tree.node_count)):
+        left, right = tree.children_left[node], tree.children_right[node]
+        if left < 0:
+            fails[node] = failed[leaf == node].mean() >= 0.5
+        else:
+            fails[node] = fails[left] and fails[right]
+    found = []
+    rest = [(0, np.full(tree.n_features, -np.inf), np.full(tree.n_features, np.inf))]
     while rest:
         node, low, high = rest.pop()
-        if all_fail(node):
-            yield low, high
-        elif tree.children_left[node] >= 0:
+        left, right = tree.children_left[node], tree.children_right[node]
+        if fails[node]:
+            found.append((low, high))
+        elif left >= 0:
             dim, at = tree.feature[node], tree.threshold[node]
             below, above = high.copy(), low.copy()
             below[dim] = above[dim] = at
-            rest.append((tree.children_right[node], above, high))
-            rest.append((tree.children_left[node], low, below))
+            rest += [(right, above, high), (left, low, below)]
+    return found
 
 
 def cause(outcome: Outcome, trajectory: Trajectory | None, others: str = "") -> str:
-    """Return in a sentence what happened in a case, and for a failure what would have avoided it.
+    """Return what happened in a case, and until when a failure could be avoided, in sentences.
 
-    `trajectory` is None where the motion is lost. `others` is a clause on other drivers.
+    Without the message of an error they have letters, digits and `,.:;` only, as labels of sumo-gui
+    need.
 
     Args:
         outcome: the outcome.
         trajectory: its motion; None where that is lost.
-        others: a clause on other drivers.
+        others: a clause on other drivers that would have avoided the failure.
     """
-    avoided = "; ".join(clause for clause in (_way_out(outcome), others) if clause)
-    fails_behind = outcome.is_tested and outcome.measures.error is not None
-    behind = "after M an error ends the follow-up" if fails_behind else ""
-    sentences = [_happened(outcome, trajectory), avoided, behind]
-    return " ".join(f"{text[0].upper()}{text[1:].removesuffix('.')}." for text in sentences if text)
+    sentences = [_course(outcome, trajectory)]
+    avoided = [clause for clause in (_way_out(outcome), others) if clause]
+    if avoided:
+        sentences.append("; ".join(avoided))
+    if outcome.is_tested and outcome.measures.error is not None:
+        sentences.append("after M an error ends the follow-up")
+    return " ".join(map(sentence, sentences))
 
 
-def met(found: Measures) -> str:
-    """Return the car of the mainline that measures are of: the nearest to the VUT at the end."""
+def heading(outcome: Outcome, trajectory: Trajectory | None) -> str:
+    """Return kind, severity and impact of a case without an error, in a few words.
+
+    Args:
+        outcome: the outcome.
+        trajectory: its motion; None where that is lost.
+    """
+    found = outcome.measures
+    text = found.became.lower()
+    if outcome.failed:
+        kind = None if trajectory is None else diagnose(trajectory, found).kind
+        text = f"{kind or 'failure'}, {text}"
+    if found.impact_speed_mps is not None:
+        text += f" at a relative speed of {found.impact_speed_mps:.1f} m/s"
+    return text
+
+
+def conflicting_car(found: Measures) -> str:
+    """Return the car of the mainline that is nearest to the VUT at the end, in words."""
     return "POV" if found.nearest == VEHICLES[POV] else f"car {found.nearest}"
 
 
-def _happened(outcome: Outcome, trajectory: Trajectory | None) -> str:
+def _course(outcome: Outcome, trajectory: Trajectory | None) -> str:
     found, at = outcome.measures, f"{outcome.measures.t_end_s:g} s"
     if found.end.is_error:
         return f"{found.end} at {at}: {message_of(outcome)}"
-    course = None if trajectory is None else diagnose(trajectory, found)
-    kind = None if course is None else course.kind
-    became = f"{kind or 'failure'}, " if outcome.failed else ""
-    became += found.became.lower()
-    if found.impact_speed_mps is not None:
-        became += f" at a relative speed of {found.impact_speed_mps:.1f} m/s"
-    conduct = "" if course is None else f"{_conduct(course, met(found))}, and "
+    car, text = conflicting_car(found), f"{heading(outcome, trajectory)}: "
+    if trajectory is not None:
+        course = diagnose(trajectory, found)
+        vut = _conduct(course.vut_brakes_s, course.vut_accelerates)
+        pov = _conduct(course.pov_brakes_s, course.pov_accelerates)
+        text += f"the VUT {vut}, the {car} {pov}, and "
     if found.end is End.TIMEOUT:
-        return f"{became}: {conduct}{message_of(outcome)}"
+        return text + message_of(outcome)
     reaches = "reaches M"
-    if found.lane_share is not None:
-        share = found.lane_share
-        place = "where the lane ends" if share >= 1.0 else f"at {share:.2f} of the lane"
-        reaches = f"merges {place}"
+    if found.lane_share is not None and found.lane_share >= 1.0:
+        reaches = "merges where the lane ends"
+    elif found.lane_share is not None:
+        reaches = f"merges at {found.lane_share:.2f} of the lane"
     side = "ahead of" if found.merged_first == "VUT" else "behind"
-    apart = f"its front bumper {abs(found.dx_m or 0.0):.1f} m {side} that of the {met(found)}"
-    return f"{became}: {conduct}the VUT {reaches} at {at}, {apart}"
+    apart = f"{abs(found.dx_m or 0.0):.1f} m {side} that of the {car}"
+    return f"{text}the VUT {reaches} at {at}, its front bumper {apart}"
 
 
-def _conduct(course: Diagnosis, other: str) -> str:
-    def of(brakes_s: float | None, accelerates: bool) -> str:
-        if brakes_s is not None:
-            return f"begins to brake at {brakes_s:.1f} s"
-        return "accelerates" if accelerates else f"keeps its speed within {BRAKED_MPS:g} m/s"
-
-    vut = of(course.vut_brakes_s, course.vut_accelerates)
-    return f"the VUT {vut}, the {other} {of(course.pov_brakes_s, course.pov_accelerates)}"
+def _conduct(brakes_s: float | None, accelerates: bool) -> str:
+    if brakes_s is not None:
+        return f"begins to brake at {brakes_s:.1f} s"
+    return "accelerates" if accelerates else f"keeps its speed within {BRAKED_MPS:g} m/s"
 
 
 def _way_out(outcome: Outcome) -> str:
-    """Return until when the VUT could avoid that front bumpers are close, in a clause."""
+    """Return until when the VUT could keep its distance at M, in a clause."""
     found, scenario = outcome.measures, outcome.case.scenario
     if not outcome.failed or found.avoidable is None:
         return ""

@@ -33,10 +33,10 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
-    return [*often, *behind(outcomes), *_one_verdict(outcomes, criterion), *in_vain(vain)]
+    return [*often, *late_errors(outcomes), *_one_verdict(outcomes, criterion), *in_vain(vain)]
 
 
-def behind(outcomes: Sequence[Outcome]) -> Iterator[str]:
+def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
     """Yield in how many cases a driver fails after M, where a verdict stands already."""
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:

@@ -1,29 +1,26 @@
-"""The facts of a campaign: each once, with its unit, and the file and the key that it is from.
+"""The facts of a campaign, each with its unit and with the file and key that it comes from.
 
-The report prints them as one table, `merge-sumo report --json` as one list; the terminal and JUnit
-take their lines from them. What no study has left in the folder is no fact.
+Report, terminal, JSON and JUnit take their numbers from this list.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import zip_longest
+from functools import partial
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.probability import PROBABILITY
 from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import STRESS
-from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.cause import heading
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, undecided
 from merge_sumo.printable import printable
-from merge_sumo.scenario.scenario import level_name
 
 PERCENT = "%"
 STARTS_THAT_FAIL = "starts that fail"
@@ -31,7 +28,7 @@ STARTS = "uniform starts of that"
 UNDECIDED = "undecided"
 RULE = "a case fails when"
 AT_MOST = "cases at most; the search converged before"
-TOUCH = "cases with contact that are no failures"
+CONTACT = "cases with contact that are no failures"
 DRIVEN = "failures that reference drivers drove"
 AVOIDED = "failures that driver {} avoids"
 AVOIDED_BY_POV = "failures that a careful POV avoids"
@@ -46,307 +43,213 @@ class Fact:
     """A fact of a campaign.
 
     Attributes:
-        name: what it is, in words.
+        name: name of the quantity.
         value: a number in `unit`, or a text.
+        key: key in the file, or a condition on the lines that are counted.
         unit: "" for counts, for texts and for FMC.
-        file: file of the run folder that it is from.
-        key: key of that file, or the lines of it that are counted.
-        level: POV level that it is of; None where it is of all.
+        file: source file in the run folder.
+        level: POV level; None for the whole campaign.
+
+    Example:
+        >>> Fact("simulated time", 2.5, "t_end_s", "h").shown
+        '2.5 h'
     """
 
     name: str
     value: float | str
-    unit: str
-    file: str
     key: str
+    unit: str = ""
+    file: str = OUTCOMES
     level: int | None = None
 
     @property
     def shown(self) -> str:
-        """The value as it is printed, with its unit."""
+        """The value as text, with its unit."""
         if isinstance(self.value, str):
             text = printable(self.value)
         elif isinstance(self.value, int):
             text = f"{self.value:,}"
+        elif self.unit:
+            text = f"{self.value:.3g}"
         else:
-            text = f"{self.value:.3g}" if self.unit else f"{self.value:.4f}"
+            text = f"{self.value:.4f}"
         return f"{text} {self.unit}".strip()
 
 
-def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
-    """Return the facts of a campaign, by what its folder holds.
+Facts = Iterator[Fact]
 
-    Raises `UserError` where a file of a study is not as it was written.
+
+def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
+    """Return the facts of a campaign and of the studies in its folder.
 
     Args:
         run: the campaign.
         summary: its summary.
         verdict: its verdict.
+
+    Raises:
+        UserError: a file of a study is damaged.
     """
+    failing = run.criterion.words if run.criterion.is_papers else "margin < 0"
     unsure = undecided(run.outcomes, run.tolerated)
-    return [
-        *_tested(run),
-        *_shares(run),
-        *_found(run, summary, verdict),
-        *(
-            fact
-            for level, found in summary.levels.items()
-            for fact in _of_level(run, level, found, untested=verdict.tested < verdict.cases)
-        ),
-        *_repeats(run),
-        *_motion(run, unsure),
-        *_avoided(run, unsure),
-        *_studies(run),
-    ]
+    facts = [*_settings(run), *_shares(run), *_counts(run, summary, verdict, failing)]
+    for level, found in summary.levels.items():
+        facts += _of_level(run, level, found, failing)
+    facts += _repeats(run)
+    facts += _motion(run, unsure, failing)
+    facts += _avoided(run, unsure)
+    facts += _studies(run)
+    return facts
 
 
-def by_level(facts: Iterable[Fact]) -> tuple[list[Fact], list[tuple[int, list[Fact | None]]]]:
-    """Return the facts of levels as a table: one of each name, and a row for each level."""
-    of_levels = [fact for fact in facts if fact.level is not None]
-    columns = list({fact.name: fact for fact in of_levels}.values())
+def by_level(facts: Iterable[Fact]) -> dict[int, dict[str, Fact]]:
+    """Return the facts of each level by name."""
     rows: dict[int, dict[str, Fact]] = {}
-    for fact in of_levels:
+    for fact in facts:
         if fact.level is not None:
             rows.setdefault(fact.level, {})[fact.name] = fact
-    return columns, [(level, [row.get(c.name) for c in columns]) for level, row in rows.items()]
+    return rows
 
 
-def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
-    """Return the first lines about a campaign; each number is that of a fact."""
-    of = {fact.name: fact for fact in facts if fact.level is None}
-    cases = _counted(of["cases"], "case")
-    if AT_MOST in of:
-        cases = f"{of['cases'].shown} of {of[AT_MOST].shown} cases, converged"
-    return [
-        f"{of['VUT'].shown}: {RULE} {of[RULE].shown}; {cases}",
-        *_level_lines(facts),
-        *_not_said(run, of, {fact.name for fact in facts}),
-        *_how_bad(run, of),
-    ]
-
-
-def _counted(fact: Fact, one: str, several: str = "") -> str:
-    return f"{fact.shown} {one if fact.value == 1 else several or f'{one}s'}"
-
-
-def _level_lines(facts: Iterable[Fact]) -> list[str]:
-    """Return a line for each level, aligned."""
-    lines = []
-    for level, row in by_level(facts)[1]:
-        of = {fact.name: fact for fact in row if fact is not None}
-        share, failures = of.get(STARTS_THAT_FAIL), of.get("failures")
-        unsure = of.get(UNDECIDED)
-        found = "nothing tested" if failures is None else f"{_counted(failures, 'failure')} found"
-        if unsure is not None and unsure.value:
-            found += f", {unsure.shown} undecided"
-        cells = [
-            f"level {level_name(level)}",
-            "" if share is None else f"{share.shown} of all starts fail, by {of[STARTS].shown}",
-            found,
-        ]
-        if failures is not None and of["FMC"].value:
-            regions = of["regions"]
-            cells.append(SCATTERED if regions.value == SCATTERED else _counted(regions, "region"))
-            cells.append(f"FMC {of['FMC'].shown}")
-        lines.append(cells)
-    widths = [max(map(len, column)) for column in zip_longest(*lines, fillvalue="")]
-    return [
-        "  ".join(["", *(cell.rjust(w) for cell, w in zip(cells, widths, strict=False) if w)])
-        for cells in lines
-    ]
-
-
-def _not_said(run: Run, of: Mapping[str, Fact], known: set[str]) -> Iterator[str]:
-    """Yield what the failures do not say: contacts under another rule, the share of starts."""
-    parts = []
-    if TOUCH in of:
-        more = _counted(of[TOUCH], "more case touches", "more cases touch")
-        where = run.scenario.said(" after M") if run.criterion.is_papers else ""
-        parts.append(f"{more}{where}, which this rule does not count: `fail_when` unsafe")
-    if PROBABLY not in known and SHARES.read(run.folder) is None:
-        measure = again("probability", run.folder, run.record)
-        parts.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
-    if parts:
-        yield "; ".join(parts)
-
-
-def _how_bad(run: Run, of: Mapping[str, Fact]) -> Iterator[str]:
-    """Yield how many failures other drivers avoid, and the command that shows the worst."""
-    if AVOIDED_BY_POV in of:
-        by = ", ".join(f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCES)
-        some = f"{of[DRIVEN].shown} of " if DRIVEN in of else ""
-        failures, pov = _counted(of["failures"], "failure"), of[AVOIDED_BY_POV].shown
-        yield f"avoided of {some}{failures}: by driver {by}, by a careful POV {pov}"
-    if WORST in of:
-        replay = command("replay", run.folder, of[WORST].value, gui=True)
-        yield f"{WORST} ({of[KIND].shown}): {replay}"
-
-
-def _tested(run: Run) -> Iterator[Fact]:
+def _settings(run: Run) -> Facts:
     settings, criterion = run.settings, run.criterion
-    yield Fact("VUT", run.vut, "", SETTINGS, "vut")
-    yield Fact("scenario", run.scenario.name, "", SETTINGS, "scenario.name")
+    yield Fact("VUT", run.vut, "vut", file=SETTINGS)
+    yield Fact("scenario", run.scenario.name, "scenario.name", file=SETTINGS)
     key = "fail_when" if criterion.require is None else "require"
-    yield Fact(RULE, criterion.said(run.scenario), "", SETTINGS, key)
+    yield Fact(RULE, criterion.said(run.scenario), key, file=SETTINGS)
     sampler = f"{settings.sampler}, seed {settings.seed}"
-    yield Fact("sampler", sampler, "", SETTINGS, "sampler, seed")
+    yield Fact("sampler", sampler, "sampler, seed", file=SETTINGS)
 
 
-def _failing(run: Run) -> str:
-    """Return the key of the failing lines of `outcomes.jsonl`: the paper's rule has no margin."""
-    return run.criterion.words if run.criterion.is_papers else "margin < 0"
-
-
-def _shares(run: Run) -> Iterator[Fact]:
+def _shares(run: Run) -> Facts:
     known = SHARES.read(run.folder)
-    for one in () if known is None else known.levels:
-        if one.without_verdict == one.cases:
-            continue  # no start was judged: nothing is known of a share
-        key = "levels: failures of cases"
-        yield Fact(STARTS_THAT_FAIL, one.shown, "", SHARES.name, key, one.level)
-        yield Fact(STARTS, one.cases, "", SHARES.name, "levels: cases", one.level)
-        if one.without_verdict:
-            name, key = "uniform starts without a verdict", "levels: without_verdict"
-            yield Fact(name, one.without_verdict, "", SHARES.name, key, one.level)
+    if known is None:
+        return
+    for one in known.levels:
+        if one.without_verdict < one.cases:
+            fact = partial(Fact, file=SHARES.name, level=one.level)
+            yield fact(STARTS_THAT_FAIL, one.shown, "levels: failures of cases")
+            yield fact(STARTS, one.cases, "levels: cases")
+            if one.without_verdict:
+                name = "uniform starts without a verdict"
+                yield fact(name, one.without_verdict, "levels: without_verdict")
 
 
-def _found(run: Run, summary: Summary, verdict: Verdict) -> Iterator[Fact]:
-    def counted(name: str, number: int, key: str) -> Fact:
-        return Fact(name, number, "", OUTCOMES, key)
-
-    yield counted("cases", summary.cases, "lines")
+def _counts(run: Run, summary: Summary, verdict: Verdict, failing: str) -> Facts:
+    yield Fact("cases", summary.cases, "lines")
     if run.converged:
-        yield Fact(AT_MOST, run.settings.cases, "", SETTINGS, "cases")
+        yield Fact(AT_MOST, run.settings.cases, "cases", file=SETTINGS)
     if verdict.errors:
-        yield counted("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
+        yield Fact("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
     if verdict.timeouts:
-        yield counted("timeouts", verdict.timeouts, "end: TIMEOUT")
-    failing = _failing(run)
-    yield counted("failures", summary.failures, failing)
+        yield Fact("timeouts", verdict.timeouts, "end: TIMEOUT")
+    yield Fact("failures", summary.failures, failing)
     if run.tolerated:
-        yield counted(UNDECIDED, summary.undecided, "draw")
+        yield Fact(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
-        yield counted("failures with contact", verdict.contacts, f"{failing}, severity: contact")
-    for severity, about in (
-        (Severity.CONTACT, TOUCH),
+        yield Fact("failures with contact", verdict.contacts, f"{failing}, severity: contact")
+    for severity, name in (
+        (Severity.CONTACT, CONTACT),
         (Severity.CONFLICT, "cases with a conflict that are no failures"),
         (Severity.HARSH, "cases with harsh braking after the merge that are no failures"),
     ):
         number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
         if number:
-            yield counted(about, number, f"severity: {severity}, not {failing}")
+            yield Fact(name, number, f"severity: {severity}, not {failing}")
 
 
-def _of_level(run: Run, level: int, found: LevelSummary, *, untested: bool) -> Iterator[Fact]:
-    def fact(name: str, value: float, key: str, unit: str = "") -> Fact:
-        return Fact(name, value, unit, OUTCOMES, key, level)
-
+def _of_level(run: Run, level: int, found: LevelSummary, failing: str) -> Facts:
+    fact = partial(Fact, level=level)
     yield fact("cases", found.cases, "level")
-    if untested:
+    if found.tested < found.cases:
         yield fact("without a verdict", found.cases - found.tested, "end")
     if found.tested or not found.cases:
-        key = _failing(run)
-        yield fact("failures", found.failures, key)
+        yield fact("failures", found.failures, failing)
         if run.tolerated:
             yield fact(UNDECIDED, found.undecided, "draw")
-        failing = found.failures + found.undecided
-        # Failures from which on more than half as many regions are said to be scattered.
-        scattered = failing >= 10 and 2 * found.regions > failing
-        regions = SCATTERED if scattered else found.regions
-        yield Fact("regions", regions, "", OUTCOMES, f"{key}: starts", level)
+        number = found.failures + found.undecided
+        scattered = number >= 10 and 2 * found.regions > number
+        yield fact("regions", SCATTERED if scattered else found.regions, f"{failing}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact("FMC", found.fmc, f"{key}: starts within {radius:.2g}")
-    if run.scenario.lane_m is not None:
-        yield from _of_lane(run, level)
-
-
-def _of_lane(run: Run, level: int) -> Iterator[Fact]:
-    """Yield where on the acceleration lane the VUT merges, and into which gaps."""
-    at_level = [o.measures for o in run.cases if o.case.level == level]
-    forced = sum((found.lane_share or 0.0) >= 1.0 for found in at_level)
-    stood = sum(found.stood_s > 0.0 for found in at_level)
-    yield Fact("merges where the lane ends", forced, "", OUTCOMES, "lane_share >= 1", level)
-    yield Fact("cases that stood on the lane", stood, "", OUTCOMES, "stood_s > 0", level)
+        yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
+    if run.scenario.lane_m is None:
+        return
+    measures = [outcome.measures for outcome in run.cases if outcome.case.level == level]
+    forced = sum((one.lane_share or 0.0) >= 1.0 for one in measures)
+    yield fact("merges where the lane ends", forced, "lane_share >= 1")
+    yield fact(
+        "cases that stood on the lane", sum(o.stood_s > 0.0 for o in measures), "stood_s > 0"
+    )
     for name, key, unit, scale in (
         ("place of the merge, median", "lane_share", "% of the lane", 100.0),
         ("time gap ahead, median", "time_gap_ahead_s", "s", 1.0),
         ("time gap behind, median", "time_gap_behind_s", "s", 1.0),
     ):
-        known = [value for found in at_level if (value := found.value(key)) is not None]
-        if known:
-            yield Fact(name, scale * statistics.median(known), unit, OUTCOMES, key, level)
+        values = [one.value(key) for one in measures if one.value(key) is not None]
+        if values:
+            yield fact(name, scale * statistics.median(values), key, unit)
 
 
-def _repeats(run: Run) -> Iterator[Fact]:
-    cases, tolerated = by_case(run.outcomes), run.tolerated
-    repeated = [one for one in cases if one.runs > 1]
-    if not (tolerated or repeated):
-        return
-    varied = [one for one in repeated if one.varies]
-    for name, number in (
-        ("runs", sum(one.runs for one in cases)),
-        ("cases that ran more than once", len(repeated)),
-        ("of these, cases whose runs differ", len(varied)),
-        ("of these, cases that both fail and pass", sum(0 < v.failures < v.runs for v in varied)),
-    ):
-        yield Fact(name, number, "", OUTCOMES, "draw")
-    if tolerated:
+def _repeats(run: Run) -> Facts:
+    cases = by_case(run.outcomes)
+    repeated = [case for case in cases if case.runs > 1]
+    if run.tolerated or repeated:
+        yield Fact("runs", sum(case.runs for case in cases), "draw")
+        yield Fact("cases that ran more than once", len(repeated), "draw")
+        both = sum(0 < case.failures < case.runs for case in repeated)
+        yield Fact("of these, cases that both fail and pass", both, "draw")
+    if run.tolerated:
         name = "share of its runs in which a case may fail"
-        yield Fact(name, 100.0 * tolerated, PERCENT, SETTINGS, "tolerated")
+        yield Fact(name, 100.0 * run.tolerated, "tolerated", PERCENT, SETTINGS)
 
 
-def _motion(run: Run, unsure: set[int]) -> Iterator[Fact]:
-    worst = failures(run.cases)
+def _motion(run: Run, unsure: set[int], failing: str) -> Facts:
     key = f"t_end_s; the follow-up by {TRAJECTORIES}/"
-    yield Fact("simulated time", run.simulated_s / 3600.0, "h", OUTCOMES, key)
-    if not worst:
+    yield Fact("simulated time", run.simulated_s / 3600.0, key, "h")
+    failed = failures(run.cases)
+    if not failed:
         return
-    yield Fact(WORST, worst[0].index, "", OUTCOMES, "lowest margin")
-    motion = run.trajectories([worst[0].index]).get(worst[0].index)
-    kind, _, _ = cause(worst[0], motion).partition(":")
-    key = "severity, impact_speed_mps; by its motion"
-    yield Fact(KIND, kind[0].lower() + kind[1:], "", OUTCOMES, key)
-    worst = [outcome for outcome in worst if outcome.index not in unsure]
-    known = [o.measures.avoidable for o in worst if o.measures.avoidable is not None]
-    if known:
+    worst = failed[0]
+    yield Fact(WORST, worst.index, "lowest margin")
+    kind = heading(worst, run.trajectories([worst.index]).get(worst.index))
+    yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
+    measures = [outcome.measures for outcome in failed if outcome.index not in unsure]
+    avoidable = [one.avoidable for one in measures if one.avoidable is not None]
+    if avoidable:
         name = "failures that full braking or full acceleration of the VUT avoids"
-        yield Fact(name, sum(known), "", OUTCOMES, f"{_failing(run)}, avoidable")
-    for name, measure, unit in (
+        yield Fact(name, sum(avoidable), f"{failing}, avoidable")
+    for name, key, unit in (
         ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
         ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
     ):
-        values = [v for o in worst if (v := o.measures.value(measure)) is not None]
+        values = [one.value(key) for one in measures if one.value(key) is not None]
         if values:
-            yield Fact(name, max(values), unit, OUTCOMES, f"{_failing(run)}: {measure}")
+            yield Fact(name, max(values), f"{failing}: {key}", unit)
 
 
-def _avoided(run: Run, unsure: set[int]) -> Iterator[Fact]:
+def _avoided(run: Run, unsure: set[int]) -> Facts:
     known = [one for one in AVOIDANCE.read_lines(run) if one.index not in unsure]
     if not known:
         return
+    fact = partial(Fact, file=AVOIDANCE.name)
     if len(known) < sum(outcome.failed for outcome in run.cases) - len(unsure):
-        yield Fact(DRIVEN, len(known), "", AVOIDANCE.name, "lines")
+        yield fact(DRIVEN, len(known), "lines")
     for name in REFERENCES:
         number = sum(name in one.avoided_by for one in known)
-        yield Fact(AVOIDED.format(name), number, "", AVOIDANCE.name, "avoided_by")
-    times = [one.latest_takeover_s for one in known if one.latest_takeover_s is not None]
-    if times:
-        middle = statistics.median_low(times)
-        name = "last time at which driver fsm may take over, in the median"
-        yield Fact(name, middle, "s", AVOIDANCE.name, "latest_takeover_s")
-    number = sum(one.pov_careful for one in known)
-    yield Fact(AVOIDED_BY_POV, number, "", AVOIDANCE.name, "pov_careful")
+        yield fact(AVOIDED.format(name), number, "avoided_by")
+    yield fact(AVOIDED_BY_POV, sum(one.pov_careful for one in known), "pov_careful")
 
 
-def _studies(run: Run) -> Iterator[Fact]:
+def _studies(run: Run) -> Facts:
     stress = STRESS.read(run.folder)
     if stress is not None and stress.failures:
         name = f"failures that stay failures in all {stress.runs} runs of the stress test"
-        yield Fact(name, len(stress.robust), "", STRESS.name, "rungs")
+        yield Fact(name, len(stress.robust), "rungs", file=STRESS.name)
     known = PROBABILITY.read(run.folder)
     if known is not None and known.overall is not None and known.is_judged:
-        for name in ("probability", "low", "high"):
-            end = "" if name == "probability" else f", {name} end at {known.confidence:.0%}"
-            value, key = 100.0 * getattr(known.overall, name), f"overall.{name}"
-            yield Fact(f"{PROBABLY}{end}", value, PERCENT, PROBABILITY.name, key)
-        yield Fact("fresh cases of that", known.cases, "", PROBABILITY.name, "cases")
+        fact = partial(Fact, file=PROBABILITY.name)
+        overall, at = known.overall, f"at {known.confidence:.0%}"
+        yield fact(PROBABLY, 100.0 * overall.probability, "overall.probability", PERCENT)
+        yield fact(f"{PROBABLY}, low end {at}", 100.0 * overall.low, "overall.low", PERCENT)
+        yield fact(f"{PROBABLY}, high end {at}", 100.0 * overall.high, "overall.high", PERCENT)
+        yield fact("fresh cases of that", known.cases, "cases")

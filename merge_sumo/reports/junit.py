@@ -1,11 +1,7 @@
 """A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others.
 
-Every case is a test case, in a test suite per POV level: what the criterion calls a failure and a
-timeout are a `failure`, an error of the VUT or of the simulation an `error`, and a case that is
-undecided is `skipped`. The type of a failure is its severity: contact, conflict, harsh or safe.
-A first suite has the gates, whether anything was tested, and the facts as properties. A campaign
-against an earlier version of the VUT has a suite of the cases that one of both fails, in which what
-broke is a `failure`. Times are simulated seconds, up to M.
+A case is a test case in the suite of its POV level; other suites have the gates, and the cases that
+two versions ran.
 """
 
 from __future__ import annotations
@@ -20,15 +16,12 @@ from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.text import change_in_words, step_headline
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
-
-CLASS = "merge-sumo"
 
 JUNIT = (".xml",)
 """Endings of the name of such a file."""
@@ -46,7 +39,11 @@ def check_junit(path: Path, folder: Path) -> None:
 def write_junit(
     path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
 ) -> None:
-    """Write the JUnit file of a campaign; `UserError` when it exists or cannot be written.
+    """Write the JUnit file of a campaign.
+
+    A failure and a timeout are a `failure`, whose type is the severity; an error of the VUT or of
+    the simulation is an `error`; an undecided case is `skipped`. The facts are properties. Times
+    are simulated seconds up to M.
 
     Args:
         path: new file to write.
@@ -54,6 +51,9 @@ def write_junit(
         facts: its facts.
         verdict: its verdict.
         gates: results of its gates.
+
+    Raises:
+        UserError: the file exists or cannot be written.
     """
     root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
     _gates(root, facts, verdict, gates)
@@ -61,16 +61,30 @@ def write_junit(
     if compared is not None:
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
         _step(root, f"against {earlier}", compared.steps[0])
-    repeated = [one for one in by_case(run.outcomes) if one.runs > 1]
+
+    runs = {}
+    for case in by_case(run.outcomes):
+        if case.runs > 1:
+            runs[case.deciding(run.tolerated).index] = f", {case.in_words}"
     unsure = undecided(run.outcomes, run.tolerated)
-    shares = {one.deciding(run.tolerated).index: f", {one.in_words}" for one in repeated}
-    said = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
-    for level, _ in by_level(facts)[1]:
-        suite = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
-        for outcome in run.cases:
-            if outcome.case.level == level:
-                runs, cause = shares.get(outcome.index, ""), said.get(outcome.index)
-                _case(suite, outcome, runs, cause, is_unsure=outcome.index in unsure)
+    cause_of = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
+    suites = {}
+    for level in by_level(facts):
+        suites[level] = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
+    for outcome in run.cases:
+        index, level_of_case = outcome.index, level_name(outcome.case.level)
+        name = f"case {index}: {described(outcome.case)}{runs.get(index, '')}"
+        suite, time_s = suites[outcome.case.level], outcome.measures.t_end_s
+        test = _test(suite, name, f"level{level_of_case}", time_s)
+        if index in unsure:
+            etree.SubElement(test, "skipped", message=f"undecided: {cause_of[index]}")
+        elif index in cause_of:
+            tag = "error" if outcome.measures.end.is_error else "failure"
+            # A criterion may call a case a failure in which the VUT never reached M.
+            kind = outcome.measures.severity or "failed"
+            if not outcome.is_tested:
+                kind = outcome.measures.end
+            _wrong(test, tag, kind, cause_of[index])
     _write(path, root)
 
 
@@ -78,7 +92,7 @@ def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
     """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
     root = etree.Element("testsuites", name="merge-sumo compare")
     for step in compared.steps:
-        before, after = (compared.versions[n - 1] for n in (step.before, step.after))
+        before, after = compared.versions[step.before - 1], compared.versions[step.after - 1]
         _step(root, printable(f"{before.folder} to {after.folder or after.vut}"), step)
     _write(path, root)
 
@@ -105,50 +119,35 @@ def _gates(
     for fact in facts:
         level = "" if fact.level is None else f"level {level_name(fact.level)}: "
         etree.SubElement(properties, "property", name=f"{level}{fact.name}", value=fact.shown)
-    tested = _test(suite, f"the VUT reaches {verdict.goal}", f"{CLASS}.gates", 0.0)
+    tested = _test(suite, f"the VUT reaches {verdict.goal}", "gates")
     if not verdict.tested:
         _wrong(tested, "failure", "NOTHING_TESTED", verdict.nothing_tested)
     for gate in gates:
-        test = _test(suite, gate.name, f"{CLASS}.gates", 0.0)
+        test = _test(suite, gate.name, "gates")
         if gate.met:
             _wrong(test, "failure", "GATE", gate.sentence)
 
 
 def _step(root: etree._Element, name: str, step: Step) -> None:
-    """Add a suite of the cases that two versions ran."""
+    """Add a suite of the cases that two versions ran, and that one of them fails."""
     suite = etree.SubElement(root, "testsuite", name=name)
     if step.passes_less:
-        test = _test(suite, "share of cases that pass", f"{CLASS}.against", 0.0)
+        test = _test(suite, "share of cases that pass", "against")
         _wrong(test, "failure", REGRESSION, step_headline(step))
     for one in step.cases:
-        if one.change is not Change.BOTH or one.judged:
-            case = f"case {one.b.index}: {described(one.b.case)}"
-            test = _test(suite, case, f"{CLASS}.against", one.b.measures.t_end_s)
-            if one.change in GOT_WORSE:
-                _wrong(test, "failure", REGRESSION, change_in_words(one))
-            if one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
-                etree.SubElement(test, "skipped", message=f"{one.change}: {change_in_words(one)}")
+        if one.change is Change.BOTH and not one.judged:
+            continue
+        case = f"case {one.b.index}: {described(one.b.case)}"
+        test = _test(suite, case, "against", one.b.measures.t_end_s)
+        if one.change in GOT_WORSE:
+            _wrong(test, "failure", REGRESSION, change_in_words(one))
+        elif one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
+            etree.SubElement(test, "skipped", message=f"{one.change}: {change_in_words(one)}")
 
 
-def _case(
-    suite: etree._Element, outcome: Outcome, runs: str, cause: str | None, *, is_unsure: bool
-) -> None:
-    """Add a case; it has a cause where it did not pass."""
-    case, measures = outcome.case, outcome.measures
-    name = f"case {outcome.index}: {described(case)}{runs}"
-    test = _test(suite, name, f"{CLASS}.level{level_name(case.level)}", measures.t_end_s)
-    if is_unsure:
-        etree.SubElement(test, "skipped", message=f"undecided: {cause}")
-    elif cause is not None:
-        tag = "error" if measures.end.is_error else "failure"
-        # A criterion may call a case a failure in which the VUT never reached M.
-        kind = (measures.severity or "failed") if outcome.is_tested else measures.end
-        _wrong(test, tag, kind, cause)
-
-
-def _test(suite: etree._Element, name: str, class_name: str, time_s: float) -> etree._Element:
+def _test(suite: etree._Element, name: str, group: str, time_s: float = 0.0) -> etree._Element:
     return etree.SubElement(
-        suite, "testcase", name=name, classname=class_name, time=f"{time_s:.1f}"
+        suite, "testcase", name=name, classname=f"merge-sumo.{group}", time=f"{time_s:.1f}"
     )
 
 

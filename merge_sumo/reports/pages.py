@@ -1,4 +1,4 @@
-"""Pages from templates: values are escaped, and a page names the style and script that it runs."""
+"""Pages from templates: values are escaped, and a policy names the style and script of a page."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from merge_sumo.printable import counted, printable, quoted
+from merge_sumo.printable import counted, printable, quoted, sentence
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
@@ -27,7 +27,7 @@ ERROR_CHARACTERS = 2000
 def page(
     template: str, *, styles: tuple[str, ...] = (), scripts: tuple[str, ...] = (), **words: Any
 ) -> str:
-    """Return a page as HTML, with style sheets and scripts in it, by name, and words as needed.
+    """Return a page as HTML that holds its style sheets and scripts.
 
     Args:
         template: name of the template.
@@ -57,7 +57,11 @@ def environment() -> Environment:
     made = Environment(
         loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True
     )
-    made.globals |= {"level_name": level_name, "counted": counted, "quoted": quoted}
-    made.globals |= {"described": described, "x_axis": X_AXIS}
-    made.filters["shown"] = lambda value: printable(str(value)[:ERROR_CHARACTERS])
+    made.globals |= {"level_name": level_name, "described": described, "x_axis": X_AXIS}
+    made.globals |= {"counted": counted, "quoted": quoted, "sentence": sentence}
+    made.filters["shown"] = _shown
     return made
+
+
+def _shown(value: object) -> str:
+    return printable(str(value)[:ERROR_CHARACTERS])

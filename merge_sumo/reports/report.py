@@ -1,15 +1,14 @@
 """The report of a campaign: one HTML file that needs no network.
 
-What a reader needs is in the page as text and tables; maps, motion and charts are drawn by
-`templates/player.js` and `report.js` from JSON in the page. Names and messages come from outside,
-so the template escapes them, the JSON holds no "<", the script sets text and never markup, and the
-page's own policy lets nothing run but that script and lets nothing load at all.
+Names and messages come from outside: the template escapes them, the JSON holds no "<", the script
+sets text and never markup, and the policy of the page allows that script alone and no loading.
 """
 
 from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import datetime
@@ -19,49 +18,46 @@ from typing import Self
 import msgspec
 from markupsafe import Markup
 
+from merge_sumo.campaigns.again import again
+from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
 from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
 from merge_sumo.files import GENERATOR, check_ours, replace_own
-from merge_sumo.metrics.cause import BRAKED_MPS
+from merge_sumo.metrics.cause import BRAKED_MPS, MEANINGS
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import Summary
+from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
-from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level, headline
+from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
-from merge_sumo.reports.report_model import OnPart, ReportModel
-from merge_sumo.reports.text import comparison_headline, robustness
+from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.text import comparison_headline, headline, robustness
 
 REPORT = "report.html"
-"""By this a report is known as ours, and may be replaced by a newer one."""
 FIRST_S = 2.0
-"""Seconds after which the report of a running campaign first appears."""
+"""Time after which the report of a running campaign first appears."""
 EVERY_S = 5
 """Minimum time between two reports of a running campaign, in s."""
+MOST_SHARE = 0.1
+"""Maximum share of the time of a campaign that its reports take."""
 
 
-def write_report(
-    run: Run, summary: Summary | None = None, on_part: OnPart = lambda _done, _total: None
-) -> Path:
+def write_report(run: Run) -> Path:
     """Write `report.html` into the folder of a campaign, in place of an older one.
 
-    A campaign against an earlier version of the VUT also gets a page of what broke.
-
-    Args:
-        run: the campaign.
-        summary: its summary, where that is known.
-        on_part: called with the number of levels whose surrogate is learned, and of all levels.
+    A campaign against an earlier version of the VUT also gets a page of the changes.
 
     Returns:
         The path of the report.
 
     Raises:
-        UserError: if it cannot be written, or the file that is there is not a report of ours.
+        UserError: it cannot be written, or merge-sumo did not create the file in its place.
     """
-    _replace(run, report_page(run, summary, on_part))
+    _replace(run, report_page(run))
     write_against(run)
     return run.folder / REPORT
 
@@ -71,10 +67,14 @@ def _replace(run: Run, html: str) -> None:
 
 
 class RunningReport:
-    """The report of a campaign that runs, rewritten every few seconds: a callback of the campaign.
+    """The report of a running campaign, rewritten every few seconds: a callback of the campaign.
 
-    It has no surrogates, which take seconds to learn. It never stops a campaign: if it cannot be
-    written, or `report.html` is not ours, the last report raises the error.
+    It has no surrogates, which take seconds to learn. It never stops a campaign: an error appears
+    when the last report is written.
+
+    Example:
+        >>> with RunningReport(folder) as report:
+        ...     run_campaign(settings, plan, folder, (report.rewrite,))
     """
 
     def __init__(self, folder: Path) -> None:
@@ -85,19 +85,19 @@ class RunningReport:
     def rewrite(self, _: Sequence[Outcome] = ()) -> None:
         """Write the report if its time has come."""
         start_s = time.monotonic()
-        if start_s >= self._due_s and (self._folder / OUTCOMES).is_file():
-            self._write(running=True)
-            took_s = time.monotonic() - start_s
-            # Maximum share of the time of a campaign that its report takes while it runs.
-            self._due_s = start_s + max(EVERY_S, took_s / 0.1)
-            if not self._is_there:
-                self._due_s = math.inf
+        if start_s < self._due_s or not (self._folder / OUTCOMES).is_file():
+            return
+        self._write(running=True)
+        took_s = time.monotonic() - start_s
+        self._due_s = start_s + max(EVERY_S, took_s / MOST_SHARE)
+        if not self._is_there:
+            self._due_s = math.inf
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Write the cases that ran into the report of a campaign that was stopped."""
+        """Write the finished cases into the report of a campaign that was stopped."""
         if error is not None and self._is_there:
             self._write(running=False)
 
@@ -110,7 +110,7 @@ class RunningReport:
 
 
 def check_report(folder: Path) -> None:
-    """Raise `UserError` where `report.html` in a folder is not a report of ours."""
+    """Raise `UserError` where merge-sumo did not create the report in a folder."""
     check_ours(folder / REPORT)
     check_ours(folder / AGAINST_PAGE)
 
@@ -120,27 +120,22 @@ LEVEL_ABOUT = {
     1: "makes room for a VUT that accelerates",
     2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
 }
-"""What the POV of a level does, in the words of a caption."""
+"""Conduct of the POV of a level, in the words of a caption."""
 
 
-def report_page(
-    run: Run,
-    summary: Summary | None = None,
-    on_part: OnPart = lambda _done, _total: None,
-    *,
-    learns: bool = True,
-    running: bool = False,
-) -> str:
+def report_page(run: Run, *, learns: bool = True, running: bool = False) -> str:
     """Return the report of a campaign as HTML.
 
     Args:
         run: the campaign.
-        summary: its summary, where that is known.
-        on_part: called with the number of levels whose surrogate is learned, and of all levels.
         learns: whether the page has surrogates.
         running: whether the campaign runs: a browser then loads the page again and again.
     """
-    model, scenario = ReportModel(run, summary, on_part, learns=learns), run.scenario
+    model, scenario = ReportModel(run, learns=learns), run.scenario
+    warnings = [unrepeatable(read_repeats(run)), mostly_clipped(run.cases)]
+    notes = doubts(run.cases, run.criterion, run.settings.in_vain)
+    if run.settings.ran_again:
+        notes.append(run.ran_again_in_words)
     # No "<" in the JSON: nothing in it can end its element.
     data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
     return page(
@@ -153,16 +148,22 @@ def report_page(
         model=model,
         run=run,
         vut=run.vut,
+        warnings=filter(None, warnings),
+        notes=notes,
+        go_on=again("resume", run.folder, run.record),
+        printed=end_of(run.folder / LOG),
         scenario=scenario,
         level_about=LEVEL_ABOUT,
         lane_m=scenario.lane_m,
         traffic=scenario.vehicles > 2,
         meanings=meanings,
-        by_level=by_level,
+        levels=by_level(model.facts),
         headline=headline(run, model.facts),
         comparison_headline=comparison_headline,
         robustness=robustness,
         starts_that_fail=STARTS_THAT_FAIL,
+        kinds=Counter(model.kinds.values()).most_common(),
+        kind_meanings=MEANINGS,
         pairs_of=pairs_of,
         radius_for=radius_for,
         references=list(REFERENCES),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -12,23 +11,23 @@ import numpy as np
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.metrics.fmc import fmc_growth, radius_for
-from merge_sumo.metrics.measures import Measure, measures_in
+from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import RunsOfCase, shortened
+from merge_sumo.metrics.summary import shortened
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import changes, name_and_unit
 from merge_sumo.road.drawing import road_data
-from merge_sumo.scenario.case import Coordinate, to_unit
-from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, level_name
+from merge_sumo.scenario.case import FloatArray, to_unit
+from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
 from merge_sumo.scenario.signals import to_record
 from merge_sumo.scenario.trajectory import Trajectory
 
 SPEED_UNIT_MPS = 0.002
-"""Speeds are kept as whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
+"""Speeds are whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
 COUNT_GRID = (32, 20)
 GRID: dict[int, Grid] = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of a map in its two coordinates and in the one that it moves through."""
@@ -41,14 +40,26 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     """Return the data of a page as JSON has it."""
     scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
     speeds, offsets = packed(model.motion)
-    columns = [m for m in measures_in(scenario).values() if m.column]
-    said = causes(model.run, model.shown)
-    rows = [
-        _row(model, o, offsets.get(o.index, 0), columns) | {"cause": said[o.index]}
-        for o in model.shown
-    ]
-    shown = {o.index for o in model.shown}
-    others = [o for o in model.cases if o.index not in shown]
+    cause_of = causes(model.run, model.shown)
+    cases: dict[str, list[Any]] = {"index": []}
+    for outcome in model.shown:
+        row = _row(model, outcome) | {
+            "cause": cause_of[outcome.index],
+            "offset": offsets.get(outcome.index, 0),
+        }
+        for name, value in row.items():
+            cases.setdefault(name, []).append(value)
+    measures = []
+    for name, measure in measures_in(scenario).items():
+        if measure.column and any(value is not None for value in cases.get(name, ())):
+            title = f"{scenario.said(measure.column)} {measure.unit}".replace("s2", "s²").rstrip()
+            measures.append({"name": name, "title": title, "digits": measure.digits})
+    axes = []
+    for c in model.coordinates:
+        # Cases are shown in full this near to the reader's place in a third coordinate.
+        near = (c.dimension.high - c.dimension.low) / 16.0
+        axis = {"name": c.name, "unit": c.unit, "digits": c.digits, "near": near}
+        axes.append(axis | to_plain(c.dimension))
     return {
         "dt": DT_S,
         "crash_m": scenario.dx_crash_m,
@@ -57,85 +68,63 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "place": "M" if lane_m is None else scenario.place,
         "vehicles": VEHICLES[: scenario.vehicles],
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
-        "coordinates": [_coordinate(c) for c in model.coordinates],
+        "coordinates": axes,
         "severities": list(Severity),
-        "measures": [
-            {"name": m.name, "title": _title(m, scenario), "digits": m.digits}
-            for m in columns
-            if any(row[m.name] is not None for row in rows)
-        ],
-        "cases": {name: [row[name] for row in rows] for name in (rows or [{"index": 0}])[0]},
+        "measures": measures,
+        "cases": cases,
         "speeds": speeds,
         "speed_unit_mps": SPEED_UNIT_MPS,
         "signals": {i: to_record(t.signals) for i, t in model.motion.items() if t.signals},
         "why": _explanations(model),
-        "boxes": [
-            {"level": box.level, "cases": [index for index in box.indices if index in shown]}
-            for box in model.boxes
-        ],
-        "maps": {
-            level: map_data(
-                *(scenario, level),
-                [o for o in others if o.case.level == level],
-                model.surfaces[level],
-            )
-            for level in model.levels
-        },
+        "boxes": [{"level": box.level, "cases": box.indices} for box in model.boxes],
+        "maps": {level: _map(model, level) for level in model.levels},
         "search": _search(model),
         **road_data(model.road),
     }
 
 
-def _title(measure: Measure[Any], scenario: Scenario) -> str:
-    """Return name and unit of a measure, as the head of a column."""
-    return f"{scenario.said(measure.column)} {measure.unit}".replace("s2", "s²").rstrip()
-
-
-def _row(
-    model: ReportModel, o: Outcome, offset: int, columns: Sequence[Measure[Any]]
-) -> dict[str, Any]:
+def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     """Return a case by column; it has no rows where its motion is not known."""
-    motion, measures = model.motion.get(o.index), o.measures
-    avoidance, course = model.avoidance.get(o.index), model.diagnoses.get(o.index)
+    index, measures = outcome.index, outcome.measures
+    motion, course = model.motion.get(index), model.diagnoses.get(index)
     row: dict[str, Any] = {
-        "index": o.index,
-        "level": o.case.level,
-        **{c.field: _rounded(c.of(o.case), c.digits + 2) for c in model.coordinates},
-        "starts": [round(x_m, 3) for x_m, _ in o.case.starts()],
+        "index": index,
+        "level": outcome.case.level,
+        "starts": [round(x_m, 3) for x_m, _ in outcome.case.starts()],
         "nearest": VEHICLES.index(measures.nearest),
-        "offset": offset,
         "rows": 0 if motion is None else len(motion.whole),
         "conflict": None if motion is None else [*Conflict.of(motion)],
         "end": measures.end,
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
         "severity": measures.severity,
-        "failed": o.failed,
-        "margin": _rounded(o.margin, 3),
-        "region": model.regions.get(o.index),
-        "last_avoidable_s": _rounded(measures.last_avoidable_s, 1),
-        **{m.name: _rounded(measures.value(m.name), 4) for m in columns},
+        "failed": outcome.failed,
+        "margin": _rounded(outcome.margin, 3),
+        "region": model.regions.get(index),
+        "last_avoidable_s": measures.last_avoidable_s,
         "vut_brakes_s": course and course.vut_brakes_s,
         "pov_brakes_s": course and course.pov_brakes_s,
-        "kind": model.kinds.get(o.index),
+        "kind": model.kinds.get(index),
     }
+    for coordinate in model.coordinates:
+        row[coordinate.field] = _rounded(coordinate.of(outcome.case), coordinate.digits + 2)
+    for name, measure in measures_in(outcome.case.scenario).items():
+        if measure.column:
+            row[name] = _rounded(measures.value(name), 4)
     if model.avoidance:
+        avoidance = model.avoidance.get(index)
         row["avoided_by"] = avoidance and avoidance.avoided_by
         row["latest_takeover_s"] = avoidance and avoidance.latest_takeover_s
         row["pov_careful"] = avoidance and avoidance.pov_careful
     if model.repeated:
-        row["runs"] = _runs(model.repeated.get(o.index))
+        row["runs"] = None
+        if runs := model.repeated.get(index):
+            low, high = runs.interval()
+            each = [(run.index, run.failed) for run in runs.outcomes]
+            row["runs"] = {"failed": runs.failures, "number": runs.runs, "each": each}
+            row["runs"] |= {"low": low, "high": high}
     if model.undecided:
-        row["undecided"] = o.index in model.undecided
+        row["undecided"] = index in model.undecided
     return row
-
-
-def _runs(of: RunsOfCase | None) -> dict[str, Any] | None:
-    """Return how many runs of a case failed, with the interval; None where it ran once."""
-    if of is None:
-        return None
-    low, high = of.interval()
-    each = [(run.index, run.failed) for run in of.outcomes]
-    return {"failed": of.failures, "number": of.runs, "low": low, "high": high, "each": each}
 
 
 def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
@@ -143,27 +132,17 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
     found: dict[int, dict[str, Any]] = {}
     for known in model.explanations:
         case = model.run.outcome(known.index).case
-        words = list(changes(known, case))
-        axes = []
-        for axis in known.start:
-            name, unit = name_and_unit(case, axis.name)
-            axes.append({**to_plain(axis), "name": name, "unit": unit})
-        for axis in known.parameters:
-            axes.append({**to_plain(axis), "name": f"vut: {axis.name}", "unit": ""})
-        if known.vut is not None:
-            vut = printable(known.vut)
-            words = [f"with {vut}: {sentence}" for sentence in words]
-            axes = [{**axis, "name": f"{vut}: {axis['name']}"} for axis in axes]
         of_case = found.setdefault(known.index, {"words": [], "axes": []})
-        of_case["words"] += words
-        of_case["axes"] += axes
+        # Of another VUT in the same case.
+        vut = None if known.vut is None else printable(known.vut)
+        for words in changes(known, case):
+            of_case["words"].append(words if vut is None else f"with {vut}: {words}")
+        named = [(axis, *name_and_unit(case, axis.name)) for axis in known.start]
+        named += [(axis, f"vut: {axis.name}", "") for axis in known.parameters]
+        for axis, name, unit in named:
+            title = name if vut is None else f"{vut}: {name}"
+            of_case["axes"].append(to_plain(axis) | {"name": title, "unit": unit})
     return found
-
-
-def _coordinate(c: Coordinate) -> dict[str, Any]:
-    known = {"name": c.name, "unit": c.unit, "digits": c.digits, **to_plain(c.dimension)}
-    # Cases are shown in full this near to where the reader is in a third coordinate.
-    return {**known, "near": 1.0 / 16.0 * (c.dimension.high - c.dimension.low)}
 
 
 def _search(model: ReportModel) -> dict[str, Any]:
@@ -183,10 +162,13 @@ def _search(model: ReportModel) -> dict[str, Any]:
 
 def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
     """Return the speeds of all cars at every step in base64, and the first row of each motion."""
-    speeds = [motion.whole[:, :, 1] for motion in motions.values()]
-    whole = [np.rint(np.clip(v / SPEED_UNIT_MPS, 0, 65535)).astype("<u2").tobytes() for v in speeds]
-    first = np.cumsum([0, *map(len, speeds)]).tolist()
-    return base64.b64encode(b"".join(whole)).decode(), dict(zip(motions, first, strict=False))
+    first, rows, content = {}, 0, b""
+    for index, motion in motions.items():
+        speeds = np.rint(np.clip(motion.whole[:, :, 1] / SPEED_UNIT_MPS, 0, 65535))
+        content += speeds.astype("<u2").tobytes()
+        first[index] = rows
+        rows += len(speeds)
+    return base64.b64encode(content).decode(), first
 
 
 def pairs_of(dims: int) -> list[Axes]:
@@ -194,55 +176,48 @@ def pairs_of(dims: int) -> list[Axes]:
     return [(0, 1)] if dims <= 3 else list(combinations(range(dims), 2))
 
 
-def map_data(
-    scenario: Scenario, level: int, others: Sequence[Outcome], surface: Surface | None
-) -> dict[str, Any]:
-    """Return the data of the map of a level.
+def _map(model: ReportModel, level: int) -> dict[str, Any]:
+    """Return the map of a level: its cases that are counted, and the chance to fail.
 
-    A level with two coordinates has one map; with a third, the reader moves through it. Of more, a
-    map shows the cases in a pair, without a chance to fail. `others` are outcomes that the page
-    counts instead of showing one by one.
-
-    Args:
-        scenario: scenario of the campaign.
-        level: level of the POV.
-        others: outcomes that are counted and not drawn.
-        surface: surrogate of the level; None for no contour.
+    A level with two coordinates has one map; with a third, the reader moves through it. With more,
+    a map shows the cases in a pair, without a chance to fail.
     """
-    dims = len(scenario.dimensions(level))
+    dims, surface = len(model.axes[level]), model.surfaces[level]
+    chance = _chance(surface, GRID[dims]) if surface and dims in GRID else None
+    shown = {outcome.index for outcome in model.shown}
+    others = [o for o in model.cases if o.case.level == level and o.index not in shown]
+    points = to_unit((outcome.case for outcome in others), level, model.run.scenario)
+    failed = np.array([outcome.failed for outcome in others], dtype=bool)
+    grids = []
+    for axes in pairs_of(dims):
+        counts: dict[str, Any] | None = None
+        if others:
+            nx, ny = COUNT_GRID
+            places = points[:, axes]
+            counts = {"nx": nx, "ny": ny}
+            counts["safe"], counts["failing"] = _counts(places[~failed]), _counts(places[failed])
+        grids.append({"chance": chance, "counts": counts})
     return {
         "pairs": pairs_of(dims),
         "through": 2 if dims == 3 else None,
-        # The ball of more coordinates is as wide as the map: its shadow says nothing.
+        # In more coordinates a ball is as wide as the map.
         "radius": radius_for(dims) if dims <= 3 else None,
-        "grids": [
-            {
-                "chance": surface and _chance(surface, dims),
-                "counts": _counts(others, scenario, level, axes) if others else None,
-            }
-            for axes in pairs_of(dims)
-        ],
+        "grids": grids,
     }
 
 
-def _counts(
-    others: Sequence[Outcome], scenario: Scenario, level: int, axes: Axes
-) -> dict[str, Any]:
+def _counts(places: FloatArray) -> list[int]:
+    """Return the number of places, (n, 2), in each cell of a map, row by row."""
     nx, ny = COUNT_GRID
-    grid: dict[str, Any] = {"nx": nx, "ny": ny}
-    for name, failing in (("safe", False), ("failing", True)):
-        cases = (o.case for o in others if o.failed is failing)
-        x, y = to_unit(cases, level, scenario)[:, list(axes)].T
-        cells, _, _ = np.histogram2d(y, x, bins=(ny, nx), range=((0, 1), (0, 1)))
-        grid[name] = cells.astype(int).ravel().tolist()
-    return grid
+    x, y = places.T
+    cells, _, _ = np.histogram2d(y, x, bins=(ny, nx), range=((0, 1), (0, 1)))
+    counts: list[int] = cells.astype(int).ravel().tolist()
+    return counts
 
 
-def _chance(surface: Surface, dims: int) -> dict[str, Any] | None:
-    """Return the chance at the nodes of a map in 255ths; None of more than three coordinates."""
-    if dims not in GRID:
-        return None
-    nx, ny, through = grid = GRID[dims]
+def _chance(surface: Surface, grid: Grid) -> dict[str, Any]:
+    """Return the chance at the nodes of a map in 255ths."""
+    nx, ny, through = grid
     values = np.rint(255.0 * surface.chance(nodes(grid))).astype(np.uint8)
     data = base64.b64encode(values.tobytes()).decode()
     return {"nx": nx, "ny": ny, "np": through, "data": data}

@@ -1,11 +1,12 @@
-"""What a terminal shows of an episode, and of the results of studies.
+"""Sentences and lines of a terminal about campaigns, cases and studies.
 
 `lines_of` has a function for each kind of result.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -24,20 +25,40 @@ from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.explanation import PSI, Axis, Explanation, ExplanationResult
 from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
 from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
-from merge_sumo.analysis.sampler_study import SamplerStudy, SamplerSummary, Spread
+from merge_sumo.analysis.sampler_study import SamplerStudy, Spread
+from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.again import again, command
-from merge_sumo.metrics.cause import cause, met
+from merge_sumo.campaigns.run import Run
+from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.plausibility import behind
+from merge_sumo.metrics.plausibility import late_errors
 from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either, printable
+from merge_sumo.reports.facts import (
+    AT_MOST,
+    AVOIDED,
+    AVOIDED_BY_POV,
+    CONTACT,
+    DRIVEN,
+    KIND,
+    PROBABLY,
+    RULE,
+    SCATTERED,
+    STARTS,
+    STARTS_THAT_FAIL,
+    UNDECIDED,
+    WORST,
+    Fact,
+    by_level,
+)
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, level_name
@@ -45,6 +66,76 @@ from merge_sumo.scenario.trajectory import Trajectory
 
 FRAGILE = 10
 """Failures that are not robust that a sentence names."""
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table with cells to the right; empty columns are left out."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True) if width]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+# Campaigns
+
+
+def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
+    """Return the first lines about a campaign; their numbers are facts."""
+    of = {fact.name: fact for fact in facts if fact.level is None}
+    levels = by_level(facts)
+    cases = _counted(of["cases"], "case")
+    if AT_MOST in of:
+        cases = f"{of['cases'].shown} of {of[AT_MOST].shown} cases, converged"
+    lines = [f"{of['VUT'].shown}: {RULE} {of[RULE].shown}; {cases}"]
+    rows = [_level_cells(level, row) for level, row in levels.items()]
+    lines += [f"  {line}" for line in aligned(rows)]
+
+    remarks = []
+    if CONTACT in of:
+        contacts = _counted(of[CONTACT], "more case")
+        remarks.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
+    is_measured = any(STARTS_THAT_FAIL in row for row in levels.values())
+    if not (PROBABLY in of or is_measured or SHARES.read(run.folder)):
+        measure = again("probability", run.folder, run.record)
+        remarks.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
+    if remarks:
+        lines.append("; ".join(remarks))
+
+    if AVOIDED_BY_POV in of:
+        number = _counted(of["failures"], "failure")
+        if DRIVEN in of:
+            number = f"{of[DRIVEN].shown} of {number}"
+        drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCES]
+        pov = f"by a careful POV {of[AVOIDED_BY_POV].shown}"
+        lines.append(f"avoided of {number}: by driver {', '.join(drivers)}, {pov}")
+    if WORST in of:
+        replay = command("replay", run.folder, of[WORST].value, gui=True)
+        lines.append(f"{WORST} ({of[KIND].shown}): {replay}")
+    return lines
+
+
+def _counted(fact: Fact, what: str) -> str:
+    return f"{fact.shown} {what}" if fact.value == 1 else f"{fact.shown} {what}s"
+
+
+def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
+    """Return level, share of starts, failures, regions and FMC as text; "" for none."""
+    cells = [f"level {level_name(level)}", "", "nothing tested", "", ""]
+    if STARTS_THAT_FAIL in of:
+        cells[1] = f"{of[STARTS_THAT_FAIL].shown} of all starts fail, by {of[STARTS].shown}"
+    if "failures" in of:
+        cells[2] = f"{_counted(of['failures'], 'failure')} found"
+        if UNDECIDED in of and of[UNDECIDED].value:
+            cells[2] += f", {of[UNDECIDED].shown} undecided"
+        if of["FMC"].value:
+            regions = of["regions"]
+            is_number = regions.value != SCATTERED
+            cells[3] = _counted(regions, "region") if is_number else SCATTERED
+            cells[4] = f"FMC {of['FMC'].shown}"
+    return cells
+
 
 # Comparisons
 
@@ -54,29 +145,32 @@ def change_in_words(case: ComparedCase) -> str:
     if case.chance is not None and case.runs_a is not None and case.runs_b is not None:
         shares = f"{case.runs_a.in_words} -> {case.runs_b.in_words}"
         return f"{shares}, by Fisher's exact test p = {case.chance:.2g}"
-    sides = case.a, case.b
-    words = [outcome_word(outcome) for outcome in sides]
-    if words[0] == words[1] and case.change in (Change.WORSE, Change.NOT_REPEATABLE):
-        words = [f"{words[0]}, margin {short(outcome.margin)}" for outcome in sides]
-    elif words[0] == words[1] and case.change is not Change.BOTH:
-        words = [f"{words[0]}, {'no' if passes(o) else 'a'} failure" for o in sides]
+    words = [outcome_word(case.a), outcome_word(case.b)]
+    if words[0] == words[1] and case.change is not Change.BOTH:
+        for place, outcome in enumerate((case.a, case.b)):
+            if case.change in (Change.WORSE, Change.NOT_REPEATABLE):
+                words[place] += f", margin {short(outcome.margin)}"
+            else:
+                words[place] += ", no failure" if passes(outcome) else ", a failure"
     return " -> ".join(words)
 
 
 def step_headline(step: Step) -> str:
-    """Return what pairs, regions and numbers of a step say."""
-    parts = ["no case is shared"]
+    """Return the numbers of a step in a sentence: cases and regions by what changed."""
+    parts = []
+    if step.passes_less:
+        by = f"by Fisher's exact test p = {step.chance:.2g}"
+        parts.append(f"{step.after} passes less often than {step.before}, {by}")
     if step.cases:
         changes = [one for one in Change if one is Change.BROKE or step.count(one)]
         numbers = ", ".join(f"{step.count(change)} {change}" for change in changes)
-        parts = [f"of {counted(len(step.cases), 'shared case')} {numbers}"]
+        parts.append(f"of {counted(len(step.cases), 'shared case')} {numbers}")
+    else:
+        parts.append("no case is shared")
     if step.regions:
-        of_regions = [one.change for found in step.regions.values() for one in found]
-        shown = [f"{of_regions.count(one)} {one}" for one in Change if one in of_regions]
+        number = Counter(region.change for found in step.regions.values() for region in found)
+        shown = [f"{number[change]} {change}" for change in Change if number[change]]
         parts.append(f"regions of failures: {', '.join(shown) or 'none'}")
-    if step.passes_less:
-        by = f"by Fisher's exact test p = {step.chance:.2g}"
-        parts.insert(0, f"{step.after} passes less often than {step.before}, {by}")
     return "; ".join(parts)
 
 
@@ -93,8 +187,10 @@ def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
     """Return by level the FMC of each version as text, of its own cases; "-" for none."""
     rows: dict[int, list[str]] = {}
     for level in sorted({level for version in compared.versions for level in version.levels}):
-        found = [version.at.get(level) for version in compared.versions]
-        rows[level] = ["-" if one is None or not one.tested else f"{one.fmc:.4f}" for one in found]
+        rows[level] = []
+        for version in compared.versions:
+            found = version.at.get(level)
+            rows[level].append(f"{found.fmc:.4f}" if found and found.tested else "-")
     return rows
 
 
@@ -107,14 +203,14 @@ def comparison(compared: Comparison) -> list[str]:
     text.append(compared.source)
     for number, version in enumerate(compared.versions, start=1):
         verdict = judge(version.outcomes, version.tolerated)
-        place = f"{version.folder} " if version.folder else "now "
-        text.append(f"{number}: {place}({version.vut}): {verdict.counts}")
-        text += [*verdict.trouble_lines(), *(f"  {one}" for one in behind(version.outcomes))]
+        text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {verdict.counts}")
+        text += [*verdict.trouble_lines(), *(f"  {one}" for one in late_errors(version.outcomes))]
     for level, row in fmc_rows(compared).items():
         text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
+    differ = False
     for step in compared.steps:
         text += _step_lines(step)
-    differ = any(c.change is not Change.BOTH for step in compared.steps for c in step.cases)
+        differ |= step.count(Change.BOTH) < len(step.cases)
     if differ and compared.page_command:
         text.append(f"both motions in one picture: {compared.page_command}")
     return [*text, *compared.notes]
@@ -146,12 +242,12 @@ def _step_lines(step: Step) -> Iterator[str]:
 
 
 def truth_remarks(truth: Truth) -> list[str]:
-    """Return what a truth is too small for, in clauses."""
+    """Return the quantities for which a truth has too few cases, in clauses."""
     remarks = []
     if truth.is_small:
         remarks.append(
             "too small to be divided by: "
-            f"as many cases again could add up to {truth.growth:.0%} to its FMC"
+            f"the same number of cases again could add up to {truth.growth:.0%} to its FMC"
         )
     if not truth.tells_regions:
         radius = radius_for(truth.points.shape[1])
@@ -184,28 +280,12 @@ def truths(found: TruthResult) -> list[str]:
 
 def _spread(spread: Spread, form: str) -> str:
     """Return the median, with the quartiles in brackets."""
-    values = spread.median, spread.low, spread.high
-    return "{} [{}, {}]".format(*(_cell(value, form) for value in values))
+    median, low, high = (_cell(one, form) for one in (spread.median, spread.low, spread.high))
+    return f"{median} [{low}, {high}]"
 
 
 def _cell(value: float | None, form: str) -> str:
     return "-" if value is None else f"{value:{form}}"
-
-
-def _columns(one: SamplerSummary, *, small: bool) -> dict[str, str]:
-    """Return the cells of a sampler by heading; nothing is divided by a `small` truth."""
-    of_truth = {
-        "FMC / truth": _spread(one.fmc_over_truth, ".3f"),
-        "FMC / limit": _spread(one.fmc_over_limit, ".3f"),
-    }
-    return {
-        **({} if small else of_truth),
-        "covered share": _spread(one.covered_share, ".3f"),
-        "FMC": _spread(one.fmc, ".4f"),
-        "failures": _spread(one.failures, ".0f"),
-        "regions": _spread(one.regions_found, ".1f"),
-        "to 90 %": _spread(one.cases_to_90_percent, ".0f"),
-    }
 
 
 @lines_of.register
@@ -219,17 +299,23 @@ def samplers(study: SamplerStudy) -> list[str]:
     for level, truth in study.truths.items():
         for remark in truth_remarks(truth):
             lines.append(f"  at level {level_name(level)} it is {remark}")
-    line = f"limit: FMC {study.limit_fmc:.4f}, of all that truth and searches found"
+    line = f"limit: FMC {study.limit_fmc:.4f}, of all failures of truth and searches"
     if study.dense:
         line += f", or of {DENSE_CASES:,} uniform cases, where that is more"
     lines.append(line)
-    rows = []
+
+    head = ["covered share", "FMC", "failures", "regions", "to 90 %"]
+    # Nothing is divided by a truth that is too small.
+    over = [] if study.is_small else ["FMC / truth", "FMC / limit"]
+    rows = [["sampler", *over, *head]]
     for name, one in study.samplers.items():
-        rows.append({"sampler": name, **_columns(one, small=study.is_small)})
-    widths = {name: max(map(len, (name, *(row[name] for row in rows)))) for name in rows[0]}
-    for row in [{name: name for name in widths}, *rows]:
-        lines.append("  ".join(row[name].rjust(width) for name, width in widths.items()))
-    lines.append("medians [quartiles]")
+        row = [name]
+        if over:
+            row += [_spread(one.fmc_over_truth, ".3f"), _spread(one.fmc_over_limit, ".3f")]
+        row += [_spread(one.covered_share, ".3f"), _spread(one.fmc, ".4f")]
+        row += [_spread(one.failures, ".0f"), _spread(one.regions_found, ".1f")]
+        rows.append([*row, _spread(one.cases_to_90_percent, ".0f")])
+    lines += [*aligned(rows), "medians [quartiles]"]
     if probes := sum(map(len, study.probes.values())):
         lines.append(f"covered share: of {counted(probes, 'failing uniform case')}")
     return lines if study.figure is None else [*lines, f"figure: {study.figure}"]
@@ -252,46 +338,46 @@ def reproduction(found: Reproduction) -> list[str]:
 
 def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
     """Yield the rows of Table II: a name, and a cell for each column."""
-    studies = [one.study for one in found.columns.values()]
-    papers = [one.column.paper for one in found.columns.values()]
+    ours = [_fmc_of(one.study) for one in found.columns.values()]
+    papers = []
+    for one in found.columns.values():
+        paper = dict(one.column.paper)
+        for name in ADAPTIVE:
+            if name in paper:
+                paper[f"{name} / truth"] = paper[name] / paper["truth"]
+        papers.append(paper)
+    for name in ours[0]:
+        form = ".2f" if "/" in name else ".4f"
+        cells = []
+        for own, paper in zip(ours, papers, strict=True):
+            cell = _cell(own[name], form)
+            cells.append(f"{cell} ({paper[name]:{form}})" if name in paper else cell)
+        if set(cells) != {"-"}:
+            yield name, cells
 
-    def row(values: Iterable[float | None], form: str) -> list[str]:
-        return [_cell(value, form) for value in values]
 
-    def with_paper(
-        ours: Iterable[float | None], paper: Iterable[float | None], form: str
-    ) -> list[str]:
-        pairs = zip(row(ours, form), row(paper, form), strict=True)
-        return [f"{one} ({other})" for one, other in pairs]
-
-    for name in ("truth", *SAMPLERS):
-        ours: list[float | None] = [one.truth_fmc for one in studies]
-        if name != "truth":
-            ours = [one.samplers[name].fmc.median for one in studies]
-        yield name, with_paper(ours, [paper.get(name) for paper in papers], ".4f")
-    dense = [sum(fmc(truth.failures) for truth in one.dense.values()) for one in studies]
-    if any(dense):
-        yield "dense truth", row([value or None for value in dense], ".4f")
-    yield "limit", row([one.limit_fmc for one in studies], ".4f")
+def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
+    """Return the values of a column of Table II by row; None for what is not known."""
+    values: dict[str, float | None] = {"truth": study.truth_fmc}
+    for name in SAMPLERS:
+        values[name] = study.samplers[name].fmc.median
+    values["dense truth"] = sum(fmc(truth.failures) for truth in study.dense.values()) or None
+    values["limit"] = study.limit_fmc
     for name in ADAPTIVE:
-        over = [one.samplers[name].fmc_over_truth.median for one in studies]
-        shares = [paper[name] / paper["truth"] if name in paper else None for paper in papers]
-        yield f"{name} / truth", with_paper(over, shares, ".2f")
+        values[f"{name} / truth"] = study.samplers[name].fmc_over_truth.median
     for name in ADAPTIVE:
-        over = [one.samplers[name].fmc_over_limit.median for one in studies]
-        yield f"{name} / limit", row(over, ".2f")
+        values[f"{name} / limit"] = study.samplers[name].fmc_over_limit.median
     for name in ADAPTIVE:
-        after = studies[0].samplers[name].cases_by_batch
-        # A quarter of all cases, or where a batch ended next.
-        batch = next(k for k, number in enumerate(after) if number >= after[-1] / 4)
-        early: list[float | None] = []
-        for one in studies:
-            reached = one.samplers[name].fmc_by_batch[1][batch]
-            early.append(reached / one.truth_fmc if one.truth_fmc and not one.is_small else None)
-        yield f"{name} / truth after {after[batch]} cases", row(early, ".2f")
+        one = study.samplers[name]
+        # A quarter of all cases, or the end of the batch that has it.
+        batch = next(k for k, n in enumerate(one.cases_by_batch) if n >= one.cases_by_batch[-1] / 4)
+        is_known = study.truth_fmc and not study.is_small
+        share = one.fmc_by_batch[1][batch] / study.truth_fmc if is_known else None
+        values[f"{name} / truth after {one.cases_by_batch[batch]} cases"] = share
+    return values
 
 
-# Of one campaign
+# Studies of a campaign
 
 
 @lines_of.register
@@ -353,9 +439,10 @@ def stress(found: StressResult) -> list[str]:
         if rung.skipped:
             lines.append(f"{'not run':>40}  {rung.about}: {rung.skipped}")
             continue
-        numbers = "{:10d}{:10d}{:12d}".format(*rung.counts)
+        passing, failing, unjudged = rung.counts
+        numbers = f"{found.share(rung):8.1%}{passing:10d}{failing:10d}{unjudged:12d}"
         drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
-        lines.append(f"{found.share(rung):8.1%}{numbers}  {rung.about}{drawn}")
+        lines.append(f"{numbers}  {rung.about}{drawn}")
     return [*lines, robustness(found)]
 
 
@@ -363,12 +450,12 @@ def robustness(found: StressResult) -> str:
     """Return how many failures are robust, and which others pass most often."""
     if not found.failures:
         return "no case failed: which passes fail on a rung is in the table"
-    robust, failures = len(found.robust), counted(len(found.failures), "failure")
-    text = f"robust, as they fail on every rung: {robust} of {failures}"
+    failures = counted(len(found.failures), "failure")
+    text = f"robust, as they fail on every rung: {len(found.robust)} of {failures}"
     fragile = [index for index in found.failures if found.passes_in(index)]
-    fragile.sort(key=lambda index: -found.passes_in(index))
-    shown = ", ".join(f"{index} ({found.passes_in(index)})" for index in fragile[:FRAGILE])
     if fragile:
+        fragile.sort(key=found.passes_in, reverse=True)
+        shown = ", ".join(f"{index} ({found.passes_in(index)})" for index in fragile[:FRAGILE])
         text += "; others, with the number of runs in which they do not fail"
         text += f"{cut(len(fragile), FRAGILE)}: {shown}"
     return text
@@ -418,14 +505,10 @@ def name_and_unit(case: Case, field: str) -> tuple[str, str]:
 
 
 def _axis(axis: Axis, name: str, unit: str) -> str:
-    def text(value: float) -> str:
-        return f"{value:.{axis.digits}f} {unit}".rstrip()
-
-    passing = either(map(text, axis.passing)) if axis.passing else "no other value"
-    return (
-        f"{name} is {text(axis.value)}; passes at {passing} (tried from {text(axis.low)} to "
-        f"{text(axis.high)}, every {text(axis.step)})"
-    )
+    values = [axis.value, axis.low, axis.high, axis.step, *axis.passing]
+    value, low, high, step, *passing = [f"{v:.{axis.digits}f} {unit}".rstrip() for v in values]
+    passes_at = either(passing) if passing else "no other value"
+    return f"{name} is {value}; passes at {passes_at} (tried from {low} to {high}, every {step})"
 
 
 @lines_of.register
@@ -439,7 +522,7 @@ def vut_check(found: VutCheck) -> list[str]:
     return lines
 
 
-# Of one case
+# Single cases
 
 
 def episode_lines(
@@ -465,23 +548,23 @@ def episode_lines(
 
 
 def _measures(outcome: Outcome) -> Iterator[str]:
-    found, scenario, other = outcome.measures, outcome.case.scenario, met(outcome.measures)
-    if other != "POV":
-        yield f"  of the {other}, which is nearest to the VUT at the end:"
-    listed = [
-        (text, value, measure.unit)
-        for measure in measures_in(scenario).values()
-        if (value := found.value(measure.name)) is not None
-        and (text := scenario.said(measure.label).replace("POV", other))
-    ]
-    # Minimum width of the column of measures, in characters.
-    width = max([31, *(len(text) for text, _, _ in listed)])
-    for text, value, unit in listed:
-        yield f"  {text:<{width}} {value:10.2f} {unit}".rstrip()
+    found, scenario = outcome.measures, outcome.case.scenario
+    car = conflicting_car(found)
+    if car != "POV":
+        yield f"  of the {car}, which is nearest to the VUT at the end:"
+    rows = []
+    for name, measure in measures_in(scenario).items():
+        value = found.value(name)
+        if measure.label and value is not None:
+            label = scenario.said(measure.label).replace("POV", car)
+            rows.append((label, f"{value:10.2f} {measure.unit}"))
     if found.clipped_steps:
-        yield f"  {'steps beyond its limits':<{width}} {found.clipped_steps:10d}"
+        rows.append(("steps beyond its limits", f"{found.clipped_steps:10d}"))
     if outcome.is_tested and found.error is not None:
-        yield f"  {'error after M':<{width}} {found.error}"
+        rows.append(("error after M", found.error))
+    width = max(len(label) for label, _ in rows)
+    for label, value in rows:
+        yield f"  {label:<{width}} {value}".rstrip()
 
 
 def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:

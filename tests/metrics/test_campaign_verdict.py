@@ -150,8 +150,9 @@ class TestJUnit:
 
     def test_fails_where_nothing_was_tested(self, tmp_path):
         run = write_run(tmp_path / "run", 4, levels=(0,), timeouts=range(4))
-        write_junit(tmp_path / "junit.xml", run, [], judge(run.outcomes), [])
-        (failure,) = read_junit(tmp_path / "junit.xml").iter("failure")
+        facts = ms.open_run(run.folder).facts
+        write_junit(tmp_path / "junit.xml", run, facts, judge(run.outcomes), [])
+        failure, *_ = read_junit(tmp_path / "junit.xml").iter("failure")
         assert failure.text.startswith("nothing was tested")
 
 

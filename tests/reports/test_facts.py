@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,9 @@ from support.handmade import write_run
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.reports import report_model
-from merge_sumo.reports.facts import TOUCH, Fact, headline
+from merge_sumo.reports.facts import CONTACT, Fact
 from merge_sumo.reports.report import report_page
+from merge_sumo.reports.text import headline
 from merge_sumo.results import CampaignRun
 
 
@@ -30,6 +30,11 @@ def made(tmp_path_factory) -> Run:
     lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
     AVOIDANCE.write_lines(run.folder, lines)
     return run
+
+
+@pytest.fixture(scope="module")
+def page(made) -> Any:
+    return html.fromstring(report_page(made, learns=False))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +61,7 @@ def test_are_what_the_lines_of_the_folder_say(made, facts):
     for level in (0, 1, 2):
         of_level = [row for row in failing if row["level"] == level]
         assert facts["failures", level].value == len(of_level)
-    untested = [facts["without a verdict", level].value for level in (0, 1, 2)]
+    untested = [fact.value for (name, _), fact in facts.items() if name == "without a verdict"]
     assert sum(untested) == 3
 
 
@@ -74,33 +79,27 @@ def test_the_simulated_time_has_the_follow_up(run, tmp_path):
     assert Run(lost).simulated_s == pytest.approx(up_to_m_s)
 
 
-def test_name_the_key_of_a_failing_line_under_the_papers_rule(facts):
+def test_are_listed_once_each_with_a_key_and_a_file_of_the_folder(made, facts):
+    found = CampaignRun(made).facts
+    assert len(found) == len(facts)
+    assert all((made.folder / fact.file).is_file() and fact.key for fact in found)
     assert facts["failures", None].key == "score < -500"
 
 
-def test_stand_once_each_with_a_file_of_the_folder(made):
-    found = CampaignRun(made).facts
-    assert set(Counter((fact.name, fact.level) for fact in found).values()) == {1}
-    assert all((made.folder / fact.file).is_file() and fact.key for fact in found)
-
-
-def test_are_all_in_the_report_and_in_its_json(made, facts):
-    page: Any = html.fromstring(report_page(made))
-    rows = page.xpath("//section[@aria-labelledby='facts']//tbody/tr")
-    cells = {
-        (row[0].text_content(), n): c.text_content() for row in rows for n, c in enumerate(row)
-    }
+def test_are_all_in_the_report_and_in_its_json(made, facts, page):
     listed = {div[0].text: (div[0][0].text, div[1].text) for div in page.xpath("//dl/div")}
-    for (name, level), fact in facts.items():
-        if level is None and name in listed:
-            assert listed[name] == (f"{fact.file}: {fact.key}", fact.shown)
-    assert {name for name, level in facts if level is None} - listed.keys() == {"cases", "failures"}
-    heads = [head.text for head in page.xpath("//table[contains(@class, 'levels')]//th[@class]")]
-    for column, head in enumerate(heads, start=1):
-        name, _, unit = head.partition(", ")
-        for level in (0, 1, 2):
-            shown = facts[name, level].shown.removesuffix(unit)
-            assert cells[str(level), column].strip() == shown.strip()
+    of_all = {name: fact for (name, level), fact in facts.items() if level is None}
+    assert of_all.keys() - listed.keys() == {"cases", "failures"}, "which are in the table"
+    for name, shown in listed.items():
+        fact = of_all[name]
+        assert shown == (f"{fact.file}: {fact.key}", fact.shown)
+    (table,) = page.xpath("//table[contains(@class, 'levels')]")
+    heads = [head.text.partition(", ") for head in table.xpath(".//th[@class]")]
+    for level, row in enumerate(table.xpath("./tbody/tr")[:3]):
+        for (name, _, unit), cell in zip(heads, row[1:], strict=True):
+            known = facts.get((name, level))
+            expected = "–" if known is None else known.shown.removesuffix(unit).strip()
+            assert cell.text_content().strip() == expected
     said = json.loads(invoke("report", made.folder, "--json").stdout)
     assert Path(said["report"]).is_file()
     assert [Fact(**row) for row in said["facts"]] == list(facts.values())
@@ -112,14 +111,14 @@ def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
     first, *levels, unknown, avoided, worst = headline(made, CampaignRun(made).facts)
     rule = "front bumpers are within 6 m when the VUT reaches the merge point"
     assert first == f"handmade: a case fails when {rule}; 180 cases"
-    found = [
-        ["level", str(level), of[f"failures {level}"], "failures", "found"]
-        + ([] if of[f"regions {level}"] == "scattered" else [of[f"regions {level}"]])
-        + [{"1": "region", "scattered": "scattered"}.get(of[f"regions {level}"], "regions")]
-        + ["FMC", of[f"FMC {level}"]]
-        for level in (0, 1, 2)
-    ]
-    assert [line.split() for line in levels] == found
+    for level, line in enumerate(levels):
+        regions = of[f"regions {level}"]
+        words = ["level", str(level), of[f"failures {level}"], "failures", "found"]
+        if regions == "scattered":
+            words.append(regions)
+        else:
+            words += [regions, "region" if regions == "1" else "regions"]
+        assert line.split() == [*words, "FMC", of[f"FMC {level}"]]
     assert len({line.find(" failures") for line in levels}) == 1
     measure = f"merge-sumo probability {made.folder} --vut handmade"
     assert unknown == f"starts that fail are not measured: {measure}"
@@ -132,7 +131,7 @@ def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
     assert "contact at a relative speed of " in of["kind of the worst case"]
 
 
-def test_of_the_headline_begin_terminal_and_report(made):
+def test_of_the_headline_begin_terminal_and_report(made, page):
     lines = headline(made, CampaignRun(made).facts)
     printed = CampaignRun(made).lines()
     assert [line for line in printed if line in lines] == lines
@@ -141,15 +140,14 @@ def test_of_the_headline_begin_terminal_and_report(made):
         "  2 TIMEOUT, the first in case 4: the VUT did not reach the merge point in 12 s",
     ]
     assert printed[-1] == f"report: {made.folder / 'report.html'}"
-    page: Any = html.fromstring(report_page(made))
     (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
     assert card.text == "\n".join(lines).replace("`", "")
 
 
 def test_of_the_headline_name_the_option_of_another_rule_in_the_report(made, monkeypatch):
-    facts = [*CampaignRun(made).facts, Fact(TOUCH, 2, "", "outcomes.jsonl", "severity")]
+    facts = [*CampaignRun(made).facts, Fact(CONTACT, 2, "severity")]
     monkeypatch.setattr(report_model, "facts_of", lambda *_: facts)
-    page: Any = html.fromstring(report_page(made))
+    page: Any = html.fromstring(report_page(made, learns=False))
     (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
-    said = "2 more cases touch after M, which this rule does not count: --fail-when unsafe"
+    said = "contact after the merge in 2 more cases: --fail-when unsafe counts them"
     assert said in card.text
