@@ -1,6 +1,6 @@
-"""A merge in any SUMO net: two paths of lanes that become one at M, as a value.
+"""A merge in any SUMO net, as a value: two paths of lanes that become one at M.
 
-Where both vehicles drive on one lane all the way, the paths are equal.
+Where both vehicles drive on the same lanes all the way, the paths are equal.
 
 Each path has its own coordinate: the distance of the front bumper along its lanes from the merge
 point M, in metres, negative before M. The lanes inside of junctions belong to the paths, so the
@@ -18,7 +18,6 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import Bounds
 
 Point = tuple[float, float, float]
@@ -106,18 +105,23 @@ class LanePath:
         position_m = x_m - piece.start_m
         return LanePoint(piece.lane, position_m, *piece.point(position_m))
 
-    def nearest(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Return how far a point in the plane is from the lanes, in m, and the coordinate there."""
-        found = []
+    def corners(self) -> list[tuple[float, float, float]]:
+        """Return the points of the lanes, each with its coordinate: (x_m, x, y)."""
+        corners = []
         for piece in self.pieces:
-            shares, shape = pairwise(piece.shares), pairwise(piece.shape)
-            for (begin, end), ((x0, y0, _), (x1, y1, _)) in zip(shares, shape, strict=True):
-                dx, dy = x1 - x0, y1 - y0
-                along = ((x_m - x0) * dx + (y_m - y0) * dy) / (dx * dx + dy * dy or 1.0)
-                along = min(max(along, 0.0), 1.0)
-                away_m = math.hypot(x_m - x0 - along * dx, y_m - y0 - along * dy)
-                share = begin + along * (end - begin)
-                found.append((away_m, piece.start_m + share * piece.length_m))
+            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True):
+                corners.append((piece.start_m + share * piece.length_m, x, y))
+        return corners
+
+    def nearest(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """Return the distance of a point in the plane to the lanes, in m, and the coordinate."""
+        found = []
+        for (begin_m, x0, y0), (end_m, x1, y1) in pairwise(self.corners()):
+            dx, dy = x1 - x0, y1 - y0
+            along = ((x_m - x0) * dx + (y_m - y0) * dy) / (dx * dx + dy * dy or 1.0)
+            along = min(max(along, 0.0), 1.0)
+            away_m = math.hypot(x_m - x0 - along * dx, y_m - y0 - along * dy)
+            found.append((away_m, begin_m + along * (end_m - begin_m)))
         return min(found)
 
     def speed_limits_mps(self) -> list[tuple[float, float]]:
@@ -160,9 +164,9 @@ class AccelerationLane:
     """Its ids in the net file, one for each edge, and those of the lanes next to it."""
     beside: tuple[str, ...]
     is_marked: bool
-    """Whether the net marks it, as netconvert marks those that it makes or is told of."""
+    """Whether the net marks it, as netconvert does."""
     exits: tuple[str, ...]
-    """Edges to which it leads on, other than that of the mainline: weaving traffic leaves there."""
+    """Edges after it, other than that of the mainline: weaving traffic leaves there."""
 
     @property
     def length_m(self) -> float:
@@ -187,7 +191,13 @@ def lane_around_m(length_m: float) -> Bounds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corridor:
-    """A merge in a net: everything that hosting, replay and exports need to know of the road."""
+    """A merge in a net: the road for the simulation, replays and exports.
+
+    Example:
+        >>> road = road_of()
+        >>> road.ramp.point(-10.0).lane
+        'ramp_0'
+    """
 
     path: Path
     sha256: str
@@ -198,7 +208,6 @@ class Corridor:
     ramp: LanePath
     junction_type: str
     """Of the junction at M."""
-    junction_id: str
     mainline_approach: Approach
     ramp_approach: Approach
     lane_drop: bool
@@ -216,7 +225,7 @@ class Corridor:
     @property
     def is_one_path(self) -> bool:
         """Whether both vehicles drive on one lane all the way."""
-        return self.mainline_edges == self.ramp_edges
+        return self.mainline == self.ramp
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
         """Return the place of a lane coordinate of one of the paths."""
@@ -227,16 +236,3 @@ class Corridor:
         """Highest speed limit of both paths."""
         pieces = self.mainline.pieces + self.ramp.pieces
         return max(piece.speed_limit_mps for piece in pieces)
-
-    def check_room(self, mainline_m: float, ramp_m: float) -> None:
-        """Raise `UserError` when a path is shorter before M than its farthest start."""
-        for name, edges, path, needed_m in (
-            ("mainline", self.mainline_edges, self.mainline, mainline_m),
-            ("ramp", self.ramp_edges, self.ramp, ramp_m),
-        ):
-            if path.before_m < needed_m:
-                raise UserError(
-                    f"the {name} ({' '.join(edges)}) begins {path.before_m:.1f} m before the merge "
-                    f"point and a vehicle starts {needed_m:g} m before it: begin with an edge "
-                    "further upstream, or start nearer"
-                )

@@ -34,9 +34,9 @@ from merge_sumo.road.corridor import (
 from merge_sumo.road.xml_input import NET_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds
 
+SumoNet = Any
 SumoLane = Any
 SumoConnection = Any
-SumoEdge = Any
 """Classes of sumolib, which has no types."""
 
 FARTHEST_M = 2e7
@@ -47,12 +47,9 @@ VISIBILITY = "visibility"
 """Attribute of a connection: from how far its driver sees the others, in m."""
 POINT_M = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
-FOLLOWED_EDGES = 5
-"""How many edges after those that a user names are searched for the merge."""
-SHOWN_EDGES = 12
-"""A net with at most as many edges names them all where one is unknown."""
-MAP_OPTIONS = {"osm": "--osm-files", "OpenDRIVE": "--opendrive-files"}
-"""Options by which netconvert reads a map, by the root of its file."""
+NAME_LAST = "name the edge after the merge point as the last one of both"
+MAINLINE, RAMP = 0, 1
+"""Places of the paths in pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +64,7 @@ class RoadNet:
 
     path: Path
     sha256: str
-    net: Any
+    net: SumoNet
 
     @property
     def edges(self) -> list[str]:
@@ -85,6 +82,9 @@ def read_net(path: Path, content: bytes | None = None) -> RoadNet:
         path: the net file.
         content: its unpacked bytes, where they are read already.
 
+    Returns:
+        The net.
+
     Raises:
         UserError: the file cannot be read, is not a SUMO net, or has a missing or wrong value.
     """
@@ -94,10 +94,9 @@ def read_net(path: Path, content: bytes | None = None) -> RoadNet:
         content = read_xml(path, "the net")
     root = parse_xml(content, f"the net {path}", NET_TAGS)
     if root.tag != "net":
-        option = MAP_OPTIONS.get(root.tag)
-        how = f"; make one of it: `netconvert {option} {path} -o NAME.net.xml`"
         raise UserError(
-            f"{path} is not a SUMO net: it does not begin with <net>{how if option else ''}"
+            f"{path} is not a SUMO net: it does not begin with <net>; netconvert makes a net of a "
+            "map (`--osm-files`, `--opendrive-files`)"
         )
     reader = NetReader(withInternal=True)
     _feed(reader, root, path)
@@ -122,32 +121,29 @@ def _feed(reader: Any, element: etree._Element, path: Path) -> None:
         ) from error
 
 
-class _NeverMeetError(UserError):
-    """Two sequences of edges that do not come to one lane."""
-
-
 def find_corridor(
     road_net: RoadNet,
     mainline: Sequence[str],
     ramp: Sequence[str],
     *,
     room_after_m: float = ROOM_AFTER_M,
-    edge_at_m: str | None = None,
     lane_m: Bounds | None = None,
 ) -> Corridor:
     """Find the merge of two sequences of edges in a net.
 
-    Both name the edge on which the paths become one, and may go on after it. Equal sequences are
-    one path.
+    Both name the edge on which the paths become one, and may continue after it. Where the mainline
+    begins with all edges of the ramp both are one path, and M is where the last of these begins.
 
     Args:
         road_net: the net.
         mainline: edges of the mainline.
         ramp: edges of the ramp.
         room_after_m: where the file ends nearer after M, the last lane is continued straight on.
-        edge_at_m: the edge of a single path that begins at M, by default its last one.
         lane_m: where a scenario has its acceleration lane: that of the road ends with it, and may
             begin before it.
+
+    Returns:
+        The corridor.
 
     Raises:
         UserError: an edge is unknown, a sequence is not connected, the paths never meet, or the
@@ -155,11 +151,7 @@ def find_corridor(
     """
     edges = tuple(mainline), tuple(ramp)
     try:
-        try:
-            paths = _paths(road_net, *edges, edge_at_m)
-        except _NeverMeetError as error:
-            raise UserError(f"{error}{_suggestion(road_net, *edges)}") from error
-        return _corridor(road_net, edges, paths, room_after_m, lane_m)
+        return _corridor(road_net, edges, room_after_m, lane_m)
     except UserError as error:
         raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
 
@@ -181,85 +173,91 @@ class _Link(NamedTuple):
 _Edges = tuple[str, ...]
 _Layer = dict[SumoLane, list[_Link]]
 """Lanes of an edge that a path can reach, each with the links that lead to it."""
+_Pieces = tuple[list[Piece], list[Piece]]
+"""Lanes of mainline and ramp."""
 
 
 class _Meeting(NamedTuple):
     """The links by which both paths come to their first common lane."""
 
-    mainline: _Link
-    ramp: _Link
-    drop: _Link | None
-    """The one of them that leaves a lane that ends."""
+    links: tuple[_Link, _Link]
+    ending: int | None
+    """The path of which a lane ends there."""
     place: int
     """Of the edge of the common lane, among the edges that follow on both paths."""
 
 
-class _Paths(NamedTuple):
-    """The lanes of mainline and ramp up to the junction at M, and those of both after it."""
-
-    meeting: _Meeting
-    before: tuple[list[Piece], list[Piece]]
-    onward: list[Piece]
-
-
 def _corridor(
-    road_net: RoadNet,
-    edges: tuple[_Edges, _Edges],
-    paths: _Paths,
-    room_after_m: float,
-    lane_m: Bounds | None,
+    road_net: RoadNet, edges: tuple[_Edges, _Edges], room_after_m: float, lane_m: Bounds | None
 ) -> Corridor:
-    """Return the corridor of two paths."""
-    meeting, before, onward = paths
-    links = meeting.mainline, meeting.ramp
-    junction = _junction(meeting.ramp.source)
-    apart, along = _acceleration_lane(before)
+    """Return the corridor of two sequences of edges."""
+    net = road_net.net
+    for name in chain(*edges):
+        _check_edge(road_net, name)
+    own, tail = _split(*edges)
+    main_layers = _layers(net, own[MAINLINE] + tail, len(own[MAINLINE]))
+    ramp_layers = _layers(net, own[RAMP] + tail, len(own[RAMP]))
+    on_main, on_ramp = len(own[MAINLINE]), len(own[RAMP])
+    meeting = _meeting(net, tail, (main_layers[on_main:], ramp_layers[on_ramp:]))
+    main_link, ramp_link = meeting.links
+    main = _lanes_before(main_layers[: on_main + meeting.place], main_link)
+    ramp = _lanes_before(ramp_layers[: on_ramp + meeting.place], ramp_link)
+    onward = _onward(net, ramp_link.target, tail[meeting.place :])
+    apart, along = _acceleration_lane(main, ramp)
+    lane = _lane_of_road(net, meeting, along, lane_m)
     if lane_m is None:
         begin_m = end_m = 0.0
-        apart = before[0] + [*links[0].via], before[1] + [*links[1].via]
-        side_by_side: tuple[list[Piece], list[Piece]] = [], []
+        apart, along = ([*main, *main_link.via], [*ramp, *ramp_link.via]), ([], [])
+    elif lane is None:
+        raise UserError(
+            "ramp and mainline meet in one point, without a lane of the ramp side by side: leave "
+            "lane_m out"
+        )
     else:
-        begin_m, end_m = _window_m(meeting, _length_m(along[0]), lane_m)
-        side_by_side = along
-        onward = [*meeting.mainline.via, *onward]
+        _check_window(lane, lane_m)
+        begin_m, end_m = lane.begin_m, lane.end_m
+        onward = [*main_link.via, *onward]
     placed = []
-    for own, side in zip(apart, side_by_side, strict=True):
-        pieces = _placed(own, begin_m - _length_m(own))
-        pieces += _placed(side, begin_m, pieces[-1])
+    for own_lanes, side_lanes in zip(apart, along, strict=True):
+        pieces = _placed(own_lanes, begin_m - _length_m(own_lanes))
+        pieces += _placed(side_lanes, begin_m, pieces[-1])
         shared = _placed(_continued(onward, room_after_m - end_m), end_m, pieces[-1])
         placed.append(LanePath((*pieces, *shared)))
-    used = {piece.lane for path in placed for piece in path.pieces}
+    junction = _junction(ramp_link.source)
     return Corridor(
         path=road_net.path,
         sha256=road_net.sha256,
-        mainline_edges=edges[0],
-        ramp_edges=edges[1],
-        mainline=placed[0],
-        ramp=placed[1],
+        mainline_edges=edges[MAINLINE],
+        ramp_edges=edges[RAMP],
+        mainline=placed[MAINLINE],
+        ramp=placed[RAMP],
         junction_type=junction.getType(),
-        junction_id=junction.getID(),
-        mainline_approach=_approach(meeting, links[0], links[1]),
-        ramp_approach=_approach(meeting, links[1], links[0]),
-        lane_drop=meeting.drop is not None,
+        mainline_approach=_approach(junction, meeting, MAINLINE),
+        ramp_approach=_approach(junction, meeting, RAMP),
+        lane_drop=meeting.ending is not None,
         drawn_after_m=end_m + _length_m(onward),
-        surroundings=_surroundings(road_net.net, shared[0].shape[0], used),
+        surroundings=_surroundings(net, shared[0].shape[0], placed),
         lane_m=lane_m and (begin_m, end_m),
-        acceleration_lane=_lane_of_road(road_net.net, meeting, along, end_m if lane_m else None),
+        acceleration_lane=lane,
     )
 
 
-def _surroundings(net: Any, place: Point, used: set[str]) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of other lanes for vehicles that begin or end near a point."""
+def _surroundings(
+    net: SumoNet, place: Point, paths: Sequence[LanePath]
+) -> tuple[tuple[Point, ...], ...]:
+    """Return the shapes of lanes that are not in the paths and begin or end near a point."""
+    used = {piece.lane for path in paths for piece in path.pieces}
     roads: list[tuple[Point, ...]] = []
     internal: list[tuple[Point, ...]] = []
     for edge in net.getEdges(withInternal=True):
         if edge.getFunction() in ("crossing", "walkingarea"):
             continue
+        shapes = internal if edge.isSpecial() else roads
         for index, lane in enumerate(edge.getLanes()):
             ends = lane.getShape3D()[:1] + lane.getShape3D()[-1:]
             is_near = any(math.dist(end, place) <= SURROUNDINGS_M for end in ends)
             if is_near and f"{edge.getID()}_{index}" not in used:
-                (internal if edge.isSpecial() else roads).append(_shape(lane))
+                shapes.append(_shape(lane))
     return (*roads, *internal)
 
 
@@ -271,13 +269,13 @@ def _junction(lane: SumoLane) -> Any:
     return junction
 
 
-def _approach(meeting: _Meeting, link: _Link, other: _Link) -> Approach:
-    """Return how the path of a link comes to the junction, where it meets the other one."""
-    junction = _junction(meeting.ramp.source)
-    if meeting.drop is not None:
-        yields = link is meeting.drop
+def _approach(junction: Any, meeting: _Meeting, path: int) -> Approach:
+    """Return how a path comes to the junction, where it meets the other one."""
+    link, other = meeting.links[path], meeting.links[1 - path]
+    if meeting.ending is not None:
+        yields = path == meeting.ending
     elif junction.getType().startswith("traffic_light"):
-        yields = link is meeting.ramp
+        yields = path == RAMP
     else:
         try:
             yields = junction.forbids(other.connection, link.connection)
@@ -286,38 +284,14 @@ def _approach(meeting: _Meeting, link: _Link, other: _Link) -> Approach:
     return Approach(link.state, yields, link.visibility_m)
 
 
-def _paths(
-    road_net: RoadNet, mainline: _Edges, ramp: _Edges, edge_at_m: str | None = None
-) -> _Paths:
-    """Return the lanes of two sequences of edges, up to where they meet and from there on."""
-    for edge in mainline + ramp:
-        _check_edge(road_net, edge)
-    net = road_net.net
-    (own_main, own_ramp), tail = _split(net, mainline, ramp, edge_at_m)
-    main_layers = _layers(net, own_main + tail, len(own_main))
-    ramp_layers = _layers(net, own_ramp + tail, len(own_ramp))
-    meeting = _meeting(net, tail, main_layers[len(own_main) :], ramp_layers[len(own_ramp) :])
-    before = (
-        _lanes_before(main_layers[: len(own_main) + meeting.place], meeting.mainline),
-        _lanes_before(ramp_layers[: len(own_ramp) + meeting.place], meeting.ramp),
-    )
-    return _Paths(meeting, before, _onward(net, meeting.ramp.target, tail[meeting.place :]))
-
-
 def _check_edge(road_net: RoadNet, name: str) -> None:
     """Raise `UserError` where a net has no such edge, or cars may not drive there."""
     net = road_net.net
     if not net.hasEdge(name) or net.getEdge(name).isSpecial():
-        edges = road_net.edges
-        few = f"it has {', '.join(edges)}" if 0 < len(edges) <= SHOWN_EDGES else ""
-        hint = f"{meant(name, edges, 0.5)}{few}".strip()  # ids of edges are short
+        hint = meant(name, road_net.edges, 0.5).strip()  # ids of edges are short
         raise UserError(f"it has no edge {name}{': ' if hint else ''}{hint}")
-    lanes = _lanes(net.getEdge(name))
-    if not lanes:
+    if not _lanes(net, name):
         raise UserError(f"no lane of edge {name} is open to cars")
-    for lane in lanes:
-        if len(_corners(_piece(lane).shape)) == 1:
-            raise UserError(f"lane {lane.getID()} has no length")
 
 
 def _allows_cars(found: SumoLane | SumoConnection) -> bool:
@@ -325,9 +299,9 @@ def _allows_cars(found: SumoLane | SumoConnection) -> bool:
     return bool(found.allows("passenger") or found.allows("all"))
 
 
-def _lanes(edge: SumoEdge) -> list[SumoLane]:
+def _lanes(net: SumoNet, edge: str) -> list[SumoLane]:
     """Return the lanes of an edge on which cars may drive."""
-    return [lane for lane in edge.getLanes() if _allows_cars(lane)]
+    return [lane for lane in net.getEdge(edge).getLanes() if _allows_cars(lane)]
 
 
 def _shape(lane: SumoLane) -> tuple[Point, ...]:
@@ -341,13 +315,14 @@ def _shape(lane: SumoLane) -> tuple[Point, ...]:
 
 def _piece(lane: SumoLane) -> Piece:
     """Return a lane as a piece of a path, which begins at 0 until it is placed."""
-    shape = _shape(lane)
-    if lane.getLength() <= 0.0 or not shape:
+    shape = _corners(_shape(lane))
+    is_point = len(shape) == 1 and not lane.getEdge().isSpecial()
+    if lane.getLength() <= 0.0 or not shape or is_point:
         raise UserError(f"lane {lane.getID()} has no length")
     return Piece(lane.getID(), 0.0, lane.getLength(), lane.getSpeed(), shape)
 
 
-def _links(net: Any, source: SumoLane, to_edge: str) -> list[_Link]:
+def _links(net: SumoNet, source: SumoLane, to_edge: str) -> list[_Link]:
     """Return the links of a lane to the lanes of an edge, as far as cars may drive there."""
     links = []
     for found in source.getOutgoing():
@@ -358,7 +333,7 @@ def _links(net: Any, source: SumoLane, to_edge: str) -> list[_Link]:
     return links
 
 
-def _via(net: Any, connection: SumoConnection) -> tuple[Piece, ...]:
+def _via(net: SumoNet, connection: SumoConnection) -> tuple[Piece, ...]:
     """Return the internal lanes of a connection; there are two where drivers wait inside."""
     pieces: dict[str, Piece] = {}
     while (name := connection.getViaLaneID()) and name not in pieces:
@@ -373,36 +348,13 @@ def _via(net: Any, connection: SumoConnection) -> tuple[Piece, ...]:
     return tuple(pieces.values())
 
 
-def _edges_after(lane: SumoLane) -> list[str]:
-    """Return the edges to which cars may drive from a lane, other than by turning back."""
-    names = set()
-    for found in lane.getOutgoing():
-        is_open = _allows_cars(found) and _allows_cars(found.getToLane())
-        turns_back = found.getDirection() in ("t", "T")
-        if is_open and not turns_back and not found.getTo().isSpecial():
-            names.add(found.getTo().getID())
-    return sorted(names)
-
-
-def _edges_before(net: Any, edge: str) -> list[str]:
-    """Return the edges from which cars may drive to an edge, other than by turning back."""
-    names = []
-    for source in net.getEdge(edge).getIncoming():
-        if not source.isSpecial() and any(edge in _edges_after(lane) for lane in _lanes(source)):
-            names.append(source.getID())
-    return sorted(names)
-
-
-def _acceleration_lane(
-    before: tuple[list[Piece], list[Piece]],
-) -> tuple[tuple[list[Piece], list[Piece]], tuple[list[Piece], list[Piece]]]:
+def _acceleration_lane(main: list[Piece], ramp: list[Piece]) -> tuple[_Pieces, _Pieces]:
     """Return the lanes of both paths before an acceleration lane, and those side by side along it.
 
     There are none of the second kind where the paths come to M without such a lane. The ramp's get
     the length of the mainline's, from which they differ a little inside of junctions and where a
     net says so: both have one coordinate.
     """
-    main, ramp = before
     on_main, on_ramp = len(main), len(ramp)
     for one, other in zip(_roads(main), _roads(ramp), strict=False):
         main_edge, _, main_index = main[one].lane.rpartition("_")
@@ -410,10 +362,10 @@ def _acceleration_lane(
         if main_edge != ramp_edge or abs(int(main_index) - int(ramp_index)) != 1:
             break
         on_main, on_ramp = one, other
-    along_main, along_ramp = main[on_main:], ramp[on_ramp:]
-    if along_ramp:
-        stretch = _length_m(along_main) / _length_m(along_ramp)
-        along_ramp = [replace(lane, length_m=lane.length_m * stretch) for lane in along_ramp]
+    along_main, along_ramp = main[on_main:], []
+    for lane in ramp[on_ramp:]:
+        stretch = _length_m(along_main) / _length_m(ramp[on_ramp:])
+        along_ramp.append(replace(lane, length_m=lane.length_m * stretch))
     return (main[:on_main], ramp[:on_ramp]), (along_main, along_ramp)
 
 
@@ -423,55 +375,52 @@ def _roads(pieces: list[Piece]) -> list[int]:
 
 
 def _lane_of_road(
-    net: Any, meeting: _Meeting, along: tuple[list[Piece], list[Piece]], end_m: float | None
+    net: SumoNet, meeting: _Meeting, along: _Pieces, lane_m: Bounds | None
 ) -> AccelerationLane | None:
-    """Return the acceleration lane of a road; by default it ends before the junction at M."""
+    """Return the acceleration lane of a road: it ends with that of a scenario, or at the junction.
+
+    None where the paths are not side by side before M, or the lane that ends is the mainline's.
+    """
     main, ramp = along
-    if not ramp or meeting.drop is meeting.mainline:
+    if not ramp or meeting.ending == MAINLINE:
         return None
-    if end_m is None:
-        end_m = -_length_m(meeting.ramp.via)
+    link = meeting.links[RAMP]
+    end_m = lane_m[1] if lane_m else -_length_m(link.via)
     lanes = [net.getLane(piece.lane) for piece in ramp]
-    after = _edges_after(lanes[-1])
+    exits = set()
+    for connection in lanes[-1].getOutgoing():
+        turns_back = connection.getDirection() in ("t", "T")
+        if _allows_cars(connection) and _allows_cars(connection.getToLane()) and not turns_back:
+            exits.add(connection.getTo().getID())
     return AccelerationLane(
         begin_m=end_m - _length_m(main),
         end_m=end_m,
         lanes=tuple(piece.lane for piece in ramp if not piece.is_internal),
         beside=tuple(piece.lane for piece in main if not piece.is_internal),
         is_marked=any(lane.isAccelerationLane() for lane in lanes),
-        exits=tuple(edge for edge in after if edge != meeting.ramp.target.getEdge().getID()),
+        exits=tuple(sorted(exits - {link.target.getEdge().getID()})),
     )
 
 
-def _window_m(meeting: _Meeting, length_m: float, lane_m: Bounds) -> Bounds:
-    """Return begin and end of a lane, if that of a scenario, `lane_m`, is on it."""
-    if meeting.drop is meeting.mainline:
-        raise UserError("the lane that ends is that of the mainline, and lane_m is one of the ramp")
-    if length_m == 0.0:
-        raise UserError(
-            "ramp and mainline meet in one point, without a lane side by side: leave lane_m out"
-        )
+def _check_window(lane: AccelerationLane, lane_m: Bounds) -> None:
+    """Raise `UserError` where the lane of a scenario begins before that of the road."""
     begin_m, end_m = lane_m
-    if begin_m < end_m - length_m:
-        low, high = lane_around_m(length_m)
+    if begin_m < lane.begin_m:
+        low, high = lane_around_m(lane.length_m)
         raise UserError(
             f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, and the acceleration lane "
-            f"is {length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
+            f"is {lane.length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
         )
-    return end_m - length_m, end_m
 
 
-def _split(
-    net: Any, mainline: _Edges, ramp: _Edges, edge_at_m: str | None
-) -> tuple[tuple[_Edges, _Edges], _Edges]:
+def _split(mainline: _Edges, ramp: _Edges) -> tuple[tuple[_Edges, _Edges], _Edges]:
     """Return the edges that each path has for itself, and those that follow on both."""
-    if mainline == ramp and len(ramp) > 1:
-        before = ramp.index(edge_at_m or ramp[-1])
-        return (ramp[:before], ramp[:before]), ramp[before:]
+    if len(ramp) > 1 and mainline[: len(ramp)] == ramp:
+        return (ramp[:-1], ramp[:-1]), mainline[len(ramp) - 1 :]
     common = next((edge for edge in ramp if edge in mainline), None)
     if common is None:
-        raise _NeverMeetError(
-            f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet"
+        raise UserError(
+            f"mainline ({' '.join(mainline)}) and ramp ({' '.join(ramp)}) never meet: {NAME_LAST}"
         )
     # A mainline may go round a ring and come by the edge again.
     on_main = mainline.index(common, 1 if common in mainline[1:] else 0)
@@ -484,124 +433,83 @@ def _split(
                 "the same edges after the merge point"
             )
     if on_main == 0 or on_ramp == 0:
-        free = [name for name in _edges_before(net, common) if name not in mainline + ramp]
         raise UserError(
             f"the {'mainline' if on_main == 0 else 'ramp'} begins with edge {common}, which the "
-            f"other path uses too; name an edge before it: {' or '.join(free) or 'there is none'}"
+            "other path uses too: name an edge before it"
         )
     return (mainline[:on_main], ramp[:on_ramp]), max(tails, key=len)
 
 
-def _suggestion(road_net: RoadNet, mainline: _Edges, ramp: _Edges) -> str:
-    """Return what to name instead of two paths that never meet: a few edges more, if that helps."""
-    mainlines, ramps = _lengthened(road_net.net, mainline), _lengthened(road_net.net, ramp)
-    pairs = [(mainlines[edge], ramps[edge]) for edge in mainlines if edge in ramps]
-    for longer in sorted(pairs, key=lambda pair: (len(pair[0]) + len(pair[1]), pair)):
-        try:
-            meeting = _paths(road_net, *longer).meeting
-        except _NeverMeetError:
-            continue
-        except UserError as error:
-            return f"; {error}"
-        # A lane of the mainline that leads elsewhere does not end.
-        if meeting.drop is not meeting.mainline or not _edges_after(meeting.mainline.source):
-            return f'; name "{" ".join(longer[0])}" and "{" ".join(longer[1])}"'
-    return (
-        f", nor do they within {FOLLOWED_EDGES} edges more: name the edge after the merge point as "
-        "the last one of both"
-    )
-
-
-def _lengthened(net: Any, path: _Edges) -> dict[str, _Edges]:
-    """Return the edges that a path comes to, each with the path that leads there."""
-    reached = dict.fromkeys(path, path)
-    latest = [path] if path else []
-    for _ in range(FOLLOWED_EDGES):
-        longer = []
-        for edges in latest:
-            for lane in _lanes(net.getEdge(edges[-1])):
-                for name in _edges_after(lane):
-                    if name not in reached:
-                        reached[name] = (*edges, name)
-                        longer.append(reached[name])
-        latest = longer
-    return reached
-
-
-def _layers(net: Any, edges: _Edges, common: int) -> list[_Layer]:
+def _layers(net: SumoNet, edges: _Edges, common: int) -> list[_Layer]:
     """Return the lanes that a path can reach on each of its edges.
 
     A lane of its own must lead to edge number `common`; after that its lanes may end.
     """
-    layers: list[_Layer] = [{lane: [] for lane in _lanes(net.getEdge(edges[0]))}]
+    layers: list[_Layer] = [{lane: [] for lane in _lanes(net, edges[0])}]
     for number, (edge, following) in enumerate(pairwise(edges), start=1):
         layer: _Layer = {}
         for lane in layers[-1]:
             for link in _links(net, lane, following):
                 layer.setdefault(link.target, []).append(link)
         if not layer and number <= common:
-            into = [name for name in _edges_before(net, following) if name != edge]
-            hint = f"; name {' or '.join(into)} before it" if into else ""
-            raise UserError(f"edge {edge} does not lead to edge {following}{hint}")
+            raise UserError(f"edge {edge} does not lead to edge {following}: name those in between")
         layers.append(layer)
     return layers
 
 
-def _meeting(net: Any, tail: _Edges, mainline: list[_Layer], ramp: list[_Layer]) -> _Meeting:
+def _meeting(net: SumoNet, tail: _Edges, layers: tuple[list[_Layer], list[_Layer]]) -> _Meeting:
     """Return the meeting of the paths: by connections, or where a lane of one of them ends.
 
     Args:
         net: the net.
         tail: the edges that follow on both paths.
-        mainline: for each of these the lanes that the mainline can reach.
-        ramp: those that the ramp can reach.
+        layers: for each of these the lanes that mainline and ramp can reach.
 
     Raises:
         UserError: they have no lane in common.
     """
     for place, edge in enumerate(tail):
-        for lane in _lanes(net.getEdge(edge)):
-            if lane in mainline[place] and lane in ramp[place]:
-                to_both = [
-                    min(layer[lane], key=_swerve) for layer in (mainline[place], ramp[place])
-                ]
-                return _Meeting(to_both[0], to_both[1], drop=None, place=place)
-        if place + 1 < len(tail) and not mainline[place + 1].keys() & ramp[place + 1].keys():
-            found = _lane_drop(net, mainline[place], ramp[place], tail[place + 1])
+        main, ramp = layers[MAINLINE][place], layers[RAMP][place]
+        for lane in _lanes(net, edge):
+            if lane in main and lane in ramp:
+                links = min(main[lane], key=_swerve), min(ramp[lane], key=_swerve)
+                return _Meeting(links, None, place)
+        if place > 0:
+            found = _lane_drop(net, (layers[MAINLINE][place - 1], layers[RAMP][place - 1]), edge)
             if found is not None:
-                return _Meeting(*found, place=place + 1)
-    raise _NeverMeetError(
-        f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}"
+                return _Meeting(*found, place)
+    raise UserError(
+        f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}: {NAME_LAST}"
     )
 
 
 def _lane_drop(
-    net: Any, mainline: _Layer, ramp: _Layer, following: str
-) -> tuple[_Link, _Link, _Link] | None:
+    net: SumoNet, layers: tuple[_Layer, _Layer], following: str
+) -> tuple[tuple[_Link, _Link], int] | None:
     """Return the links of both paths where a lane of one ends next to a lane of the other.
 
-    The third one is the link, of these two, of the path whose lane ends. `following` is the edge
-    after that on which it ends; None where no such lane ends.
+    The number is that of the path whose lane ends. `following` is the edge after that on which it
+    ends; None where no such lane ends.
     """
-    for ending, going in ((ramp, mainline), (mainline, ramp)):
-        for last, neighbour in product(ending, going):
+    for ending in (RAMP, MAINLINE):
+        for last, neighbour in product(layers[ending], layers[1 - ending]):
             onward = _links(net, neighbour, following)
             is_next = abs(last.getIndex() - neighbour.getIndex()) == 1
             if is_next and onward and not _links(net, last, following):
-                drop = _drop(last, onward[0])
-                return (onward[0], drop, drop) if ending is ramp else (drop, onward[0], drop)
+                drop = _change(last, onward[0])
+                return ((onward[0], drop) if ending == RAMP else (drop, onward[0])), ending
     return None
 
 
-def _drop(last: SumoLane, neighbour: _Link) -> _Link:
+def _change(last: SumoLane, neighbour: _Link) -> _Link:
     """Return the link from a lane that ends to the target of a link of the lane next to it."""
-    via: tuple[Piece, ...] = ()
-    if neighbour.via:
+    via = list(neighbour.via[:1])
+    if via:
         ends = last.getShape3D()[-1], neighbour.target.getShape3D()[0]
-        via = (replace(neighbour.via[0], length_m=_length_m(neighbour.via), shape=ends),)
+        via = [replace(via[0], length_m=_length_m(neighbour.via), shape=_corners(ends))]
     state = "Z" if _junction(last).getType() == "zipper" else "m"
     # A driver on it sees all along the lane next to it.
-    return _Link(last, neighbour.target, via, state, visibility_m=last.getLength())
+    return _Link(last, neighbour.target, tuple(via), state, visibility_m=last.getLength())
 
 
 def _swerve(link: _Link) -> tuple[int, int]:
@@ -621,11 +529,11 @@ def _lanes_before(layers: list[_Layer], last: _Link) -> list[Piece]:
     return pieces
 
 
-def _onward(net: Any, lane: SumoLane, edges: _Edges) -> list[Piece]:
+def _onward(net: SumoNet, lane: SumoLane, edges: _Edges) -> list[Piece]:
     """Return the lanes from one on along edges, the first of which it is on, as far as they go."""
     longest: list[Piece] = []
     links = _links(net, lane, edges[1]) if len(edges) > 1 else []
-    for link in sorted(links, key=lambda link: _swerve(link)[0]):
+    for link in sorted(links, key=_swerve):
         pieces = [*link.via, *_onward(net, link.target, edges[1:])]
         longest = max(longest, pieces, key=len)
     return [_piece(lane), *longest]
@@ -637,7 +545,7 @@ def _continued(pieces: list[Piece], length_m: float) -> list[Piece]:
     if missing_m <= 0.0:
         return pieces
     last = pieces[-1]
-    before, end = _corners(last.shape)[-2:]
+    before, end = last.shape[-2:]
     # As SUMO draws the lane: a metre of it is this long in the plane.
     drawn_m = missing_m * sum(math.dist(a, b) for a, b in pairwise(last.shape)) / last.length_m
     share = drawn_m / math.dist(before, end)
@@ -654,7 +562,7 @@ def _placed(pieces: Iterable[Piece], start_m: float, before: Piece | None = None
     """Return pieces one after the other from a coordinate on; `before` is the piece before them."""
     placed = []
     for piece in pieces:
-        shape = _corners(piece.shape)
+        shape = piece.shape
         if len(shape) == 1 and before is not None:
             # Drawn as a point, as some lanes inside of junctions: it points where the last one did.
             (x0, y0, _), (x1, y1, _) = before.shape[-2:]

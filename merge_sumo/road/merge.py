@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
+from merge_sumo.errors import UserError
 from merge_sumo.files import resource
 from merge_sumo.metrics.bodies import CentreLines
-from merge_sumo.road.corridor import Corridor, LanePath
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.road.xml_input import read_xml
-from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
 
 MAINLINE_EDGES = ("main_in", "main_out")
@@ -37,7 +37,7 @@ def road_of(
 ) -> Corridor:
     """Return the merge of two sequences of edges in a net file, by default the shipped one.
 
-    What is searched once is kept until the file changes.
+    A road that was found is kept until the file changes.
 
     Args:
         net: the net file.
@@ -45,6 +45,9 @@ def road_of(
         ramp: edges of the ramp in driving order, past M.
         room_after_m: where the file ends nearer after M, the road goes straight on.
         lane_m: begin and end of the acceleration lane of a scenario.
+
+    Returns:
+        The road.
 
     Raises:
         UserError: the file is not a SUMO net, or has no such merge.
@@ -62,13 +65,23 @@ def road_of(
 def road_for(scenario: Scenario) -> Corridor:
     """Return the road of a scenario.
 
-    Raises `UserError` where there is no such merge, or not room enough for its vehicles.
+    Raises:
+        UserError: there is no such merge, or a path is shorter before M than its farthest start.
     """
-    # Where a path says nothing of folders, the net is one that the package brings.
+    # A net without a folder is one of the package.
     net = None if scenario.net is None else resource("sumo_net") / scenario.net
-    edges = scenario.mainline, scenario.ramp
-    road = road_of(net, *edges, scenario.room_after_m, scenario.lane_m)
-    road.check_room(scenario.farthest_start_m, -scenario.x_vut0_m)
+    paths = scenario.mainline, scenario.ramp
+    road = road_of(net, *paths, scenario.room_after_m, scenario.lane_m)
+    for edges, path, needed_m in (
+        (scenario.mainline, road.mainline, scenario.farthest_start_m),
+        (scenario.ramp, road.ramp, -scenario.x_vut0_m),
+    ):
+        if path.before_m < needed_m:
+            raise UserError(
+                f"{' '.join(edges)} begins {path.before_m:.1f} m before the merge point, and a "
+                f"vehicle starts {needed_m:g} m before it: begin with an edge further upstream, or "
+                "start nearer"
+            )
     return road
 
 
@@ -79,15 +92,6 @@ def centre_lines(road: Corridor) -> CentreLines:
     """Return the centre lines of both paths of a road; they are found once in a process."""
     key = road.sha256, road.mainline_edges, road.ramp_edges, road.lane_m
     if key not in _centre_lines:
-        _centre_lines[key] = CentreLines.of(_line(road.mainline), _line(road.ramp))
+        corners = np.array(road.mainline.corners()), np.array(road.ramp.corners())
+        _centre_lines[key] = CentreLines.of(*corners)
     return _centre_lines[key]
-
-
-def _line(path: LanePath) -> FloatArray:
-    return np.array(
-        [
-            [piece.start_m + share * piece.length_m, x, y]
-            for piece in path.pieces
-            for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True)
-        ]
-    )

@@ -145,9 +145,8 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
     return find_corridor(
         net,
         main + lane + out,
-        (main if is_one_path else ramp) + lane + out,
+        main + out[:1] if is_one_path else ramp + lane + out,
         room_after_m=0.0,
-        edge_at_m=out[0] if out else None,
         lane_m=lane_m and (lane_m[1], lane_m[1]),
     )
 

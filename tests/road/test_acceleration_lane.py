@@ -1,4 +1,4 @@
-"""Acceleration lanes: found beside the mainline, as a scenario says, and in a new scenario."""
+"""Acceleration lanes: of a road, of a scenario, and in a new scenario."""
 
 from __future__ import annotations
 
@@ -35,16 +35,17 @@ def road(tmp_path_factory):
     return get
 
 
-class TestTheShippedRoad:
-    def test_has_m_at_a_share_of_035_of_200_m(self, road):
-        us23 = road("us23-lane")
-        assert us23.lane_m == (-70.0, 130.0)
-        names = ("ramp_0", -425.0), ("lane_0", -70.0), ("main_out_0", 130.0)
-        assert tuple((piece.lane, piece.start_m) for piece in us23.ramp.pieces) == names
-        names = ("main_in_0", -1000.0), ("lane_1", -70.0), ("main_out_0", 130.0)
-        assert tuple((piece.lane, piece.start_m) for piece in us23.mainline.pieces) == names
-        assert us23.lane_point(0.0, on_ramp=False) == ("lane_1", 70.0, 0.0, 0.0, 90.0)
-        assert us23.lane_point(0.0, on_ramp=True) == ("lane_0", 70.0, 0.0, -3.2, 90.0)
+def test_the_shipped_road_has_m_at_a_share_of_035_of_200_m(road):
+    us23 = road("us23-lane")
+    assert us23.lane_m == (-70.0, 130.0)
+    for path, lanes, starts_m in (
+        (us23.ramp, ["ramp_0", "lane_0", "main_out_0"], [-425.0, -70.0, 130.0]),
+        (us23.mainline, ["main_in_0", "lane_1", "main_out_0"], [-1000.0, -70.0, 130.0]),
+    ):
+        assert [piece.lane for piece in path.pieces] == lanes
+        assert path.starts_m == starts_m
+    assert us23.lane_point(0.0, on_ramp=False) == ("lane_1", 70.0, 0.0, 0.0, 90.0)
+    assert us23.lane_point(0.0, on_ramp=True) == ("lane_0", 70.0, 0.0, -3.2, 90.0)
 
 
 class TestTheWindow:
@@ -62,21 +63,11 @@ class TestTheWindow:
             main, ramp = (own.lane_point(x_m, on_ramp=on_ramp) for on_ramp in (False, True))
             assert np.hypot(main.x_m - ramp.x_m, main.y_m - ramp.y_m) == pytest.approx(3.2, abs=0.1)
 
-    @pytest.mark.parametrize(
-        ("lane_m", "said"),
-        [
-            (
-                (-150.0, 130.0),
-                r"is -150 to 130, 280 m, .* 215\.4 m long: write lane_m = \[-75\.4, 139\.9\]$",
-            ),
-            ((-1.0, 400.0), r"is -1 to 400, 401 m, .* write lane_m = \[-75\.4, 139\.9\]$"),
-        ],
-    )
-    def test_that_is_longer_than_the_lane_is_refused(self, tmp_path, lane_m, said):
+    def test_that_is_longer_than_the_lane_is_refused(self, tmp_path):
         net = read_net(lane_drop(tmp_path))
-        with pytest.raises(UserError, match=said) as error:
-            find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=lane_m)
-        assert "\n" not in str(error.value)
+        said = r"is -150 to 130, 280 m, .* 215\.4 m long: write lane_m = \[-75\.4, 139\.9\]$"
+        with pytest.raises(UserError, match=said):
+            find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=(-150.0, 130.0))
 
     def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
         build, mainline, ramp = FOREIGN["priority"]
@@ -113,9 +104,8 @@ class TestAScenario:
         checked = api.check_scenario(scenario)
         assert checked.record["warnings"] == []
         picture = (tmp_path / "mine.svg").read_text()
-        assert all(
-            f">{name}</text>" in picture for name in ("VUT", "POV", "M", "gore", "end of lane")
-        )
+        for name in ("VUT", "POV", "M", "gore", "end of lane"):
+            assert f">{name}</text>" in picture
 
     @pytest.mark.parametrize(
         ("length_m", "kind", "lane_m"),

@@ -1,9 +1,12 @@
 """Merges in nets that are not ours: found, drawn where SUMO draws them, and driven by eq. (4)."""
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import pytest
 from support.foreign_nets import FOREIGN, edge, lane, node, plain, straight
@@ -11,14 +14,10 @@ from support.foreign_nets import FOREIGN, edge, lane, node, plain, straight
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import LanePath, Piece
 from merge_sumo.road.finder import RoadNet, find_corridor, read_net
+from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.world import World
-
-
-@pytest.fixture(scope="module")
-def straight_net(tmp_path_factory) -> RoadNet:
-    return read_net(straight(tmp_path_factory.mktemp("net"), "priority"))
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -92,28 +91,28 @@ def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):
 
 
 def test_a_start_before_the_path_is_refused(corridor):
-    road = corridor("priority")
-    road.check_room(mainline_m=340.0, ramp_m=182.0)
-    with pytest.raises(UserError, match=r"ramp \(r0 r1 out\) begins 505.9 m before .* further up"):
-        road.check_room(mainline_m=340.0, ramp_m=600.0)
+    with pytest.raises(UserError, match=r"ramp main_out begins 425.0 m before .* further upstream"):
+        road_for(replace(US23, x_vut0_m=-600.0))
     with (
-        World(1, road, scenario=US23) as world,
+        World(1, corridor("priority"), scenario=US23) as world,
         pytest.raises(UserError, match=r"begins 505\.94 m before"),
     ):
         world.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
+
+
+@pytest.fixture(scope="module")
+def straight_net(tmp_path_factory) -> RoadNet:
+    return read_net(straight(tmp_path_factory.mktemp("net"), "priority"))
 
 
 @pytest.mark.parametrize(
     ("mainline", "ramp", "message"),
     [
         ("in out", "r9 out", "has no edge r9: did you mean r[01] or r[01]"),
-        ("in :m_0", "r1 out", "has no edge :m_0"),
-        ("in out", "r1", 'never meet; name "in out" and "r1 out"'),
-        ("in", "r0", 'never meet; name "in out" and "r0 r1 out"'),
-        ("out", "r1", "mainline begins with edge out, .* uses too; name an edge before it: in$"),
-        ("", "r1 out", "never meet, nor do they within 5 edges more"),
-        ("in r1 out", "r0 out", "edge in does not lead to edge r1; name r0 before it"),
-        ("in out", "out out2", "ramp begins with edge out.*before it: r1$"),
+        ("in out", ":m_0 out", "has no edge :m_0"),
+        ("in", "r0", "never meet: name the edge after the merge point as the last one of both"),
+        ("out out2", "r1 out", "the mainline begins with edge out, .*: name an edge before it"),
+        ("in r1 out", "r0 out", "edge in does not lead to edge r1"),
         ("in out out2", "r1 out in", "after edge out the mainline goes to out2 and the ramp to"),
     ],
 )
@@ -124,39 +123,22 @@ def test_edges_without_a_merge_are_refused_in_one_sentence(straight_net, mainlin
     assert str(straight_net.path) in str(error.value)
 
 
-@pytest.fixture(scope="module")
-def weaving_net(tmp_path_factory) -> RoadNet:
-    """An acceleration lane over two edges, with an exit and with places to turn back."""
+def test_an_acceleration_lane_over_two_edges_with_an_exit(tmp_path):
     net = plain(
-        tmp_path_factory.mktemp("net"),
+        tmp_path,
         node("a", -800, 0) + node("n", -300, 0) + node("k", 0, 0) + node("d", 200, 0)
-        + node("b", 700, 0) + node("r", -500, -90) + node("x", 100, -100),
+        + node("b", 700, 0) + node("r", -500, -90) + node("x", 300, -100),
         edge("in", "a", "n", 2, 36, priority=9) + edge("acc", "n", "k", 3, 36, priority=9)
         + edge("mid", "k", "d", 3, 36, priority=9) + edge("out", "d", "b", 2, 36, priority=9)
-        + edge("back", "k", "n", 1, 36) + edge("exit", "k", "x", 1, 20)
-        + edge("ramp", "r", "n", 1, 22, priority=3),
+        + edge("exit", "d", "x", 1, 20) + edge("ramp", "r", "n", 1, 22, priority=3),
         lane("in", 0, "acc", 1) + lane("in", 1, "acc", 2) + lane("ramp", 0, "acc", 0)
-        + lane("mid", 1, "out", 0) + lane("mid", 2, "out", 1),
+        + lane("mid", 0, "exit", 0) + lane("mid", 1, "out", 0) + lane("mid", 2, "out", 1),
     )  # fmt: skip
-    assert net.read_text().count('dir="t"') == 4
-    return read_net(net)
-
-
-@pytest.mark.parametrize(
-    ("mainline", "ramp", "message"),
-    [
-        ("in", "ramp", 'never meet; name "in acc mid out" and "ramp acc mid out"'),
-        ("in acc", "ramp acc", 'of edge acc; name "in acc mid out" and "ramp acc mid out"'),
-        ("back acc", "ramp acc", "end of edge acc, nor do they within 5 edges more"),
-    ],
-)
-def test_suggested_edges_lead_to_a_merge(weaving_net, mainline, ramp, message):
-    with pytest.raises(UserError, match=message):
-        find_corridor(weaving_net, mainline.split(), ramp.split())
-    road = find_corridor(weaving_net, ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
-    lane = road.acceleration_lane
-    assert lane is not None
-    assert (lane.lanes, lane.exits) == (("acc_0", "mid_0"), ())
+    with pytest.raises(UserError, match="no lane in common up to the end of edge mid"):
+        find_corridor(read_net(net), ["in", "acc", "mid"], ["ramp", "acc", "mid"])
+    road = find_corridor(read_net(net), ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
+    assert road.acceleration_lane.lanes == ("acc_0", "mid_0")
+    assert road.acceleration_lane.exits == ("exit",)
 
 
 def edited(old: str, new: str):
@@ -171,11 +153,9 @@ def edited(old: str, new: str):
     ("edit", "message"),
     [
         (lambda text: text[:500], "not readable XML"),
-        (lambda text: "<routes/>", "is not a SUMO net: it does not begin with <net>"),
-        (lambda text: "<osm/>", "make one of it: `netconvert --osm-files .* -o NAME.net.xml`"),
+        (lambda text: "<osm/>", "is not a SUMO net: .* netconvert makes a net of a map"),
         (lambda text: "<net/>", "<net> in line 1 has a missing or wrong value .*version"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "r1_0 has nan, not within"),
-        (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="0"'), "r1_0 has no length"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="1,1 1,1"'), "r1_0 has no length"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="1,1 9e9,1"'), "not within 2e.07"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="here"'), "<lane> in line .*'here'"),
@@ -183,7 +163,7 @@ def edited(old: str, new: str):
         (edited(r'(<connection from="r1" [^>]*)via="[^"]*"', r'\1via=":x_0"'), "over lane :x_0"),
         (
             edited(r'<connection from="r1" [^>]*/>', ""),
-            "edge r1 does not lead to edge out; name in",
+            "edge r1 does not lead to edge out",
         ),
         (edited('(<edge id="r1" .*)to="m"', r"\1"), "no junction at the end of lane r1_0"),
         (edited('(<junction id="m" .*) x="[^"]*"', r'\1 x="far"'), "<junction> in line .*'far'"),
