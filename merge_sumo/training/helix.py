@@ -137,8 +137,9 @@ def train_library(
                 )
         for name, network, seconds in _train_in_parallel(folder, tasks, on_progress):
             _keep(folder, name, network, {**plans[name], "training_s": round(seconds, 1)})
-        for name in plans:
-            entry = read_manifest(folder)[name]
+        for name, entry in read_manifest(folder).items():
+            if name not in plans:
+                continue
             if "check" in entry:
                 on_done(name, "there already")
                 continue
