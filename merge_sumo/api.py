@@ -51,7 +51,7 @@ from merge_sumo.analysis.share import note_shares
 from merge_sumo.analysis.stress import STRESS, StressResult
 from merge_sumo.analysis.truth import TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
-from merge_sumo.campaigns.again import call_again
+from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, run_campaign
 from merge_sumo.campaigns.plan import (
     changed_scenario,
@@ -108,7 +108,7 @@ from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.workers import AnyWorkers, Workers, open_workers
+from merge_sumo.workers import open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
@@ -285,8 +285,8 @@ def export(config: c.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
     indices = config.indices
     wanted = [indices] if isinstance(indices, int) else list(indices or ())
-    loaded = campaign_of(config.run).run
-    return export_cases(loaded, wanted, config.file_format, path_of(config.out))
+    run = campaign_of(config.run).run
+    return export_cases(run, wanted, config.file_format, path_of(config.out))
 
 
 def report(run: c.AnyRun) -> Shown:
@@ -583,9 +583,15 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
+    workers = where.workers
+    if workers is None and settings.cases <= FEW_CASES and not settings.may_vary:
+        workers = 1
     try:
-        workers = _opened_workers(settings, plan, where.workers)
-        with workers, bars, RunningReport(folder) as report:
+        with (
+            open_workers(plan.workers(workers)) as available,
+            bars,
+            RunningReport(folder) as report,
+        ):
             begun_s = perf_counter()
             done = run_campaign(
                 settings,
@@ -593,46 +599,42 @@ def run_and_report(
                 folder,
                 (bars.ended, report.rewrite, on_cases),
                 resumes=resumes,
-                workers=workers,
+                workers=available,
                 begin=partial(bars.begin, title),
             )
             result = CampaignRun(done, config.gates)
             plan = replace(plan, against=None)
             on_part = partial(bars.counted, "careful drivers", unit="failures")
-            known = avoidance(done, plan, workers=workers, check=check, on_part=on_part)
+            known = avoidance(done, plan, workers=available, check=check, on_part=on_part)
             if known:
                 AVOIDANCE.write_lines(folder, known)
             on_part = partial(bars.counted, "uniform starts", unit="cases")
-            note_shares(done, plan, workers, perf_counter() - begun_s, check, on_part)
+            note_shares(done, plan, available, perf_counter() - begun_s, check, on_part)
             note_explanation(done, plan, check)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
-        _note_how_to_resume(stop, settings, folder, where)
+        if folder.exists():
+            link_latest(folder)
+            stop.add_note(f"go on with: {_resumption(settings, folder, where, config)}")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
 
 
-def _opened_workers(
-    settings: CampaignSettings, plan: SimulationPlan, requested: AnyWorkers
-) -> Workers:
-    """Return the workers of a campaign: by default one a core, or one where others do not pay."""
-    if requested is None and settings.cases <= FEW_CASES and not settings.may_vary:
-        requested = 1
-    return open_workers(plan.workers(requested))
-
-
-def _note_how_to_resume(
-    stop: BaseException, settings: CampaignSettings, folder: Path, where: c.Execution
-) -> None:
-    """Add the command that resumes a campaign to the exception that stopped it."""
-    if folder.exists():
-        link_latest(folder)
-        address = {"workers": where.workers} if isinstance(where.workers, str) else {}
-        command = call_again("resume", folder, asdict(settings), **address)
-        stop.add_note(f"stopped; go on with {command}")
+def _resumption(
+    settings: CampaignSettings, folder: Path, where: c.Execution, config: c.CampaignCalls
+) -> str:
+    """Return the command that continues a campaign; gates and files are not among its settings."""
+    options: dict[str, Any] = {}
+    if config.gates:
+        options["gates"] = list(config.gates)
+    if config.junit is not None:
+        options["junit"] = config.junit
+    if isinstance(where.workers, str):
+        options["workers"] = where.workers
+    return again("resume", folder, asdict(settings), **options)
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:

@@ -19,7 +19,6 @@ import merge_sumo as ms
 from merge_sumo import config as c
 from merge_sumo.console import (
     flag_of,
-    names_of_samplers,
     notices_printed,
     prepare_streams,
     print_json,
@@ -29,10 +28,10 @@ from merge_sumo.console import (
     stoppable,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.files import dated
 from merge_sumo.interrupt import Stopped, stopping_in_order
 from merge_sumo.limits import check_limits, exhausted
-from merge_sumo.printable import quoted
+from merge_sumo.printable import either, quoted
+from merge_sumo.samplers.registry import SAMPLERS
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection
@@ -71,18 +70,6 @@ FIELDS: Mapping[str, Parameter] = {
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
     Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
 )
-GONE: Mapping[str, str] = {
-    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
-    "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
-    "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
-    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
-    "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
-    "stress": "`merge-sumo rerun RUN --stress` does it",
-    "repair": "`examples/repair.py`, in a checkout, searches by optuna and `merge_sumo.rerun`",
-    "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
-    "bounds how much of the pool can fail",
-}
-"""What replaces a command of an earlier version, by its name."""
 FAULT = 70
 """Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
 
@@ -112,7 +99,7 @@ class Commands(App):
             more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
             more = Parameter.combine(more, FIELDS.get(name))
             if name == "sampler":  # installed packages add some
-                text = f"Sampler that proposes the cases: {names_of_samplers()}."
+                text = f"Sampler that proposes the cases: {either(SAMPLERS)}."
                 more = Parameter.combine(more, Parameter(help=text))
             for kind, group in GROUPS.items():
                 if argument.keys and name in kind.__annotations__:
@@ -206,31 +193,15 @@ def campaign(
 ) -> int:
     if resume is not None and out is not None:
         raise UserError("--resume names the folder: leave --out away")
-    folder = resume or out or dated(vut)
-
-    def how_to_go_on() -> str | None:
-        return _how_to_go_on(folder, config) if folder.exists() else None
-
-    with stoppable(how_to_go_on) as check:
+    with stoppable() as check:
         if resume is None:
-            run = ms.campaign(vut, **vars(config), out=folder, check=check)
+            run = ms.campaign(vut, **vars(config), out=out, check=check)
         else:
-            run = ms.resume(folder, **vars(config), vut=vut or None, check=check)
+            run = ms.resume(resume, **vars(config), vut=vut or None, check=check)
     code = print_result(run, json)
     for remark in run.remarks():
         say(remark)
     return code
-
-
-def _how_to_go_on(folder: Path, config: c.CampaignOptions) -> str:
-    """Return the command that continues, with the options that are not settings of the campaign."""
-    words = [ms.open_run(folder).go_on]
-    words += [f"--gate {quoted(gate)}" for gate in config.gates]
-    if config.junit is not None:
-        words.append(f"--junit {quoted(config.junit)}")
-    if isinstance(config.workers, str):
-        words.append(f"--workers {quoted(config.workers)}")
-    return f"go on with: {' '.join(words)}"
 
 
 @command(c.CaseOptions, SEARCH)
@@ -397,8 +368,6 @@ def execute(words: Sequence[str]) -> int:
     Raises:
         UserError: for bad use.
     """
-    if words and words[0] in GONE:
-        raise UserError(f"the command {words[0]} is gone: {GONE[words[0]]}")
     try:
         with notices_printed():
             return app(words) or 0

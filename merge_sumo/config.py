@@ -666,5 +666,8 @@ def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
 
 def changed(config: object, kind: type[Any]) -> dict[str, Any]:
     """Return the same, of the fields that differ from their defaults."""
-    default = {one.name: one.default for one in fields(kind)}
-    return {name: x for name, x in values_of(config, kind).items() if x != default[name]}
+    found = values_of(config, kind)
+    for field in fields(kind):
+        if found[field.name] == field.default:
+            del found[field.name]
+    return found

@@ -14,13 +14,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
 from io import TextIOWrapper
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from merge_sumo import config
 from merge_sumo.errors import Notice, UserError, WorkersLostError
 from merge_sumo.interrupt import Interrupt, Stopped
-from merge_sumo.printable import either, printable
-from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.printable import printable
 
 if TYPE_CHECKING:
     from merge_sumo.result import Result
@@ -104,11 +103,6 @@ def _with_flags(sentence: str) -> str:
     return re.sub(r"`(\w+)`", in_place, sentence)
 
 
-def names_of_samplers() -> str:
-    """Return the names of the samplers, those of installed packages included, as help has them."""
-    return either(SAMPLERS)
-
-
 def print_json(record: dict[str, Any]) -> None:
     """Print a JSON object in one line."""
     show(json.dumps(record, allow_nan=False))
@@ -134,11 +128,10 @@ def print_result(result: Result, as_json: bool, **paths: object) -> int:
 
 
 @contextmanager
-def stoppable(how_to_go_on: Callable[[], str | None]) -> Iterator[Callable[[], None]]:
+def stoppable() -> Iterator[Callable[[], None]]:
     """Yield a `check` for a campaign: after Ctrl-C the running batch ends, and a sentence follows.
 
-    Args:
-        how_to_go_on: returns the sentence; None where nothing was written.
+    The sentence is a note of the exception: how to continue.
 
     Raises:
         UserError: where the cluster of the workers is gone.
@@ -146,13 +139,12 @@ def stoppable(how_to_go_on: Callable[[], str | None]) -> Iterator[Callable[[], N
     try:
         with Interrupt("finishing the running batch; once more stops at once") as interrupt:
             yield interrupt.check
-    except Stopped:
-        sentence = how_to_go_on()
-        say(f"stopped; {sentence or 'before the first case; nothing was written'}")
+    except Stopped as stopped:
+        notes = getattr(stopped, "__notes__", ["before the first case; nothing was written"])
+        say("; ".join(["stopped", *notes]))
         raise
     except WorkersLostError as lost:
-        sentence = how_to_go_on()
-        raise UserError(f"{lost}; {sentence}" if sentence else str(lost)) from lost
+        raise UserError("; ".join([str(lost), *getattr(lost, "__notes__", ())])) from lost
 
 
 @contextmanager
@@ -163,17 +155,12 @@ def notices_printed() -> Iterator[None]:
         show_warning = warnings.showwarning
 
         def print_notice(
-            message: Warning | str,
-            category: type[Warning],
-            filename: str,
-            lineno: int,
-            file: TextIO | None = None,
-            line: str | None = None,
+            message: Warning | str, category: type[Warning], *place: Any, **options: Any
         ) -> None:
             if issubclass(category, Notice):
                 say(f"note: {message}")
             else:
-                show_warning(message, category, filename, lineno, file, line)
+                show_warning(message, category, *place, **options)
 
         warnings.showwarning = print_notice
         yield

@@ -91,7 +91,9 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
         raise UserError(f"{option} is {str(path)!r}: no file can have that name") from error
     except OSError as error:
         raise cannot_write(path, error) from error
-    parent = next((p for p in path.parents if os.path.lexists(p)), path.parent)
+    parent = path.parent
+    while not os.path.lexists(parent) and parent != parent.parent:
+        parent = parent.parent
     if not parent.is_dir():
         raise UserError(f"cannot write {path}: {parent} is not a folder")
     try:
@@ -149,12 +151,11 @@ def make_folder(path: Path, option: str = "`out`", *, exist_ok: bool = False) ->
     Raises:
         UserError: it exists or cannot be made.
     """
+    if exist_ok and path.name not in ("", "..") and path.is_dir():
+        return
+    check_new(path, option)
     try:
-        if not (exist_ok and path.name not in ("", "..") and path.is_dir()):
-            check_new(path, option)
-            path.mkdir(parents=True)
-    except FileExistsError as error:
-        raise _exists(path, option) from error
+        path.mkdir(parents=True)
     except OSError as error:
         raise cannot_write(path, error) from error
 

@@ -56,21 +56,6 @@ class Registry(Mapping[str, T], Generic[T]):
         for name, item in ours.items():
             self._ours[name] = EntryPoint(name, item, group) if isinstance(item, str) else item
 
-    def register(self, name: str, item: T) -> T:
-        """Add an object in this process; `UserError` where the name is taken.
-
-        Processes that this one starts do not know it: an entry point reaches them, too.
-        """
-        if name in self:
-            raise UserError(f"the {self.noun} {name!r} is registered already: choose another name")
-        self._ours[name] = self._checked(name, item, "this process")
-        return item
-
-    @property
-    def ours(self) -> frozenset[str]:
-        """The names of this package."""
-        return frozenset(self._ours)
-
     @property
     def packages(self) -> list[str]:
         """The installed packages that add to it, in the order of their names."""
@@ -103,15 +88,12 @@ class Registry(Mapping[str, T], Generic[T]):
         if not isinstance(entry, EntryPoint):
             return entry
         try:
-            item = entry.load()
+            item: T = entry.load()
         except (Exception, SystemExit) as error:
             raise UserError(
-                f"the {self.noun} {entry.name!r} of {package} cannot be loaded from "
-                f"{entry.value}: {type(error).__name__}: {error}"
+                f"the {self.noun} {name!r} of {package} cannot be loaded from {entry.value}: "
+                f"{type(error).__name__}: {error}"
             ) from error
-        return self._checked(name, item, package)
-
-    def _checked(self, name: str, item: T, package: str) -> T:
         if not self._accepts(item):
             raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
         own = getattr(item, "name", name)

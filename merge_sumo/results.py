@@ -11,7 +11,6 @@ from typing import Any
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.analysis.share import SHARES
-from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
 from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.config import AnyRun
@@ -237,11 +236,6 @@ class CampaignRun(Result):
             *transitions(self.against.steps[0]),
             f"both motions in one picture: {self.folder / AGAINST_PAGE}",
         ]
-
-    @property
-    def go_on(self) -> str:
-        """The command that continues the campaign; a call of Python where an object drives."""
-        return again("resume", self.folder, self.settings)
 
     def remarks(self) -> list[str]:
         """Return what decided whether the campaign passed: the gates, and whether it tested."""

@@ -28,7 +28,7 @@ import numpy as np
 from bench_record import add_record_option, append_record
 from scipy.spatial import cKDTree
 
-from merge_sumo.campaigns.campaign import FIRST_BATCH, controller_model_of
+from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -117,9 +117,8 @@ class Versions:
             controller_model_of(self.old, settings.pool, settings.seed),
         )
         sampler = make_sampler(settings.sampler, settings.pool, seed, models)
-        young = FIRST_BATCH * len(settings.levels) if sampler.uses_predictions else None
         groups: Groups = []
-        SearchLoop(sampler, self.new, cases, first=young).run(groups.extend)
+        SearchLoop(sampler, self.new, cases).run(groups.extend)
         broke = [
             one.outcome.case
             for one in chain.from_iterable(groups)

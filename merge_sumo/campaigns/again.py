@@ -14,11 +14,10 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.controllers.in_memory import names_code
-from merge_sumo.controllers.kinds import parse
+from merge_sumo.controllers.kinds import parse, runs_code
 from merge_sumo.controllers.python import object_of
 from merge_sumo.controllers.signatures import is_code
-from merge_sumo.controllers.spec import HERE, PYTHON
+from merge_sumo.controllers.spec import HERE, PYTHON, ControllerSpec
 from merge_sumo.printable import quoted
 from merge_sumo.road.scenario_file import spoken_name
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -27,7 +26,7 @@ CONTROLLERS = ("vut", "pov", "against")
 OPTIONS = {"run": ("run", "case"), "resume": ("campaign", "resume")}
 """Verbs of a recorded campaign that are a command with an option."""
 
-Argument = str | Path | int | float | Sequence[int] | Mapping[str, float]
+Argument = str | Path | int | float | Sequence[int | str] | Mapping[str, float]
 
 
 def again(
@@ -42,19 +41,13 @@ def again(
         arguments: further arguments after the folder.
         options: options by keyword; a controller replaces the recorded one.
     """
-    return command(verb, folder, *arguments, **(options | _named(verb, record) | options))
-
-
-def call_again(verb: str, folder: Path, record: Mapping[str, Any], **options: Argument) -> str:
-    """Return the call in Python of a verb for a recorded campaign.
-
-    Args:
-        verb: name of a function of the API.
-        folder: folder of the campaign.
-        record: content of its `campaign.json`.
-        options: options by keyword; a recorded controller replaces a controller.
-    """
-    return call(verb, [folder], {**options, **_named(verb, record)})
+    named: dict[str, Argument] = {}
+    for name in CONTROLLERS:
+        spec = record.get(name)
+        # A run folder names no code to run; see `settings_of`. Only a campaign has two versions.
+        if isinstance(spec, str) and runs_code(spec) and (name != "against" or verb == "resume"):
+            named[name] = spec
+    return command(verb, folder, *arguments, **{**named, **options})
 
 
 def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
@@ -68,23 +61,32 @@ def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
     given = {name: value for name, value in options.items() if value is not None}
     specs = [parse(str(given[name])) for name in CONTROLLERS if name in given]
     if any(spec.kind == HERE for spec in specs):
-        return call(verb, arguments, given)
+        return call(verb, *arguments, **given)
     name, *option = OPTIONS.get(verb if arguments else "", (verb,))
-    words = [name, *map(_flag, option)]
-    words += [word for argument in arguments for word in _words(argument)]
+    words = ["merge-sumo", name, *map(_flag, option)]
+    for argument in arguments:
+        words += _words(argument)
     for name, value in given.items():
         if value is True:
             words.append(_flag(name))
             continue
         for word in _words(value):
             words += [_flag(name), word]
-    found = dict.fromkeys(root for spec in specs if (root := _root(spec.kind, spec.argument)))
-    path = f"PYTHONPATH={quoted(':'.join(found))} " if found else ""
-    return f"{path}merge-sumo {' '.join(words)}"
+    folders = dict.fromkeys(filter(None, map(_folder_of_module, specs)))
+    if folders:
+        words.insert(0, f"PYTHONPATH={quoted(':'.join(folders))}")
+    return " ".join(words)
 
 
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+def call(verb: str, *arguments: Argument, **options: Argument) -> str:
+    """Return a call of Python, in which `ms` is this package; as `command`."""
+    parts = list(map(_expression, arguments))
+    if verb == "run" and parts:
+        parts = [f"recorded=({', '.join(parts)})"]
+    for name, value in options.items():
+        expression = _controller(str(value)) if name in CONTROLLERS else _expression(value)
+        parts.append(f"{name}={expression}")
+    return f"ms.{verb}({', '.join(parts)})"
 
 
 def campaign_in(scenario: Scenario, **options: str | None) -> str:
@@ -95,83 +97,58 @@ def campaign_in(scenario: Scenario, **options: str | None) -> str:
     return command("campaign", **options, scenario=None if name == US23.name else name)
 
 
-def _named(verb: str, record: Mapping[str, Any]) -> dict[str, str]:
-    """Return the controllers of a record that no run folder names; see `settings_of`."""
-    names = CONTROLLERS if verb == "resume" else CONTROLLERS[:-1]
-    specs = {name: record.get(name) for name in names}
-    return {
-        name: spec
-        for name, spec in specs.items()
-        if isinstance(spec, str) and (names_code(spec) or parse(spec).kind == HERE)
-    }
+def _flag(name: str) -> str:
+    return "--gate" if name == "gates" else f"--{name.replace('_', '-')}"
 
 
 def _words(argument: Argument) -> Iterator[str]:
     """Yield the words of a shell for an argument."""
     if isinstance(argument, Mapping):
-        yield from (quoted(f"{name}={value!r}") for name, value in argument.items())
+        for name, value in argument.items():
+            yield quoted(f"{name}={value!r}")
     elif isinstance(argument, str | Path):
         yield quoted(argument)
-    elif isinstance(argument, int | float):
-        yield str(argument)
+    elif isinstance(argument, Sequence):
+        for item in argument:
+            yield quoted(str(item))
     else:
-        yield from map(str, argument)
+        yield str(argument)
 
 
-def _root(kind: str, argument: str) -> str:
+def _folder_of_module(spec: ControllerSpec) -> str:
     """Return the folder of a module that a new process does not look into by itself; "" for none.
 
-    Who called us may have put it into the path, as pytest does.
+    The caller may have put it into the path, as pytest does.
     """
-    module = sys.modules.get(argument.rpartition(":")[0].partition(".")[0])
-    file = getattr(module, "__file__", None)
-    if kind != PYTHON or argument.rpartition(":")[0].endswith(".py") or file is None:
+    name = spec.argument.rpartition(":")[0]
+    file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
+    if spec.kind != PYTHON or name.endswith(".py") or file is None:
         return ""
-    root = Path(file).resolve().parent
+    folder = Path(file).resolve().parent
     if Path(file).name == "__init__.py":
-        root = root.parent
-    installed = (Path(path).resolve() for path in sysconfig.get_paths().values())
-    return "" if root == Path.cwd() or root in installed else str(root)
-
-
-def call(
-    verb: str, arguments: Sequence[Argument], given: Mapping[str, Argument] | None = None
-) -> str:
-    """Return a call of Python, in which `ms` is this package.
-
-    Args:
-        verb: name of a function of the API.
-        arguments: arguments in their order.
-        given: options by keyword.
-    """
-    parts = [_value(argument) for argument in arguments]
-    if verb == "run" and parts:
-        parts = [f"recorded=({', '.join(parts)})"]
-    for name, value in (given or {}).items():
-        expression = _controller(str(value)) if name in CONTROLLERS else _value(value)
-        parts.append(f"{name}={expression}")
-    return f"ms.{verb}({', '.join(parts)})"
+        folder = folder.parent
+    searched = [Path.cwd()]
+    for installed in sysconfig.get_paths().values():
+        searched.append(Path(installed).resolve())
+    return "" if folder in searched else str(folder)
 
 
 def _controller(text: str) -> str:
-    """Return what a controller is called where it is an object: it is of the caller's names."""
+    """Return an expression for a controller: an object has the name that the caller gave it."""
     spec = parse(text)
     if spec.kind != HERE or spec.parameters:
-        return _value(text)
+        return _expression(text)
     name, known = re.sub(r"-\d+$", "", spec.argument), object_of(spec)
     if not name.isidentifier() or iskeyword(name):
         return "vut"
     return name if known is None or is_code(known) else f"{name}(...)"
 
 
-def _value(argument: Argument) -> str:
+def _expression(argument: Argument) -> str:
     """Return a value as Python writes it."""
-    if isinstance(argument, str | Path):
-        text = str(argument)
-        return json.dumps(text, ensure_ascii=False) if text.isprintable() else repr(text)
-    if isinstance(argument, Mapping):
-        items = (f"{_value(name)}: {value!r}" for name, value in argument.items())
-        return f"{{{', '.join(items)}}}"
     if isinstance(argument, int | float):
         return str(argument)
-    return f"[{', '.join(map(str, argument))}]"
+    plain = str(argument) if isinstance(argument, Path) else argument
+    if isinstance(plain, str) and not plain.isprintable():
+        return repr(plain)
+    return json.dumps(plain, ensure_ascii=False)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from merge_sumo.campaigns.draws import RepeatingSampler
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.repeats import repeat
 from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failures
-from merge_sumo.campaigns.settings import RECORDED_BY_DEFAULT, CampaignSettings, record_of
+from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
@@ -36,11 +34,6 @@ from merge_sumo.workers import Workers, workers_or_here
 
 EXPORTED_FAILURES = 10
 SCENARIOS = "scenarios"
-FIRST_BATCH: Final = 5
-"""Cases of each level in the first batch where models of two versions predict, which they do from
-four cases on. Measured with design2 and design2?x1_m=120 at level 2, seeds 0 to 4: after 40 cases
-.81 of what broke is found in the median, and .69 with ten.
-"""
 
 Callback = Callable[[Sequence[Outcome]], None]
 """Called with the outcomes of cases when they are stored; may raise to stop the campaign there."""
@@ -83,33 +76,32 @@ def run_campaign(
     else:
         check_new(folder)
         check_new(folder / SCENARIOS / case_name(settings.cases))
-    plan = _sized(settings, plan, folder, workers)
-    outcomes: list[Outcome] = []
+    # No more corridors than cases run at a time.
+    batch = settings.batch if SAMPLERS[settings.sampler].learns else None
+    plan = plan.for_cases(settings.in_flight or batch or settings.cases)
+    plan = plan.with_log(folder.resolve() / LOG)
+    history: list[Episode] = []
     with workers_or_here(workers) as available, ExitStack() as opened:
         if resumes:
             journal, history = _resumed(settings, plan, folder, opened, available)
-            outcomes += [episode.outcome for episode in history]
         else:
             open_simulators(plan, available)
-            journal, history = _created(settings, plan, folder, opened), []
-        begin(outcomes)
+            journal = _created(settings, plan, folder, opened)
+        begin([episode.outcome for episode in history])
 
         def on_groups(groups: Groups) -> None:
             journal.append(*groups)
             stored = [episode.outcome for group in groups for episode in group]
-            outcomes.extend(stored)
             for callback in callbacks:
                 callback(stored)
 
-        sampler = _sampler(settings, plan)
-        young = sampler.uses_predictions and plan.against is not None
         loop = SearchLoop(
-            sampler,
+            _sampler(settings, plan),
             plan,
             settings.cases,
             workers=available,
             batch=settings.batch,
-            first=FIRST_BATCH * len(settings.levels) if young else None,
+            draws=settings.repeat,
             in_flight=settings.in_flight,
             stop=settings.stopping_rule(),
             history=history,
@@ -131,8 +123,7 @@ def _created(
     """Return the journal of a new folder, which `opened` closes."""
     journal = opened.enter_context(Journal.create(folder, record_of(settings, plan)))
     if plan.earlier is not None:
-        record = record_of(settings.earlier, plan.earlier)
-        journal.earlier = opened.enter_context(Journal.create(folder / AGAINST, record))
+        journal.earlier = _created(settings.earlier, plan.earlier, folder / AGAINST, opened)
     return journal
 
 
@@ -144,88 +135,64 @@ def _resumed(
     workers: Workers,
 ) -> tuple[Journal, list[Episode]]:
     """Return the journal of a folder, which `opened` closes, and the episodes that it has."""
-    journal, before = _reopened(folder, opened)
-    records = [(journal, _compared(settings, plan, before))]
-    motion = SAMPLERS[settings.sampler].uses_predictions
+    journal, before = _reopened(settings, plan, folder, opened)
     old: Run | None = None
     if plan.earlier is not None:
         place = folder / AGAINST
         if not before.outcomes:  # it may have been stopped before that folder was whole
-            record = record_of(settings.earlier, plan.earlier)
-            with suppress(TakenError), Journal.create(place, record):
-                pass
-        journal.earlier, old = _reopened(place, opened)
-        records.append((journal.earlier, _compared(settings.earlier, plan.earlier, old)))
+            with suppress(TakenError), ExitStack() as created:
+                _created(settings.earlier, plan.earlier, place, created)
+        journal.earlier, old = _reopened(settings.earlier, plan.earlier, place, opened)
         before.earlier()  # raises where cases are missing; more of them run again
         journal.earlier.keep(old, len(before.outcomes))
     open_simulators(plan, workers)
-    for one, rewritten in records:
-        if rewritten is not None:
-            one.rewrite_settings(rewritten)
+    journal.write_settings()
+    motion = SAMPLERS[settings.sampler].uses_predictions
     history = before.episodes(motion=motion)
     if old is not None:
-        pairs = zip(history, old.episodes(motion=motion), strict=True)
-        history = [replace(new, earlier=earlier) for new, earlier in pairs]
+        for index, earlier in enumerate(old.episodes(motion=motion)):
+            history[index] = replace(history[index], earlier=earlier)
     return journal, history
 
 
-def _sized(
-    settings: CampaignSettings, plan: SimulationPlan, folder: Path, workers: Workers | None
-) -> SimulationPlan:
-    """Return the plan with no more corridors than cases run at a time, and with a log."""
-    at_once = settings.batch if SAMPLERS[settings.sampler].learns else settings.cases
-    if settings.in_flight is not None:
-        at_once = math.ceil(settings.in_flight / (1 if workers is None else workers.count))
-    return plan.for_cases(at_once or settings.cases).with_log(folder.resolve() / LOG)
-
-
-def _reopened(folder: Path, opened: ExitStack) -> tuple[Journal, Run]:
+def _reopened(
+    settings: CampaignSettings, plan: SimulationPlan, folder: Path, opened: ExitStack
+) -> tuple[Journal, Run]:
     """Return the journal of a folder, which `opened` closes, and the campaign in it."""
-    journal, run, dropped = Journal.reopen(folder)
+    journal, before, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
     if dropped:
         notice(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-    return journal, run
+    journal.settings = _continued(settings, plan, before)
+    return journal, before
 
 
-def _compared(
-    settings: CampaignSettings, plan: SimulationPlan, before: Run
-) -> dict[str, Any] | None:
-    """Return the record of a campaign that continues, where it is to be written again.
+def _continued(settings: CampaignSettings, plan: SimulationPlan, before: Run) -> dict[str, Any]:
+    """Return the record of a campaign that continues.
 
     Raises `UserError` where something differs that decides outcomes: cases of two controllers are
     not a campaign.
     """
-    recorded = {k: v for k, v in before.record.items() if k not in TALLIES}
-    record = record_of(settings, plan)
+    recorded, record = dict(before.record), record_of(settings, plan)
     # The content of policies decides outcomes, and not their folder.
-    moved = (RECORDED_BY_DEFAULT | recorded)["policies"] != record["policies"]
     recorded["policies"] = record["policies"]
     # What was loaded while it ran must be the same, too, although it is not loaded yet.
     for name in FILES:
-        known = recorded.get(name) or {}
-        record[name] = files_now(known, record[name] or {}) or None
+        record[name] = files_now(recorded.get(name) or {}, record[name] or {}) or None
+    for name in TALLIES:
+        if name in recorded:
+            record[name] = recorded[name]
     # Which cases come next does not depend on how many there are to be.
     ended = before.settings.stop_when_converged and not settings.stop_when_converged
-    grown = before.settings.cases < settings.cases or ended
-    if grown:
+    if ended or before.settings.cases < settings.cases:
         recorded |= {"cases": settings.cases, "stop_when_converged": settings.stop_when_converged}
-    changes = differences(RECORDED_BY_DEFAULT | recorded, record)
-    if before.criterion != settings.criterion:
-        raise UserError(
-            f"in {before.folder} a case fails when {before.criterion.text}, and not when "
-            f"{settings.criterion.text}: the criterion cannot change on resume; start a new "
-            "campaign"
-        )
-    if changes:
-        name, (was, now) = next(iter(changes.items()))
+    for name, (was, now) in differences(recorded, record).items():
         same = f"give {was} or more" if name == "cases" else "make it the same"
         raise UserError(
             f"{name} differs: {before.folder} was run with {was}, now it is {now}; {same}, or "
             "start a new campaign"
         )
-    record |= {k: before.record[k] for k in TALLIES if k in before.record}
-    return record if moved or grown else None
+    return record
 
 
 def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
@@ -235,8 +202,7 @@ def _sampler(settings: CampaignSettings, plan: SimulationPlan) -> Sampler:
     if plan.against is not None:
         earlier = controller_model_of(plan, settings.pool, settings.seed)
         predictor = ControllerModelPair(model, earlier)
-    sampler = settings.new_sampler(predictor)
-    return sampler if settings.repeat == 1 else RepeatingSampler(sampler, settings.repeat)
+    return settings.new_sampler(predictor)
 
 
 def controller_model_of(plan: SimulationPlan, pool: Pool, seed: int) -> ControllerModel:

@@ -10,8 +10,8 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
@@ -29,13 +29,17 @@ from merge_sumo.campaigns.run import (
     batch_file,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.files import check_own, make_folder, replace_own, sync_folder, write_folder
+from merge_sumo.files import (
+    cannot_write,
+    check_own,
+    make_folder,
+    replace_own,
+    sync_folder,
+    write_folder,
+)
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import to_json
 from merge_sumo.scenario.signals import to_record
-
-MOST_SYNCS = 8
-"""Files that are synced at the same time."""
 
 
 def to_line(outcome: Outcome) -> str:
@@ -65,14 +69,13 @@ class Journal:
         self.folder, self.settings = folder, settings
         self.earlier: Self | None = None
         self._outcomes = outcomes
-        self._threads = ThreadPoolExecutor(MOST_SYNCS)
         _lock(outcomes, folder)
         make_folder(folder / TRAJECTORIES, exist_ok=True)
 
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
         """Create the folder with its settings; `UserError` when it exists or cannot be written."""
-        write_folder(folder, {OUTCOMES: b"", SETTINGS: _settings_text(settings)})
+        write_folder(folder, {OUTCOMES: b"", SETTINGS: to_json(settings, indent=2)})
         return cls(folder, (folder / OUTCOMES).open("r+b", buffering=0), settings)
 
     @classmethod
@@ -93,15 +96,12 @@ class Journal:
                 journal = cls(folder, opened.enter_context(outcomes), {})
                 run = Run(folder)
                 journal.settings = run.record
-                dropped = len(run.outcomes) - run.whole_batches() + run.torn
+                whole = run.whole_batches()
+                dropped = len(run.outcomes) - whole + run.torn
                 if dropped:
-                    journal.keep(run, run.whole_batches())
-            except (FileNotFoundError, NotADirectoryError) as error:
-                raise UserError(
-                    f"{folder} is not a campaign to go on with: it has no {OUTCOMES}"
-                ) from error
+                    journal.keep(run, whole)
             except OSError as error:
-                raise UserError(f"cannot write {folder}: {error.strerror}") from error
+                raise cannot_write(folder, error) from error
             opened.pop_all()
         return journal, run, dropped
 
@@ -114,84 +114,86 @@ class Journal:
         os.fsync(self._outcomes.fileno())
 
     def append(self, *groups: Sequence[Episode]) -> None:
-        """Write groups and sync them to the disk: several at once take little more time than one.
+        """Write groups and sync them to the disk.
 
         What their episodes say of loaded files, of commands in vain, and of cases that ran again
         goes into the settings. Raises `UserError` when they cannot be written; what was there
         before stays.
         """
         if self.earlier is not None:
-            self.earlier.append(*([e.earlier for e in group if e.earlier] for group in groups))
-        paths = [batch_file(self.folder, group[0].outcome.batch) for group in groups]
-        lines, arrays = zip(*map(_encoded, groups), strict=True)
+            earlier = []
+            for group in groups:
+                earlier.append([episode.earlier for episode in group if episode.earlier])
+            self.earlier.append(*earlier)
+        episodes = list(chain.from_iterable(groups))
+        lines = "".join(to_line(episode.outcome) for episode in episodes)
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
-            list(self._threads.map(_write, paths, arrays))
+            for group in groups:
+                path = batch_file(self.folder, group[0].outcome.batch)
+                with path.open("wb", buffering=0) as file:
+                    _write_all(file, _arrays(group))
             sync_folder(self.folder / TRAJECTORIES)
             try:
-                _write_all(self._outcomes, b"".join(lines))
+                _write_all(self._outcomes, lines.encode())
             except OSError:
                 self._outcomes.truncate(end)
                 raise
         except OSError as error:
-            goes_on = again("resume", self.folder, self.settings)
-            kept = f"; what ran before is kept: go on with `{goes_on}`"
+            resume = again("resume", self.folder, self.settings)
             raise UserError(
-                f"cannot write {self.folder}: {error.strerror}"
-                f"{kept if (self.folder / OUTCOMES).is_file() else ''}"
+                f"{cannot_write(self.folder, error)}; when it can be written, continue with "
+                f"`{resume}`"
             ) from error
-        noted = dict(self.settings)
-        for episode in (episode for group in groups for episode in group):
-            for name, loaded in zip(FILES, (episode.files, episode.pov_files), strict=True):
-                if loaded:
-                    noted[name] = loaded | (noted.get(name) or {})  # what was known stays
-            for command in episode.trajectory.in_vain:
-                cases = noted.get(IN_VAIN) or {}
-                noted[IN_VAIN] = cases | {command: cases.get(command, 0) + 1}
-            if episode.again:
-                noted[RAN_AGAIN] = noted.get(RAN_AGAIN, 0) + 1
-        if noted != self.settings:
-            self.rewrite_settings(noted)
+        before = dict(self.settings)
+        for episode in episodes:
+            self._note(episode)
+        if self.settings != before:
+            self.write_settings()
 
-    def rewrite_settings(self, settings: dict[str, Any]) -> None:
-        """Put other settings in the place of those that were there, all or nothing."""
-        self.settings = settings
-        replace_own(self.folder / SETTINGS, _settings_text(settings))
+    def _note(self, episode: Episode) -> None:
+        """Note in the settings what an episode tells of them."""
+        noted = self.settings
+        for name, files in zip(FILES, (episode.files, episode.pov_files), strict=True):
+            if files:
+                noted[name] = files | (noted.get(name) or {})  # what was known stays
+        for command in episode.trajectory.in_vain:
+            cases = noted.get(IN_VAIN, {})
+            noted[IN_VAIN] = cases | {command: cases.get(command, 0) + 1}
+        if episode.again:
+            noted[RAN_AGAIN] = noted.get(RAN_AGAIN, 0) + 1
+
+    def write_settings(self) -> None:
+        """Write the settings in the place of those that were there, all or nothing."""
+        if self.earlier is not None:
+            self.earlier.write_settings()
+        replace_own(self.folder / SETTINGS, to_json(self.settings, indent=2))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._threads.shutdown()
         self._outcomes.close()
 
 
-def _encoded(group: Sequence[Episode]) -> tuple[bytes, bytes]:
-    """Return the lines of a group, and the file of its trajectories."""
-    outcomes = [episode.outcome for episode in group]
-    trajectories = [episode.trajectory for episode in group]
-    lines = "".join(map(to_line, outcomes)).encode()
-    signals = {
-        str(o.index): to_record(t.signals)
-        for o, t in zip(outcomes, trajectories, strict=True)
-        if t.signals
-    }
-    text = json.dumps(signals, allow_nan=False).encode()
-    kept: dict[str, Any] = {"signals": np.frombuffer(text, np.uint8)} if signals else {}
-    motions = [trajectory.whole for trajectory in trajectories]
-    arrays = io.BytesIO()
-    np.savez(
-        arrays,
-        **kept,
-        index=np.array([o.index for o in outcomes]),
-        rows=np.array([len(motion) for motion in motions]),
-        motion=np.concatenate([motion.reshape(len(motion), -1) for motion in motions]),
-    )
-    return lines, arrays.getvalue()
-
-
-def _settings_text(settings: dict[str, Any]) -> bytes:
-    return to_json(settings, indent=2)
+def _arrays(group: Sequence[Episode]) -> bytes:
+    """Return the file of the trajectories of a group."""
+    indices, rows, motions, signals = [], [], [], {}
+    for episode in group:
+        index, trajectory = episode.outcome.index, episode.trajectory
+        indices.append(index)
+        rows.append(len(trajectory.whole))
+        motions.append(trajectory.whole.reshape(len(trajectory.whole), -1))
+        if trajectory.signals:
+            signals[str(index)] = to_record(trajectory.signals)
+    arrays: dict[str, Any] = {}
+    if signals:
+        arrays["signals"] = np.frombuffer(json.dumps(signals, allow_nan=False).encode(), np.uint8)
+    arrays |= {"index": np.array(indices), "rows": np.array(rows)}
+    arrays["motion"] = np.concatenate(motions)
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
 
 
 def _lock(outcomes: io.FileIO, folder: Path) -> None:
@@ -207,14 +209,11 @@ def _lock(outcomes: io.FileIO, folder: Path) -> None:
         raise UserError(f"another process writes {folder}: wait until it has ended") from error
 
 
-def _write(path: Path, content: bytes) -> None:
-    """Write a file and sync it to the disk."""
-    with path.open("wb", buffering=0) as file:
-        _write_all(file, content)
-
-
 def _write_all(file: io.FileIO, content: bytes) -> None:
-    # Unbuffered: after an error, nothing is left that closing the file would write after all.
+    """Write bytes to an unbuffered file, and sync it to the disk.
+
+    After an error, nothing is left in a buffer that closing the file would write after all.
+    """
     rest = memoryview(content)
     while rest:
         rest = rest[file.write(rest) :]

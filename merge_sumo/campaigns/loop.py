@@ -42,19 +42,13 @@ Groups = list[list[Episode]]
 
 @dataclass(slots=True)
 class _Group:
-    """Cases that were proposed together, and their episodes once these are known."""
+    """Cases that were proposed together, and their episodes when they have run."""
 
     number: int
     first: int
     cases: Sequence[Case]
     predictions: Sequence[Prediction | None] = ()
     episodes: list[Episode] = field(default_factory=list)
-
-    def take(self, episodes: Sequence[Episode]) -> None:
-        """Take the episodes of the cases."""
-        for place, episode in enumerate(episodes):
-            index, prediction = self.first + place, self.predictions[place]
-            self.episodes.append(episode.at(index, self.number, prediction))
 
 
 class SearchLoop:
@@ -72,7 +66,7 @@ class SearchLoop:
         *,
         workers: Workers | None = None,
         batch: int | None = None,
-        first: int | None = None,
+        draws: int = 1,
         in_flight: int | None = None,
         stop: Callable[[Sequence[Outcome]], bool] | None = None,
         history: Iterable[Episode] = (),
@@ -85,7 +79,7 @@ class SearchLoop:
             cases: number of cases after which the search ends.
             workers: where they run; by default in this process, whose simulator stays open.
             batch: cases of a group; by default the number that the sampler wants.
-            first: most cases of the first group.
+            draws: runs of each case that the sampler proposes. All are in one group.
             in_flight: most cases in flight; by default one group.
             stop: whether the outcomes with a verdict end the search.
             history: whole groups that ran before, in order. Only a sampler that uses predictions
@@ -93,13 +87,14 @@ class SearchLoop:
         """
         self._sampler, self._plan, self._cases, self._stop = sampler, plan, cases, stop
         self._workers = Workers() if workers is None else workers
-        self._batch, self._first, self._in_flight = batch, first, in_flight
+        self._batch, self._draws, self._in_flight = batch, draws, in_flight
         self._ahead = not sampler.learns and stop is None
         self._overlaps = in_flight is not None and sampler.overlaps
         groups = groupby(history, key=lambda episode: episode.outcome.batch)
         self._history = deque(list(group) for _, group in groups)
         self._pending: list[_Group] = []
-        self._proposed = self._groups = self._ran = 0
+        self._proposed = self._ran = 0
+        self._groups = 0
         self._start_s = time.perf_counter()
 
     def run(self, on_groups: Callable[[Groups], None]) -> None:
@@ -117,7 +112,7 @@ class SearchLoop:
                 return
             groups, job = running.popleft()
             if job is not None:
-                self._take(groups, self._workers.collect(job), job.retried)
+                self._collect(groups, job)
                 on_groups([group.episodes for group in groups])
             for group in groups:
                 tell(self._sampler, group.episodes)
@@ -144,9 +139,14 @@ class SearchLoop:
         end = min(self._cases, self._proposed + self._cases_ahead())
         groups = []
         while self._proposed < end:
-            cases = self._sampler.ask(self._size())
-            predictions = [self._sampler.prediction(place) for place in range(len(cases))]
-            groups.append(self._add(_Group(self._groups, self._proposed, cases, predictions)))
+            cases, predictions = [], []
+            for place, case in enumerate(self._sampler.ask(max(1, self._size() // self._draws))):
+                for draw in range(self._draws):
+                    cases.append(replace(case, draw=draw))
+                    predictions.append(None if draw else self._sampler.prediction(place))
+            left = self._cases - self._proposed
+            group = _Group(self._groups, self._proposed, cases[:left], predictions[:left])
+            groups.append(self._add(group))
         return groups
 
     def _cases_ahead(self) -> int:
@@ -160,12 +160,12 @@ class SearchLoop:
         """Return the number of cases of the next group."""
         if self._history:
             return len(self._history[0])
-        if self._in_flight is not None:
-            size = max(1, self._most() // GROUPS) if self._overlaps else self._most()
-        else:
+        if self._in_flight is None:
             size = self._batch or self._sampler.batch_size()
-            if self._batch is None and self._first is not None and not self._proposed:
-                size = min(size, self._first)
+        elif self._overlaps:
+            size = max(1, self._most() // GROUPS)
+        else:
+            size = self._most()
         return min(size, self._cases - self._proposed)
 
     def _most(self) -> int:
@@ -178,7 +178,8 @@ class SearchLoop:
 
     def _add(self, group: _Group) -> _Group:
         """Count a group as proposed."""
-        self._groups, self._proposed = group.number + 1, self._proposed + len(group.cases)
+        self._groups += 1
+        self._proposed += len(group.cases)
         self._pending.append(group)
         self._pend()
         return group
@@ -193,18 +194,16 @@ class SearchLoop:
         cases = [case for group in groups for case in group.cases]
         return submit_cases(self._plan, cases, self._workers)
 
-    def _take(
-        self, groups: Sequence[_Group], episodes: list[Episode], retried: Iterable[int]
-    ) -> None:
-        """Give groups their episodes, and note which ran again because a worker had died."""
+    def _collect(self, groups: Sequence[_Group], job: Job[Case, Episode]) -> None:
+        """Collect the episodes of groups; note which ran again because a worker had died."""
+        episodes = self._workers.collect(job)
         self._ran += len(episodes)
-        for place in retried:
+        for place in job.retried:
             episodes[place] = replace(episodes[place], again=True)
-        first = 0
+        rest = iter(episodes)
         for group in groups:
-            end = first + len(group.cases)
-            group.take(episodes[first:end])
-            first = end
+            for index, prediction in enumerate(group.predictions, group.first):
+                group.episodes.append(next(rest).at(index, group.number, prediction))
 
 
 def tell(sampler: Sampler, episodes: Sequence[Episode]) -> None:

@@ -5,6 +5,7 @@ A single case, with the same drivers and verdict as in a campaign, is planned he
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -104,9 +105,8 @@ def explicit(
         if base := config.scenario or scenario:
             fields["scenario"] = changed_scenario(base, changes)
         elif changes:
-            raise UserError(
-                f"`{next(iter(changes))}` is of the scenario: name that, too, with `scenario`"
-            )
+            (name, *_) = changes
+            raise UserError(f"`{name}` is of the scenario: name that, too, with `scenario`")
     if isinstance(config, c.CampaignCalls):
         fields |= c.changed(config, c.Search)
         if config.against is not None:
@@ -126,9 +126,8 @@ def settings_for(
     fields, where = explicit(config, scenario=US23)
     if isinstance(config, c.Campaign) and config.cases is None:
         fields["stop_when_converged"] = True
-    scenario, own = fields["scenario"], config.pov is not None
-    folder = policies_folder(config.policies, scenario)
-    fields["levels"] = parse_levels(config.level, folder, own=own)
+    folder = policies_folder(config.policies, fields["scenario"])
+    fields["levels"] = parse_levels(config.level, folder, own=config.pov is not None)
     return _new_settings(fields | search), where
 
 
@@ -168,29 +167,20 @@ def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, 
         scenario, row = run.scenario, run.outcome(config.recorded[1]).to_record()
     level = int(row.get("level", 0))
     if config.level is not None:
-        folder, own = policies_folder(config.policies, scenario), config.pov is not None
-        level = one_level(str(config.level), folder, own=own)
+        folder = policies_folder(config.policies, scenario)
+        level = one_level(str(config.level), folder, own=config.pov is not None)
     fields |= {**ONE, "levels": (level,)}
-    recorded = None if run is None else settings_of(run.folder, run.record, fields)
-    settings = recorded or _new_settings(fields)
+    settings = None if run is None else settings_of(run.folder, run.record, fields)
+    settings = settings or _new_settings(fields)
+    draw = _number("draw", row.get("draw") or 0)
     values = {}
     for dimension in settings.scenario.dimensions(level):
         values[dimension.field] = row.get(dimension.field)
-    named = dict(config.at or {})
     for name in c.COORDINATES:
-        value = getattr(config, name)
-        if value is not None and named.setdefault(name, value) != value:
-            raise UserError(
-                f"`{name}` is {value} and `at` has {name}={named[name]}: give the coordinate once"
-            )
-    case = case_of(settings.scenario, level, values | named)
-    draw = row.get("draw")
-    if draw is None or draw != draw:  # noqa: PLR0124 (NaN of a data frame: the first)
-        return settings, case
-    try:
-        return settings, replace(case, draw=int(draw))
-    except (TypeError, ValueError, OverflowError):
-        raise UserError(f"draw is {draw!r:.60}: it must be a whole number") from None
+        if getattr(config, name) is not None:
+            values[name] = getattr(config, name)
+    case = case_of(settings.scenario, level, values | dict(config.at or {}))
+    return settings, replace(case, draw=0 if math.isnan(draw) else int(draw))
 
 
 def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
@@ -204,31 +194,34 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     Raises:
         UserError: a coordinate is missing or unknown, or a value is out of range.
     """
-    given: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in scenario.notation and name != "v_vut0_mps":
-            raise UserError(f"a case has no {name}: it has {', '.join(scenario.notation)}")
-        try:
-            if value is not None:
-                given[name] = float(value)
-        except (TypeError, ValueError):
-            raise UserError(f"{name} is {value!r}: it must be a number") from None
-    if isinstance(scenario.v_vut0_mps, float):
-        given.setdefault("v_vut0_mps", scenario.v_vut0_mps)
-    unknown = given.keys() - {"v_vut0_mps"}
+    known = {"v_vut0_mps"}
     for dimension in scenario.dimensions(level):
-        if dimension.field not in given:
+        known.add(dimension.field)
+        if values.get(dimension.field) is None:
             raise UserError(
                 f"{_option(dimension.field)} is missing: the pool has {dimension.low:g} to "
                 f"{dimension.high:g}"
             )
-        unknown -= {dimension.field}
-    for name in unknown:
-        raise UserError(
-            f"{_option(name)} is none of the coordinates of {scenario.name} at level "
-            f"{level_name(level)}: leave it out"
-        )
+    given: dict[str, Any] = {}
+    if isinstance(scenario.v_vut0_mps, float):
+        given["v_vut0_mps"] = scenario.v_vut0_mps
+    for name, value in values.items():
+        if name not in known:
+            raise UserError(
+                f"{_option(name)} is none of the coordinates of {scenario.name} at level "
+                f"{level_name(level)}, which are {', '.join(sorted(known))}: leave it out"
+            )
+        if value is not None:
+            given[name] = _number(name, value)
     return Case(level=level, scenario=scenario, **given)
+
+
+def _number(name: str, value: Any) -> float:
+    """Return a value of a case as a number."""
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} is {value!r:.60}: it must be a number") from None
 
 
 def _option(name: str) -> str:

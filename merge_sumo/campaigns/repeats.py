@@ -3,13 +3,11 @@
 `repeats.jsonl` in the folder of the campaign has a line for each case that ran twice.
 """
 
-# An episode must depend on its case alone. A controller that draws random numbers, reads a clock,
-# or keeps a state from one episode to the next violates this: its results depend on the number of
-# workers, on the sampler, and on chance. The first cases run again, which a new controller ran, and
-# others, in reverse order. The VUTs of this package need no such check.
-#
-# A campaign with `--repeat` expects chance, but no state between episodes: cases that differ run
-# twice more, each time with new controllers.
+# An episode must depend on its case alone. A controller that draws random numbers without the seed
+# of its case, reads a clock, or keeps a state from one episode to the next violates this: its
+# results depend on the number of workers, on the sampler, and on chance. The first cases run again,
+# which a new controller ran, and others, in reverse order. The VUTs of this package need no such
+# check.
 
 from __future__ import annotations
 
@@ -23,11 +21,11 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.files import replace_own
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.records import Record, read_indexed, replaced, to_json
-from merge_sumo.scenario.case import Case
+from merge_sumo.printable import counted
+from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import close_simulator, simulate, submit_cases
+from merge_sumo.simulation.evaluate import submit_cases
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -38,8 +36,8 @@ ONE_IN: Final = 8
 """One case of this number runs twice, up to the maximum."""
 
 
-class Repeat(Record, frozen=True, omit_defaults=True):
-    """A case that ran a second time.
+class Repeat(Record, frozen=True, forbid_unknown_fields=False):
+    """A case that ran a second time; lines of earlier versions have more keys.
 
     Attributes:
         index: of the case.
@@ -48,8 +46,6 @@ class Repeat(Record, frozen=True, omit_defaults=True):
         end: how the case ended the second time.
         failed: whether it failed the second time.
         other_verdict: whether it ended or failed otherwise than the first time.
-        drawn: whether it differs by chance, and not by what ran before it: it differs in two new
-            processes that run the same cases. None where that was not looked for.
     """
 
     index: int
@@ -58,7 +54,6 @@ class Repeat(Record, frozen=True, omit_defaults=True):
     end: End
     failed: bool
     other_verdict: bool
-    drawn: bool | None = None
 
     @property
     def same(self) -> bool:
@@ -87,30 +82,14 @@ def repeat(
     again = [outcome for outcome in chosen if outcome.index in recorded]
     if not again:
         return []
-    cases, found = [outcome.case for outcome in again], []
-    job = submit_cases(plan, cases, workers)
+    found = []
+    job = submit_cases(plan, [outcome.case for outcome in again], workers)
     for outcome, ran in zip(again, workers.collect(job), strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
             found.append(repeat_of(outcome, recorded[outcome.index], ran))
-    if settings.repeat != 1 and not all(one.same for one in found):
-        first, second = (_simulated_again(plan, cases) for _ in range(2))
-        drawn = {}
-        for outcome, one, other in zip(again, first, second, strict=True):
-            difference = _difference(one.trajectory, other.trajectory)
-            drawn[outcome.index] = difference != (None, None)
-        found = [one if one.same else replaced(one, drawn=drawn[one.index]) for one in found]
     found.sort(key=lambda one: one.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
     return found
-
-
-def _simulated_again(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
-    """Run cases in this process, with drivers that drove nothing before."""
-    close_simulator()
-    try:
-        return simulate(plan, cases)
-    finally:
-        close_simulator()
 
 
 def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
@@ -157,21 +136,20 @@ def repeat_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
 
 
 def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
-    """Return from when on two motions differ, and which vehicle differs first."""
-    wholes = one.whole, other.whole
-    rows = min(map(len, wholes))
-    pairs = [whole[:rows].copy() for whole in wholes]
-    for pair in pairs:
-        pair[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
-    differs = pairs[0] != pairs[1]
+    """Return the time from which two motions differ, and the vehicle that differs first."""
+    rows = min(len(one.whole), len(other.whole))
+    first, second = one.whole[:rows].copy(), other.whole[:rows].copy()
+    first[-1, :, 2] = second[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
+    differs = first != second
     steps = np.flatnonzero(differs.any(axis=(1, 2)))
-    if not steps.size:
-        same = len(wholes[0]) == len(wholes[1])
-        return (None, None) if same else (round((rows - 1) * DT_S, 1), None)
-    step = int(steps[0])
-    # The acceleration of a step is the answer to its state, which was the same.
-    vehicles = np.flatnonzero(differs[step, :, 2]).tolist()
-    return round(step * DT_S, 1), VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
+    if len(steps):
+        step = int(steps[0])
+        # The acceleration of a step is the answer to its state, which was the same.
+        vehicles = np.flatnonzero(differs[step, :, 2])
+        vehicle = VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
+        return round(step * DT_S, 1), vehicle
+    same = len(one.whole) == len(other.whole)
+    return (None if same else round((rows - 1) * DT_S, 1)), None
 
 
 def read_repeats(run: Run) -> list[Repeat]:
@@ -182,31 +160,18 @@ def read_repeats(run: Run) -> list[Repeat]:
 def unrepeatable(found: Iterable[Repeat]) -> str | None:
     """Return how many cases did not repeat, and what that means; None where each did."""
     known = list(found)
-    differing = [one for one in known if not (one.same or one.drawn)]
+    differing = [one for one in known if not one.same]
     if not differing:
         return None
-    verdicts = sum(one.other_verdict for one in differing)
-    example = next((one for one in differing if one.other_verdict), differing[0])
-    who = "VUT or the POV"
-    for vehicle in ("vut", "pov"):
-        if all(one.first == vehicle for one in differing):
-            who = vehicle.upper()
+    verdicts = [one for one in differing if one.other_verdict]
+    example = (verdicts or differing)[0]
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
-    why = cause(who)
-    if all(one.drawn is False for one in differing):
-        why = f"The {who} keeps something from earlier episodes"
-    cases = "case that ran" if len(known) == 1 else "cases that ran"
+    firsts = {one.first for one in differing}
+    who = "VUT or the POV" if len(firsts) > 1 else str(firsts.pop() or "VUT or the POV").upper()
     return (
-        f"Not repeatable: {len(differing)} of {len(known)} {cases} twice went differently the "
-        f"second time, {verdicts or 'none'} of them with another verdict (case {example.index}"
-        f"{since}). {why}: a result depends on more than its case, and "
+        f"Not repeatable: {len(differing)} of {counted(len(known), 'case')} that ran twice went "
+        f"differently the second time, {len(verdicts) or 'none'} of them with another verdict "
+        f"(case {example.index}{since}). Either the {who} draws random numbers or reads a clock, "
+        "or it keeps something from earlier episodes: a result depends on more than its case, and "
         "other workers or another order may give others."
-    )
-
-
-def cause(who: str = "VUT") -> str:
-    """Return in a clause why a case may go differently when it runs again."""
-    return (
-        f"Either the {who} draws random numbers or reads a clock, or it keeps something from "
-        "earlier episodes"
     )

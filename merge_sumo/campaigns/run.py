@@ -13,10 +13,9 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
-from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 from msgspec import Meta
@@ -28,10 +27,10 @@ from merge_sumo.files import regular
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.fmc import fmc, regions
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.metrics.summary import failing_cases, one_per_case
+from merge_sumo.metrics.summary import RunsOfCase, failing_cases, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import RecordError, convert, decode, read_arrays
-from merge_sumo.scenario.case import Case, FloatArray, to_unit
+from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
@@ -106,16 +105,8 @@ class Run:
     def __init__(self, folder: Path) -> None:
         """Read settings and outcomes."""
         self._take(folder, read_settings(folder), folder / SETTINGS)
-        try:
-            self.criterion = Criterion(self.settings.fail_when, self.settings.require)
-            self._read()
-        except UserError as error:
-            if absent := _absent_packages(self.record):
-                raise UserError(
-                    f"{folder} was recorded with {absent}, which is not installed: install it to "
-                    "read the campaign"
-                ) from error
-            raise
+        self.criterion = Criterion(self.settings.fail_when, self.settings.require)
+        self._read()
 
     def _take(self, folder: Path, record: dict[str, Any], place: Path) -> None:
         """Take settings that are recorded at a place."""
@@ -148,8 +139,8 @@ class Run:
 
     @property
     def levels(self) -> list[int]:
-        """The POV levels that the settings name, or else those of the cases."""
-        return list(self.settings.levels) or sorted({one.case.level for one in self.outcomes})
+        """The POV levels."""
+        return list(self.settings.levels)
 
     @property
     def tolerated(self) -> float:
@@ -330,19 +321,6 @@ def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
         raise UserError(f"{path} has no scenario: {error}") from error
 
 
-def _absent_packages(settings: Mapping[str, Any]) -> str:
-    """Return the recorded packages that are not installed, as a list in words; empty for none."""
-    recorded = settings.get("versions")
-    absent = []
-    for name, number in (recorded if isinstance(recorded, dict) else {}).items():
-        try:
-            if name != "python":
-                version(name)
-        except (PackageNotFoundError, ValueError):
-            absent.append(f"{name} {number}"[:NAME_CHARACTERS])
-    return printable(", ".join(absent))
-
-
 def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outcome], bool]:
     """Return the outcomes in the bytes of an `outcomes.jsonl`, and whether the last was torn.
 
@@ -374,17 +352,29 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
 
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """Return the failing outcomes, the worst first."""
-    return sorted((o for o in outcomes if o.failed), key=lambda o: (o.margin, o.index))
+    failing = [outcome for outcome in outcomes if outcome.failed]
+    return sorted(failing, key=lambda outcome: (outcome.margin, outcome.index))
+
+
+Judged = TypeVar("Judged", Outcome, RunsOfCase)
+
+
+def _by_level(outcomes: Iterable[Judged]) -> dict[int, tuple[list[Judged], FloatArray]]:
+    """Return outcomes by level, with their cases as points of its unit cube, (n, d)."""
+    groups: defaultdict[int, list[Judged]] = defaultdict(list)
+    for outcome in outcomes:
+        groups[outcome.case.level].append(outcome)
+    found = {}
+    for level, group in groups.items():
+        cases = [outcome.case for outcome in group]
+        found[level] = group, to_unit(cases, level, cases[0].scenario)
+    return found
 
 
 def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
     """Return the region (`fmc.regions`) of each failure within its level, by index of the case."""
-    by_level: defaultdict[int, list[Outcome]] = defaultdict(list)
-    for outcome in failures(outcomes):
-        by_level[outcome.case.level].append(outcome)
     region: dict[int, int] = {}
-    for level, group in by_level.items():
-        points = to_unit((outcome.case for outcome in group), level, group[0].case.scenario)
+    for group, points in _by_level(failures(outcomes)).values():
         for outcome, number in zip(group, regions(points).tolist(), strict=True):
             region[outcome.index] = number
     return region
@@ -397,9 +387,9 @@ def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     before: Counter[tuple[int, int]] = Counter()
     turns: dict[int, int] = {}
     for outcome in worst_first:
-        own = outcome.case.level, region[outcome.index]
-        turns[outcome.index] = before[own]
-        before[own] += 1
+        place = outcome.case.level, region[outcome.index]
+        turns[outcome.index] = before[place]
+        before[place] += 1
     return sorted(worst_first, key=lambda outcome: turns[outcome.index])
 
 
@@ -421,13 +411,8 @@ def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
 
 def coverage_by_level(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> dict[int, float]:
     """Return the failure mode coverage of each level with failures."""
-    by_level: defaultdict[int, list[Case]] = defaultdict(list)
-    for outcome in failing_cases(outcomes, tolerated):
-        by_level[outcome.case.level].append(outcome.case)
-    coverage = {}
-    for level, cases in by_level.items():
-        coverage[level] = fmc(to_unit(cases, level, cases[0].scenario))
-    return coverage
+    by_level = _by_level(failing_cases(outcomes, tolerated))
+    return {level: fmc(points) for level, (_, points) in by_level.items()}
 
 
 def batch_file(folder: Path, batch: int) -> Path:

@@ -210,40 +210,34 @@ def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
 def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
     """Return the numbers of a scenario that are not like those of training, in sentences."""
     unit, known = Units.of(scenario), Units.of(trained)
-    length, speed, gap = (
-        getattr(known, name) / getattr(unit, name) for name in ("length", "speed", "gap")
-    )
+    length, speed = known.length / unit.length, known.speed / unit.speed
     time = known.time / unit.time
-    slowest = trained.v_hw_min_mps, scenario.v_hw_min_mps
-    pool = trained.v_pov0_mps[1] - trained.v_pov0_mps[0]
+    slower_mps = trained.v_hw_min_mps - speed * scenario.v_hw_min_mps
+    alike = {
+        "x_pov0_m": (length, 0.0),
+        "v_pov0_mps": (speed, slower_mps),
+        "v_vut0_mps": (speed, slower_mps),
+        "v_hw_min_mps": (speed, 0.0),
+        "v_hw_max_mps": (speed, 0.0),
+        "v_min_mps": (speed, 0.0),
+        "a_min_mps2": (speed / time, 0.0),
+        "a_max_mps2": (speed / time, 0.0),
+        "level0_a_mps2": (speed / time, 0.0),
+        "ttc_min_s": (time, 0.0),
+        "dx_crash_m": (length, 0.0),
+        "dx_critical_m": (known.gap / unit.gap, 0.0),
+    }
     sentences = []
-
-    def compare(name: str, low: float, high: float, margin: float) -> None:
+    for name, (factor, offset) in alike.items():
+        low, high = (factor * bound + offset for bound in scenario.bounds(name))
         known_low, known_high = trained.bounds(name)
+        pool = trained.bounds("v_pov0_mps" if name == "v_vut0_mps" else name)
+        margin = ALIKE * (pool[1] - pool[0] or abs(known_low))
         if low < known_low - margin or high > known_high + margin:
             sentences.append(
                 f"{name} {_range(*scenario.bounds(name))} is like {_range(low, high)} in "
                 f"{trained.name} (trained on {_range(known_low, known_high)})"
             )
-
-    low, high = (length * x for x in scenario.x_pov0_m)
-    compare("x_pov0_m", low, high, ALIKE * (trained.x_pov0_m[1] - trained.x_pov0_m[0]))
-    for name in ("v_pov0_mps", "v_vut0_mps"):
-        low, high = (slowest[0] + speed * (v - slowest[1]) for v in scenario.bounds(name))
-        compare(name, low, high, ALIKE * pool)
-    for name, factor in (
-        ("v_hw_min_mps", speed),
-        ("v_hw_max_mps", speed),
-        ("v_min_mps", speed),
-        ("a_min_mps2", speed / time),
-        ("a_max_mps2", speed / time),
-        ("level0_a_mps2", speed / time),
-        ("ttc_min_s", time),
-        ("dx_crash_m", length),
-        ("dx_critical_m", gap),
-    ):
-        like = factor * getattr(scenario, name)
-        compare(name, like, like, ALIKE * abs(getattr(trained, name)))
     return sentences
 
 

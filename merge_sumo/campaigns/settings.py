@@ -8,12 +8,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.campaigns.run import SETTINGS, SharedSettings, has_converged, scenario_of
+from merge_sumo.campaigns.again import CONTROLLERS
+from merge_sumo.campaigns.run import (
+    NAME_CHARACTERS,
+    SETTINGS,
+    SharedSettings,
+    has_converged,
+    scenario_of,
+)
 from merge_sumo.config import Search, changed
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.policies import policies_in, policies_name
+from merge_sumo.drivers.policies import policies_name
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome
@@ -28,7 +35,6 @@ from merge_sumo.scenario.scenario import (
     DEADLINE_S,
     MEMORY_GIB,
     OWN,
-    US23,
     Scenario,
     level_name,
 )
@@ -49,8 +55,13 @@ class CampaignSettings(SharedSettings):
 
     def __post_init__(self) -> None:
         check_fields(self)
-        for name in ("vut", "policies", "pov", "against"):
-            _check_text(name, getattr(self, name))
+        for name in (*CONTROLLERS, "policies"):
+            text = getattr(self, name) or ""
+            if text != text.encode(errors="replace").decode():
+                raise UserError(
+                    f"`{name}` is {text!r}: it has bytes that are not UTF-8, which campaign.json "
+                    "cannot record; use another name"
+                )
         criterion = self.criterion
         object.__setattr__(self, "fail_when", criterion.fail_when)
         object.__setattr__(self, "require", criterion.require)
@@ -58,13 +69,13 @@ class CampaignSettings(SharedSettings):
         self.vut_options(None)
         self.new_sampler()
         check_tolerated(self.tolerated)
-        for name, least in {"cases": 1, "batch": 1, "in_flight": 1, "repeat": 1, "seed": 0}.items():
+        if self.seed < 0:
+            raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
+        for name in ("cases", "batch", "in_flight", "repeat"):
             number = getattr(self, name)
-            if isinstance(number, int) and number < least:
-                raise UserError(f"`{name}` is {number}: it must be {least} or more")
-        for name in ("batch", "in_flight", "repeat"):
-            number = getattr(self, name)
-            if isinstance(number, int) and number > self.cases:
+            if number is not None and number < 1:
+                raise UserError(f"`{name}` is {number}: it must be 1 or more")
+            if number is not None and number > self.cases:
                 raise UserError(
                     f"`{name}` is {number} and `cases` is {self.cases}: it cannot be more"
                 )
@@ -159,24 +170,6 @@ class CampaignSettings(SharedSettings):
         return Pool(levels=self.levels, scenario=self.scenario)
 
 
-RECORDED_BY_DEFAULT = {
-    **{f.name: f.default for f in fields(CampaignSettings) if f.default is not MISSING},
-    "scenario": US23.to_record(),
-}
-"""What the settings were in a campaign that does not record them."""
-
-
-def _check_text(name: str, text: str | None) -> None:
-    """Raise `UserError` for bytes of a command line that are no text, which no record can hold."""
-    try:
-        (text or "").encode()
-    except UnicodeEncodeError:
-        raise UserError(
-            f"`{name}` is {text!r}: it has bytes that are not UTF-8, which campaign.json cannot "
-            "record; use another name"
-        ) from None
-
-
 def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:
     """Return what `campaign.json` holds: everything that decides the outcomes."""
     folder = None if settings.policies is None else policies_name(plan.povs.policies)
@@ -200,16 +193,16 @@ def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
         b: that of another campaign; files that only one of both recorded decide nothing.
         level: the level.
     """
+    if level == OWN and a.get("pov") != b.get("pov"):
+        return False
     name = "pov_files" if level == OWN else "policies_sha256"
-    one, other = (known if isinstance(known := r.get(name), dict) else {} for r in (a, b))
-    both = one.keys() & other.keys()
-    deciding = both if level == OWN else both & {POLICIES.get(level)}
-    same_name = level != OWN or a.get("pov") == b.get("pov")
-    return same_name and all(one[key] == other[key] for key in deciding)
-
-
-MOST_SHOWN = 200
-"""Characters of a spec in a message."""
+    files, others = a.get(name), b.get(name)
+    if not (isinstance(files, dict) and isinstance(others, dict)):
+        return True
+    for file in files.keys() & others.keys():
+        if files[file] != others[file] and (level == OWN or file == POLICIES.get(level)):
+            return False
+    return True
 
 
 def settings_of(
@@ -236,13 +229,11 @@ def settings_of(
     for name, spec in controllers(record).items():
         if name not in explicit:
             raise UserError(
-                f"{folder} was run with {name} {printable(spec)[:MOST_SHOWN]}, and a run folder "
-                f"names no code to run: name it again with `{name}`"
+                f"{folder} was run with {name} {printable(spec[:NAME_CHARACTERS])}, and a run "
+                f"folder names no code to run: name it again with `{name}`"
             )
     if not isinstance(record.get("scenario"), Scenario):
         record["scenario"] = scenario_of(record, folder / SETTINGS)
-    if isinstance(record.get("policies"), str) and "policies" not in explicit:
-        _check_still_there(folder, record["policies"])
     known = {}
     for field in fields(CampaignSettings):
         if field.name in record:
@@ -257,17 +248,9 @@ def settings_of(
 
 def controllers(record: Mapping[str, Any]) -> dict[str, str]:
     """Return the controllers of a record that are code of a user's, by the name of the setting."""
-    named = {name: record.get(name) for name in ("vut", "pov", "against")}
-    return {
-        name: spec for name, spec in named.items() if isinstance(spec, str) and names_code(spec)
-    }
-
-
-def _check_still_there(folder: Path, policies: str) -> None:
-    try:
-        policies_in(policies)
-    except UserError:
-        raise UserError(
-            f"{folder} was run with the policies in {policies}, and there are none any more: name "
-            "the folder where they are now with `policies`"
-        ) from None
+    found = {}
+    for name in CONTROLLERS:
+        spec = record.get(name)
+        if isinstance(spec, str) and names_code(spec):
+            found[name] = spec
+    return found

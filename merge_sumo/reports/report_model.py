@@ -116,7 +116,7 @@ class ReportModel:
         explain = again("explain", run.folder, run.record, INDEX)
         before, _, after = explain.partition(str(INDEX))
         if explain.startswith("ms."):
-            after += f"; {call('report', [run.folder])}"
+            after += f"; {call('report', run.folder)}"
         else:
             after += f" && {command('report', run.folder)}"
         self.explain = before, after

@@ -7,7 +7,6 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,6 @@ from merge_sumo.analysis.comparison import Change, compare_against
 from merge_sumo.campaigns.run import AGAINST, OUTCOMES, Run
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.scenario.case import Case, Pool, to_unit
@@ -81,7 +79,6 @@ class TestFinds:
         run = run_campaign(settings(cases=10), Path("run"))
         earlier = run.earlier()
         assert earlier.settings.vut == "old.py:f"
-        assert [o.case for o in earlier.outcomes] == [o.case for o in run.outcomes]
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
         path = Path("run") / AGAINST / OUTCOMES
         path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
@@ -89,30 +86,14 @@ class TestFinds:
             run.earlier()
 
 
-class TestBytes:
-    @pytest.fixture
-    def whole(self) -> bytes:
-        run_campaign(settings(), Path("whole"))
-        return lines(Path("whole"))
-
-    def test_are_the_same_after_a_stop_between_the_two_versions(self, whole):
-        left = 2
-
-        def stop(_) -> None:
-            nonlocal left
-            left -= 1
-            if not left:
-                raise Stopped(signal.SIGINT)
-
-        with pytest.raises(Stopped):
-            run_campaign(settings(), Path("run"), callbacks=[stop])
-        ran = len(Run(Path("run")).outcomes)
-        # The batch of the old version is written first: here the new one's was not.
-        kept = (Path("run") / OUTCOMES).read_bytes().splitlines(keepends=True)[:5]
-        (Path("run") / OUTCOMES).write_bytes(b"".join(kept))
-        assert len(kept) < ran == len(Run(Path("run") / AGAINST).outcomes)
-        resume_campaign(Path("run"))
-        assert lines(Path("run")) == whole
+def test_the_bytes_are_the_same_after_a_stop_between_the_two_versions():
+    run_campaign(settings(), Path("whole"))
+    run_campaign(settings(cases=10), Path("run"))
+    # The batch of the old version is written first: of the new one's, half is not.
+    path = Path("run") / OUTCOMES
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
+    resume_campaign(Path("run"), {"cases": 20})
+    assert lines(Path("run")) == lines(Path("whole"))
 
 
 class TestRefuses:

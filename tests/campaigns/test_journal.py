@@ -9,19 +9,15 @@ import math
 import os
 import resource
 from dataclasses import replace
-from typing import get_type_hints
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from support.handmade import FOLLOWED_UP
 
 from merge_sumo.campaigns.journal import Journal, to_line
-from merge_sumo.campaigns.run import FILES, OUTCOMES, Run, read_outcomes, read_settings
+from merge_sumo.campaigns.run import Run, read_outcomes, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import OURS, Measures
-from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.merge import centre_lines, road_for
 from merge_sumo.scenario.case import Case
@@ -33,48 +29,6 @@ SPEC_FIELDS = [
     *("score", "dx_m", "dv_mps", "ttc_s", "pet_s", "t_end_s"),
 ]
 """The record of SPEC 10 up to its dots; "error" closes it."""
-
-examples = settings(max_examples=50, deadline=None)
-number = st.floats(allow_nan=False, allow_infinity=False)
-maybe = st.none() | number
-
-
-@st.composite
-def cases(draw) -> Case:
-    level = draw(st.sampled_from([0, 1, 2]))
-    svo = st.floats(0.0, math.nextafter(math.pi / 2, 0.0)) if level == 2 else st.none()
-    return Case(
-        level=level,
-        x_pov0_m=draw(st.floats(-900.0, 0.0)),
-        v_pov0_mps=draw(st.floats(0.0, 45.0)),
-        svo_rad=draw(svo),
-        v_vut0_mps=draw(st.floats(0.0, 45.0)),
-        scenario=US23,
-    )
-
-
-EVERYWHERE = [name for name, one in OURS.items() if not one.only_with]
-MAYBE = [n for n in EVERYWHERE if get_type_hints(OURS[n].of)["return"] == float | None]
-any_measures = st.builds(
-    Measures,
-    **dict.fromkeys(MAYBE, maybe),
-    end=st.sampled_from(End),
-    t_end_s=number,
-    severity=st.sampled_from([None, *(s.value for s in Severity)]),
-    vut_max_brake_mps2=number,
-    pov_max_brake_mps2=number,
-    merged_first=st.sampled_from([None, "VUT", "POV"]),
-    avoidable=st.none() | st.booleans(),
-    clipped_steps=st.integers(0, 300),
-    error=st.none() | st.text(),
-)
-any_outcome = st.builds(
-    Outcome,
-    index=st.integers(0, 10**6),
-    batch=st.integers(0, 10**5),
-    case=cases(),
-    measures=any_measures,
-)
 
 
 def episode(index: int, batch: int = 0, steps: int = 60) -> Episode:
@@ -102,14 +56,17 @@ def assert_sentence(error: pytest.ExceptionInfo[UserError], *parts: str) -> None
 
 
 class TestARecord:
-    @examples
-    @given(any_outcome)
-    def test_survives_to_the_last_bit(self, outcome):
-        assert Outcome.from_json(json.dumps(outcome.to_record()), scenario=US23) == outcome
-        line = to_line(outcome)
-        again = Outcome.from_json(line, scenario=US23)
-        assert again == outcome
-        assert to_line(again) == line, "repr tells floats apart that == does not: -0.0 and 0.0"
+    def test_survives_to_the_last_bit(self, run):
+        # repr tells floats apart that == does not: -0.0 and 0.0.
+        odd = {"ttc_s": -0.0, "dx_m": 5e-324, "score": -1e300, "error": "é\n\u2028\""}
+        record = {**run.outcomes[0].to_record(), **odd}
+        text = json.dumps(record) + "\n"
+        assert to_line(Outcome.from_json(text, scenario=US23)) == text
+        for outcome in run.outcomes:
+            line = to_line(outcome)
+            again = Outcome.from_json(line, scenario=US23)
+            assert again == outcome
+            assert to_line(again) == line
 
     def test_has_the_fields_of_the_specification_in_their_order(self):
         names = [n for n in episode(0).outcome.to_record() if n in (*SPEC_FIELDS, *OURS)]
@@ -117,60 +74,34 @@ class TestARecord:
         assert names[-len(FOLLOWED_UP) :] == list(FOLLOWED_UP)
 
 
+def read(text: bytes) -> tuple[list[Outcome], bool]:
+    return read_outcomes(text, "outcomes.jsonl", scenario=US23)
+
+
 class TestReading:
     def test_drops_a_last_line_that_is_torn_at_any_byte(self):
         whole, last = b"".join(lines_of(2)), lines_of(3)[2]
         before = [episode(0).outcome, episode(1).outcome]
         for cut in range(1, len(last)):
-            assert read_outcomes(whole + last[:cut], "outcomes.jsonl", scenario=US23) == (
-                before,
-                True,
-            )
-        assert len(read_outcomes(whole + last, "outcomes.jsonl", scenario=US23)[0]) == 3
+            assert read(whole + last[:cut]) == (before, True)
+        assert len(read(whole + last)[0]) == 3
 
-    @pytest.mark.parametrize(
-        ("order", "line"),
-        [([1, 0, 2], 1), ([0, 2, 1], 2), ([0, 0, 1], 2), ([0, 2], 2), ([0, 1, 1], 3)],
-    )
+    @pytest.mark.parametrize(("order", "line"), [([1, 0, 2], 1), ([0, 2], 2), ([0, 1, 1], 3)])
     def test_names_the_first_line_that_is_not_in_its_place(self, order, line):
         lines = lines_of(3)
         with pytest.raises(UserError) as error:
-            read_outcomes(
-                b"".join(lines[index] for index in order), "outcomes.jsonl", scenario=US23
-            )
+            read(b"".join(lines[index] for index in order))
         assert_sentence(error, f"line {line} ")
 
     @pytest.mark.parametrize(
         ("field", "value"),
-        [
-            ("index", True),
-            ("batch", None),
-            ("level", 4),
-            ("x_pov0_m", "-200"),
-            ("v_vut0_mps", None),
-            ("svo_rad", 0.3),
-            ("end", "ARRIVED"),
-            ("score", math.nan),
-            ("dx_m", "near"),
-            ("clipped_steps", 1.5),
-        ],
+        [("index", True), ("level", 4), ("svo_rad", 0.3), ("end", "ARRIVED"), ("score", math.nan)],
     )
     def test_refuses_a_value_of_the_wrong_type(self, field, value):
         record = {**episode(0).outcome.to_record(), field: value}
         with pytest.raises(UserError) as error:
-            read_outcomes(json.dumps(record).encode() + b"\n", "outcomes.jsonl", scenario=US23)
+            read(json.dumps(record).encode() + b"\n")
         assert_sentence(error, "line 1")
-
-
-def test_a_run_with_measures_of_an_absent_package_names_the_package(tmp_path):
-    settings = {"vut": "design1", "levels": [0], "versions": {"python": "3.11", "speedy": "1.0"}}
-    journal = Journal.create(tmp_path / "run", settings)
-    journal.append([episode(0)])
-    Run(tmp_path / "run")
-    path = tmp_path / "run" / OUTCOMES
-    path.write_bytes(path.read_bytes().replace(b'"error"', b'"mean_speed_mps": 1.0, "error"'))
-    with pytest.raises(UserError, match=r"with speedy 1\.0, which is not installed"):
-        Run(tmp_path / "run")
 
 
 class TestAJournal:
@@ -190,22 +121,17 @@ class TestAJournal:
             assert again.motion.tobytes() == ran[index].trajectory.motion.tobytes()
             assert again.case == ran[index].trajectory.case
 
-    def test_notes_files_and_cases_that_ran_again(self, tmp_path):
+    def test_notes_what_episodes_tell_of_the_settings(self, tmp_path):
+        first = replace(episode(0), files={"a": "2", "b": "3"}, again=True)
+        second = replace(episode(1, 1), pov_files={"c": "4"})
         with Journal.create(tmp_path / "run", {"vut_files": {"a": "1"}, "pov_files": None}) as to:
-            to.append([replace(episode(0), files={"a": "2", "b": "3"}, again=True)])
-            to.append([replace(episode(1, 1), pov_files={"c": "4"})])
-        noted = {"vut_files": {"a": "1", "b": "3"}, "pov_files": {"c": "4"}, "ran_again": 1}
-        assert read_settings(tmp_path / "run") == noted
-
-    def test_notes_in_how_many_cases_a_command_was_in_vain(self, tmp_path):
-        with Journal.create(tmp_path / "run", dict.fromkeys(FILES)) as to:
-            for number, commands in enumerate([("a", "b"), (), ("a",)]):
-                one = episode(number, number)
-                trajectory = replace(one.trajectory, in_vain=commands)
-                to.append([replace(one, trajectory=trajectory)])
+            for one, in_vain in ((first, ("a", "b")), (second, ("a",))):
+                to.append([replace(one, trajectory=replace(one.trajectory, in_vain=in_vain))])
         assert read_settings(tmp_path / "run") == {
-            **dict.fromkeys(FILES),
+            "vut_files": {"a": "1", "b": "3"},
+            "pov_files": {"c": "4"},
             "in_vain": {"a": 2, "b": 1},
+            "ran_again": 1,
         }
 
     def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,6 @@ class TestRoom:
         ("how", "asked"),
         [
             ({"cases": 5, "batch": 2}, [(2, 0, 0), (2, 2, 0), (1, 4, 0)]),
-            ({"cases": 7, "size": 3, "first": 2}, [(2, 0, 0), (3, 2, 0), (2, 5, 0)]),
             ({"cases": 4, "in_flight": 3}, [(1, 0, 0), (1, 0, 1), (1, 0, 2), (1, 1, 2)]),
             ({"cases": 3, "in_flight": 1}, [(1, 0, 0), (1, 1, 0), (1, 2, 0)]),
         ],
@@ -119,6 +119,14 @@ class TestRoom:
         monkeypatch.setattr(Asked, "learns", False)
         asked = self.asked(9, batch=2, stop=lambda known: len(known) >= 4)
         assert asked == [(2, 0, 0), (2, 2, 0)]
+
+
+@pytest.mark.parametrize("how", [{"batch": 9}, {"batch": 4}, {"in_flight": 8}])
+def test_every_case_runs_as_often_as_stated_however_batches_are_cut(how):
+    ran = found(make_sampler("coverage", POOL, 1), 26, draws=3, **how)
+    runs = Counter(one.outcome.case.start for one in ran)
+    assert list(runs.values()) == [3] * 8 + [2]
+    assert [one.outcome.case.draw for one in ran] == [0, 1, 2] * 8 + [0, 1]
 
 
 @pytest.mark.slow
@@ -153,10 +161,6 @@ def recorded(folder: Path) -> dict[str, bytes]:
     return {file.name: file.read_bytes() for file in files}
 
 
-def outcomes(folder: Path) -> bytes:
-    return recorded(folder)[OUTCOMES]
-
-
 @pytest.fixture(scope="module")
 def two():
     with open_workers(2) as opened:
@@ -181,12 +185,11 @@ def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two
     assert recorded(tmp_path / "1") == recorded(tmp_path / "2")
 
 
-class TestAhead:
-    def test_a_campaign_records_the_same_bytes(self, in_turn, tmp_path):
-        seen = []
-        run_campaign(UNIFORM, tmp_path / "run", on_case=lambda one: seen.append(one.index))
-        assert recorded(tmp_path / "run") == in_turn
-        assert seen == list(range(90))
+def test_cases_ahead_are_recorded_as_in_turn(in_turn, tmp_path):
+    seen: list[int] = []
+    run_campaign(UNIFORM, tmp_path / "run", on_case=lambda one: seen.append(one.index))
+    assert recorded(tmp_path / "run") == in_turn
+    assert seen == list(range(90))
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,6 @@ OWN = SHY.format(remember="self.shy = True", remembered="self.shy")
 IN_ITS_MODULE = "import collections\nSEEN = collections.Counter()\nclass Vut:\n" + SHY.format(
     remember="SEEN['near'] += 1", remembered="SEEN['near'] % 7 == 3"
 )
-RANDOM = "import random\ndef Vut(seen):\n    return 1.0 + random.random() / 100.0\n"
 
 
 @pytest.fixture
@@ -82,17 +81,6 @@ def test_what_remembers_is_said_everywhere_but_is_no_other_case(vut, tmp_path):
     assert "keeps something from earlier episodes" in checked.stdout
 
 
-@pytest.mark.parametrize(("source", "chance"), [(RANDOM, True), (IN_ITS_MODULE, False)])
-def test_where_cases_repeat_chance_is_expected_and_memory_is_not(vut, tmp_path, source, chance):
-    run = campaign(vut(source), tmp_path / "run", cases=60, repeat=2)
-    differing = [one for one in read_repeats(run) if not one.same]
-    assert differing
-    assert {one.drawn for one in differing} == {chance}
-    said = unrepeatable(differing)
-    assert (said is None) is chance
-    assert chance or "The VUT keeps something from earlier episodes: " in str(said)
-
-
 def test_drivers_of_the_package_run_once_and_a_client_that_nobody_starts_is_not_waited_for(run):
     assert read_repeats(run) == []
     assert not (run.folder / REPEATS).exists()
@@ -112,7 +100,6 @@ HONEST = to_plain(Repeat(3, 1.5, "vut", End.MERGED, failed=False, other_verdict=
         {"index": 60},
         {"differs_from_s": 1e300},
         {"first": "<script>"},
-        {"more": 1},
     ],
 )
 def test_a_file_that_somebody_changed_is_refused_by_its_line(run, tmp_path, change):

@@ -22,7 +22,7 @@ from support.campaigning import campaign_settings, run_campaign
 import merge_sumo as ms
 from merge_sumo import testing
 from merge_sumo.campaigns import journal
-from merge_sumo.campaigns.again import again, call_again, command
+from merge_sumo.campaigns.again import again, command
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.interrupt import Stopped
 from merge_sumo.road.scenario_file import to_toml
@@ -192,7 +192,7 @@ def test_runs_of_an_object_of_a_notebook(place):
     explained = ms.explain(run, worst, vut=here, progress=False)
     found |= set(commands_in("\n".join(explained.lines())))
     assert any(one.startswith('ms.campaign(vut="design2", against=MyVut') for one in found)
-    found |= {call_again("resume", run.folder, run.settings)}
+    found |= {again("resume", run.folder, run.settings)}
     found |= {again("run", run.folder, run.settings, worst, at={"x_pov0_m": -250.0})}
     calls = {one for one in found if one.startswith("ms.")}
     assert len(calls) >= 5

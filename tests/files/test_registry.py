@@ -71,13 +71,3 @@ def test_the_working_folder_is_data(install, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", ["", ".", *sys.path])
     assert list(registry()) == ["ours", "other"]
-
-
-def test_an_object_may_be_registered_in_this_process():
-    tools = registry()
-    assert tools.register("mine", int) is int
-    assert (tools["mine"], list(tools)[-1]) == (int, "mine")
-    with pytest.raises(UserError, match="registered already"):
-        tools.register("ours", int)
-    with pytest.raises(UserError, match="not a class"):
-        tools.register("third", 3)  # type: ignore[arg-type]

@@ -266,7 +266,7 @@ class TestADaskCluster:
         keywords |= {"cases": 20_000, "out": folder, "workers": address}
         with pytest.raises(WorkersLostError) as lost:
             api.campaign("design1", on_case=lambda _: scheduler.kill(), **keywords)
-        note = f'stopped; go on with ms.resume("{folder}", workers="{address}")'
+        note = f"go on with: merge-sumo campaign --resume {folder} --workers {address}"
         assert lost.value.__notes__ == [note]
         assert lost.value._render_traceback_()[-1] == note
 
