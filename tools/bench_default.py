@@ -7,14 +7,13 @@ the median of the runs in seconds and in units, with the least and the largest.
 
 from __future__ import annotations
 
-import argparse
 import subprocess
 import sys
 import tempfile
-import time
+from functools import partial
 from statistics import median
 
-from bench_record import add_record_option, append_record
+from measuring import append_record, benchmark_parser, seconds, spread
 
 UNIT = """
 import numpy as np
@@ -27,31 +26,23 @@ for _ in range(6):
 """
 
 
-def seconds(*command: str, folder: str) -> float:
-    """Return how long a command takes."""
-    start_s = time.perf_counter()
-    subprocess.run(command, check=True, capture_output=True, cwd=folder)
-    return time.perf_counter() - start_s
-
-
 def main() -> None:
     """Print the figures."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--program", default="merge-sumo", help="another installation's program")
-    add_record_option(parser)
     options = parser.parse_args()
     took, units = [], []
     with tempfile.TemporaryDirectory() as folder:
-        unit_s = [seconds(sys.executable, "-c", UNIT, folder=folder)]
+        run = partial(subprocess.run, check=True, capture_output=True, cwd=folder)
+        unit = partial(run, (sys.executable, "-c", UNIT))
+        unit_s = [seconds(unit)]
         for number in range(options.runs):
             command = (options.program, "campaign", "--vut", "design2", "--out", f"run-{number}")
-            took.append(seconds(*command, folder=folder))
-            unit_s.append(seconds(sys.executable, "-c", UNIT, folder=folder))
+            took.append(seconds(partial(run, command)))
+            unit_s.append(seconds(unit))
             units.append(took[-1] / (0.5 * (unit_s[-1] + unit_s[-2])))
-    line = f"{median(took):.1f} s [{min(took):.1f}, {max(took):.1f}], {median(units):.1f} units "
-    line += f"[{min(units):.1f}, {max(units):.1f}]; a unit takes {median(unit_s):.2f} s"
-    print(line)
+    print(f"{spread(took, 1)} s, {spread(units, 1)} units; a unit takes {median(unit_s):.2f} s")
     append_record(options.record, "default", {"seconds": median(took), "units": median(units)})
 
 

@@ -1,4 +1,4 @@
-"""Measure the SUMO host beside its peers, all in one run: `python tools/bench_host.py`.
+"""Compare the SUMO host with its peers, all in one run: `python tools/bench_host.py`.
 
     host     rollouts of the rule-based VUT against the level-0 POV: drivers, commands, positions
              read back from SUMO and checked at every step, refills, trajectories
@@ -14,17 +14,16 @@ spread in brackets. A step is that of a corridor with all its vehicles.
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 import libsumo
 import numpy as np
 import traci
-from bench_record import add_record_option, append_record
+from measuring import append_record, benchmark_parser, spread
 
 from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.base import Driver, Scene
@@ -197,49 +196,24 @@ def measured(scenario: Scenario, k: int, count: int, rounds: int) -> dict[str, l
 
 
 def main() -> None:
-    """Print a table, or with --json one object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    add_record_option(parser)
+    """Print a table."""
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--cases", type=int, default=1280, help="cases per round and K")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--processes", type=int, default=5, help="cases with a process each")
     options = parser.parse_args()
-
-    traffic = named_scenario("us23-traffic")
-    rows = {
-        (scenario.vehicles, k): measured(scenario, k, options.cases, options.rounds)
-        for scenario, ks in ((US23, KS), (traffic, (32,)))
-        for k in ks
-    }
+    worlds = [(US23, k) for k in KS] + [(named_scenario("us23-traffic"), 32)]
+    print(f"{'A':>2} {'K':>4}  us per step, cases per s, ratio to bare, ratio to step")
+    figures: dict[str, Any] = {}
+    for scenario, k in worlds:
+        row = measured(scenario, k, options.cases, options.rounds)
+        figures[f"A = {scenario.vehicles}, K = {k}"] = row
+        print(f"{scenario.vehicles:>2} {k:>4}  {', '.join(map(spread, row.values()))}", flush=True)
     process = statistics.median(process_s(cases_of(US23, options.processes)))
-    medians = {
-        k: {name: statistics.median(x) for name, x in row.items()} for k, row in rows.items()
-    }
-    ratio_to_process = process * medians[2, 32]["cases_per_s"]
-    alone = {k: row for (vehicles, k), row in medians.items() if vehicles == 2}
-    result = {
-        "us_per_pair_step": {k: row["us"] for k, row in alone.items()},
-        "cases_per_s": {k: row["cases_per_s"] for k, row in alone.items()},
-        "ratio_to_bare": alone[32]["to_bare"],
-        "ratio_to_bare_by_k": {k: row["to_bare"] for k, row in alone.items()},
-        "ratio_to_step_by_k": {k: row["to_step"] for k, row in alone.items()},
-        "in_traffic": medians[traffic.vehicles, 32],
-        "ratio_to_traci_process": ratio_to_process,
-        "s_per_traci_process_case": process,
-    }
-    append_record(options.record, "host", result)
-    if options.json:
-        print(json.dumps(result))
-        return
-    print(
-        f"{'A':>2} {'K':>4} {'us per step':>24} {'cases per s':>24} "
-        f"{'ratio to bare':>20} {'to step':>20}"
-    )
-    for (vehicles, k), row in rows.items():
-        cells = [f"{statistics.median(x):.2f} [{min(x):.2f}, {max(x):.2f}]" for x in row.values()]
-        print(f"{vehicles:>2} {k:>4} {cells[0]:>24} {cells[1]:>24} {cells[2]:>20} {cells[3]:>20}")
-    print(f"a TraCI process per case: {process:.3f} s, {ratio_to_process:.0f} times K = 32")
+    ratio = process * statistics.median(figures["A = 2, K = 32"]["cases_per_s"])
+    print(f"a TraCI process per case: {process:.3f} s, {ratio:.0f} times K = 32")
+    figures |= {"s_per_traci_process_case": process, "ratio_to_traci_process": ratio}
+    append_record(options.record, "host", figures)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,6 @@
-"""How well a POV that knows a merge at M plays beside an acceleration lane: its regret.
+"""Measure the regret on an acceleration lane of a POV that knows a merge at M.
 
     python tools/bench_lane.py [--cases 300] [--seed 1]
-
-First what the POV gains before the merge:
 
 The VUT drives the level-0 profile and merges at a place that the POV does not know: where the lane
 begins, at M, in the middle of the rest, at the lane's end. The POV is that of level 1 by the rule
@@ -16,11 +14,10 @@ level 0: by ACC, as they do, and by IDM.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 
 import numpy as np
-from bench_record import add_record_option, append_record
+from measuring import append_record, benchmark_parser
 
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
@@ -98,7 +95,6 @@ def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
             f"{place_m:7.0f} {regret.mean():12.1%} {np.quantile(regret, 0.99):12.1%}"
             f"{(reached.safe < crash).mean():13.1%} {(best < crash).mean():13.1%}"
         )
-
     return means
 
 
@@ -119,10 +115,9 @@ def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
 
 def main() -> None:
     """Print the regret by the place of the merge, and the braking after it."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--cases", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
-    add_record_option(parser)
     arguments = parser.parse_args()
     scenario = named_scenario("us23-lane")
     assert scenario.lane_m is not None, "a lane"  # noqa: S101

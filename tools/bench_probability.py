@@ -1,6 +1,6 @@
-"""Measure the intervals of `probability`: how often they hold, and how wide they are.
+"""Measure the coverage and width of the intervals of `probability`.
 
-`python tools/bench_probability.py`
+    python tools/bench_probability.py
 
 After a campaign of 400 cases of `design1` at level 0, with 200 seeds: how many intervals of 600 and
 of 100,000 fresh cases hold the probability, and their mean width as a ratio to that of Clopper and
@@ -10,12 +10,11 @@ is one of its cases in the same stratum, so that each verdict is the simulation'
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from bench_record import add_record_option, append_record
+from measuring import append_record, benchmark_parser
 
 from merge_sumo.analysis.exposure import read_distribution
 from merge_sumo.analysis.probability import (
@@ -40,15 +39,14 @@ CAMPAIGN = CampaignSettings(vut="design1", levels=(0,), cases=400, seed=5, scena
 
 def main() -> None:
     """Print how many intervals hold, and how wide they are."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--truth-cases", type=int, default=1_000_000)
-    add_record_option(parser)
-    given = parser.parse_args()
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         plan = resolve(CAMPAIGN)
         study = RunStudy(run_campaign(CAMPAIGN, plan, Path(folder) / "run"), CAMPAIGN, plan)
         cells = expected_cells(study, read_distribution(None, (0,), US23))
-    truth = truth_of("design1", 0, cases=given.truth_cases).truths[0]
+    truth = truth_of("design1", 0, cases=options.truth_cases).truths[0]
     failing = truth.margin < 0.0
     shape = cells_of(US23, 0)
     number = np.ravel_multi_index(tuple((truth.points * shape).astype(np.int64).T), shape)
@@ -71,7 +69,7 @@ def main() -> None:
         ratio = float(np.mean(widths)) / (high - low)
         print(f"{cases:,} cases: {held} of {len(SEEDS)} hold {p:.4f}, width {ratio:.2f} of plain")
         figures[str(cases)] = {"held": held, "width": ratio}
-    append_record(given.record, "probability", figures)
+    append_record(options.record, "probability", figures)
 
 
 if __name__ == "__main__":

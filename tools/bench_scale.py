@@ -1,52 +1,47 @@
-"""Measure how cost and memory grow with the number of cases: `python tools/bench_scale.py`.
+"""Measure how cost and memory grow with the number of cases.
 
-    truth     uniform cases of the rule-based VUT against the level-0 POV through the workers that
-              `truth` uses: cases per second and the largest memory of a worker process
-    workers   the same cases on one worker process and on two, in turns, beside a loop that only
-              computes, on one process and on two: what the machine itself can give
-    engines   verdicts on uniform cases of design2 at level 2 by SUMO and by the kinematic engine,
-              which runs one case of a hundred in SUMO as well: CPU time per case, in turns
-    in-flight the whole command of a campaign whose VUT sleeps --case-s for a case, with --in-flight
-              on sixteen workers and in batches on one, and cases to .9 of the truth of design2 with
-              both. One worker is computed from a run with a VUT that sleeps hardly at all, and the
-              computation is compared with a measurement on few cases
-    campaign  the whole command of a uniform campaign of design2, from its start to the report, on
-              one worker and on two, in turns
-    default   the whole command of the default campaign of design2, 800 cases by `coverage` at three
-              levels, on one worker and on two, in turns
-    parent    cases per second that the process takes that asks, tells and keeps, where workers are
-              no limit, and how many workers like the one above that feeds
-    samplers  seconds that each sampler takes for a batch, after a history of that many cases
-    files     reading `outcomes.jsonl`, FMC and regions of its failures, the report
+    python tools/bench_scale.py [PART...]
 
-Everything is measured in one run; `--most 1000000` goes on to a million uniform cases. `--only
-workers campaign parent` leaves out the others.
+    truth      uniform cases of the rule-based VUT against the level-0 POV on a worker process:
+               cases per second and the largest memory of a process
+    workers    the same cases on one worker process and on two, in turns, next to a loop that only
+               computes: what the machine itself can give. Then the cases per second of the process
+               that asks, tells and keeps, where workers are no limit, and how many workers that
+               feeds
+    engines    verdicts on uniform cases of design2 at level 2 by SUMO and by the kinematic engine,
+               which runs one case of a hundred in SUMO as well: CPU time per case, in turns
+    in-flight  the whole command of a campaign whose VUT sleeps for a case, with --in-flight on
+               sixteen workers and in batches on one, and cases to .9 of the truth of design2 with
+               both. One worker is computed from a run with a VUT that sleeps hardly at all, and the
+               computation is compared with a measurement on few cases
+    campaign   the whole command of a uniform campaign of design2, from its start to the report, on
+               one worker and on two, in turns
+    files      reading `outcomes.jsonl`, FMC and regions of its failures, the report
+
+Figures are medians with the least and the most. `--most 1000000` takes a million cases.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
 import pickle
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
-from bench_record import add_record_option, append_record
+from measuring import append_record, benchmark_parser, seconds, spread
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.analysis.truth import _margin_of, ground_truth
+from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.loop import SearchLoop
@@ -54,24 +49,26 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import fmc, regions
-from merge_sumo.metrics.outcome import Episode, Outcome
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.reports.report import write_report
-from merge_sumo.samplers.registry import SAMPLERS, make_sampler
-from merge_sumo.scenario.case import Pool, from_unit, to_unit
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.scenario.case import FloatArray, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import evaluate, simulate
 from merge_sumo.simulation.kinematic_simulator import CHUNK
 from merge_sumo.workers import Job, LocalProcesses, Workers
 
-VUT = "design1"
+UNIFORM = CampaignSettings(
+    vut="design1", levels=(0,), sampler="uniform", cases=400, batch=400, scenario=US23
+)
 ROUNDS = 5
-CAMPAIGN_ROUNDS = 5
 PAIR_CASES = 2000
 BATCH = 20
-DEFAULT_ROUNDS = 3
+CAMPAIGN_CASES = 20_000
+CASE_S, HARDLY_S = 1.0, 0.02
+FLIGHT_CASES, FEW_CASES = 800, 24
 FLIGHT, FLIGHT_WORKERS = 48, 16
 FLIGHT_SEEDS, SEARCHED = 5, 150
-HARDLY_S = 0.02
 SLEEPY = """
 import time
 class Sleepy:
@@ -81,10 +78,7 @@ class Sleepy:
         near = abs(seen.x_pov_m - seen.x_vut_m) < 9
         return 1.0 if seen.x_vut_m < -40 else -1.5 if near else 0.0
 """
-PARTS = (
-    *("truth", "workers", "engines", "in-flight", "campaign", "default", "parent", "samplers"),
-    "files",
-)
+Figures = dict[str, list[float]]
 
 
 def memory_mb() -> float:
@@ -92,22 +86,9 @@ def memory_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
 
 
-def margin_and_memory(episode: Episode) -> tuple[float, int, float]:
-    """Return what `truth` keeps of a case, which process ran it, and how large it is."""
-    margin, _, _ = _margin_of(episode)
-    return margin, os.getpid(), memory_mb()
-
-
-def compute(seconds: Sequence[float]) -> list[int]:
-    """Compute for some seconds; return how often for each."""
-    counts = []
-    for limit in seconds:
-        count, end = 0, time.perf_counter() + limit
-        while time.perf_counter() < end:
-            sum(range(1000))
-            count += 1
-        counts.append(count)
-    return counts
+def failed_and_memory(episode: Episode) -> tuple[bool, float]:
+    """Return the verdict on a case, and how large the process is that ran it."""
+    return episode.outcome.failed, memory_mb()
 
 
 def never(item: Any) -> Any:
@@ -115,173 +96,72 @@ def never(item: Any) -> Any:
     raise RuntimeError(f"a worker died at {item}")
 
 
-def local(count: int) -> Workers:
-    """Return worker processes that are never replaced, so that a leak would show."""
-    return Workers(LocalProcesses, count)
+def run_uniform(workers: Workers, points: FloatArray) -> float:
+    """Run the cases at points, (n, 2), and return the largest memory of a worker in MB."""
+    cases = Pool(levels=(0,), scenario=US23).cases(points, 0)
+    largest_mb = 0.0
+    for _, mb in evaluate(resolve(UNIFORM), cases, workers, failed_and_memory):
+        largest_mb = max(largest_mb, mb)
+    return largest_mb
 
 
-def truth(most: int) -> Iterator[dict[str, float]]:
-    """Yield cost and memory for 100, 1,000, ... cases, all in the same worker process."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
+def truth(most: int) -> Figures:
+    """Return cost and memory for 100, 1,000, ... cases, all in the same worker process."""
     rng = np.random.default_rng(0)
-    with local(1) as workers:
-        pool = Pool(levels=(0,), scenario=US23)
-        warm = pool.cases(rng.random((32, 2)), 0)
-        list(evaluate(plan, warm, workers, margin_and_memory))
+    figures: Figures = {}
+    with Workers(LocalProcesses, 1) as workers:
+        run_uniform(workers, rng.random((32, 2)))
         cases = 100
         while cases <= most:
-            points: Any = rng.random((cases, 2))
-            start, memory = time.perf_counter(), 0.0
-            for _, _, now in evaluate(plan, pool.cases(points, 0), workers, margin_and_memory):
-                memory = max(memory, now)
-            spent = time.perf_counter() - start
-            yield {
-                "cases": cases,
-                "cases_per_s": cases / spent,
-                "worker_mb": memory,
-                "this_process_mb": memory_mb(),
-            }
+            start_s = time.perf_counter()
+            worker_mb = run_uniform(workers, rng.random((cases, 2)))
+            rate = cases / (time.perf_counter() - start_s)
+            figures[f"{cases:,} cases: cases per s"] = [rate]
+            figures[f"{cases:,} cases: MB of the worker"] = [worker_mb]
+            figures[f"{cases:,} cases: MB of the main process"] = [memory_mb()]
             cases *= 10
+    return figures
 
 
-def two_workers() -> dict[str, list[float]]:
-    """Return the rates on two workers over those on one, round by round."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
-    points: Any = np.random.default_rng(1).random((PAIR_CASES, 2))
-    found: dict[str, list[float]] = {"cases": [], "computing": [], "cases_per_s_on_one": []}
-    with local(1) as one, local(2) as two:
+def compute(limits_s: Sequence[float]) -> list[int]:
+    """Compute for some times; return how often for each."""
+    counts = []
+    for limit_s in limits_s:
+        count, end = 0, time.perf_counter() + limit_s
+        while time.perf_counter() < end:
+            sum(range(1000))
+            count += 1
+        counts.append(count)
+    return counts
 
-        def seconds(workers: Workers) -> float:
-            start = time.perf_counter()
+
+def workers(_: int) -> Figures:
+    """Return the rates on two workers over those on one, and those of the main process."""
+    points = np.random.default_rng(1).random((PAIR_CASES, 2))
+    figures: Figures = {"cases on two over one": [], "computing on two over one": []}
+    figures["cases per s on one"] = []
+    with Workers(LocalProcesses, 1) as one, Workers(LocalProcesses, 2) as two:
+
+        def run_all(workers: Workers) -> None:
             for first in range(0, PAIR_CASES, 500):  # chunks of 250 on two workers
-                some = Pool(levels=(0,), scenario=US23).cases(points[first : first + 500], 0)
-                list(evaluate(plan, some, workers, margin_and_memory))
-            return time.perf_counter() - start
+                run_uniform(workers, points[first : first + 500])
 
-        def rate(workers: Workers, count: int) -> float:
-            return float(sum(workers.run(compute, [1.0] * count, never, chunk=1)))
+        def rate(workers: Workers) -> int:
+            counts = workers.run(compute, [1.0] * workers.count, never, chunk=1)
+            return sum(counts)
 
-        seconds(one), seconds(two)
+        run_all(one)
+        run_all(two)
         for _ in range(ROUNDS):
-            alone = seconds(one)
-            found["cases"].append(alone / seconds(two))
-            found["cases_per_s_on_one"].append(PAIR_CASES / alone)
-            found["computing"].append(rate(two, 2) / rate(one, 1))
-    return found
-
-
-def engines(cases: int, rounds: int) -> dict[str, list[float]]:
-    """Return the CPU time of a case by each engine, in us, and its ratio, round by round."""
-    plan = resolve(CampaignSettings(vut="design2", levels=(2,), scenario=US23))
-    plans = {"sumo": plan, "kinematic": plan.with_engine("kinematic")}
-    pool, rng = Pool(levels=(2,), scenario=US23), np.random.default_rng(2)
-    found: dict[str, list[float]] = {"sumo_us": [], "kinematic_us": [], "ratio": []}
-
-    def us(name: str, points: Any) -> tuple[float, list[bool]]:
-        simulate(plans[name], pool.cases(points[:200], 2))  # SUMO starts
-        start = time.process_time()
-        episodes = simulate(plans[name], pool.cases(points, 2))
-        spent_us = (time.process_time() - start) / len(points) * 1e6
-        return spent_us, [episode.outcome.failed for episode in episodes]
-
-    with threadpool_limits(1):
-        for _ in range(rounds):
-            points = rng.random((cases, 3))
-            by_name = {name: us(name, points) for name in plans}
-            (sumo, expected), (kinematic, failed) = by_name["sumo"], by_name["kinematic"]
-            if failed != expected:
-                raise RuntimeError("the engines disagree about a verdict")
-            found["sumo_us"].append(sumo)
-            found["kinematic_us"].append(kinematic)
-            found["ratio"].append(sumo / kinematic)
-    return found
-
-
-def whole_campaigns(rounds: int, *options: str) -> dict[str, list[float]]:
-    """Return the seconds of whole commands on one worker and on two, and their ratio, by round."""
-    found: dict[str, list[float]] = {"s_on_one": [], "s_on_two": [], "gain": []}
-    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "design2"]
-    command += [*options, "--quiet"]
-    with tempfile.TemporaryDirectory() as scratch:
-        for number in range(rounds):
-            spent = []
-            for workers in (1, 2):
-                out = ["--workers", str(workers), "--out", f"{scratch}/{number}-{workers}"]
-                start = time.perf_counter()
-                subprocess.run([*command, *out], check=True, stdout=subprocess.DEVNULL)
-                spent.append(time.perf_counter() - start)
-            found["s_on_one"].append(spent[0])
-            found["s_on_two"].append(spent[1])
-            found["gain"].append(spent[0] / spent[1])
-    return found
-
-
-def slow_campaign(folder: Path, case_s: float, cases: int, *options: str) -> tuple[float, int]:
-    """Return the seconds of a whole command whose VUT sleeps, and the number of cases that ran."""
-    folder.mkdir()
-    (folder / "sleepy.py").write_text(SLEEPY.format(case_s=case_s))
-    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--vut", "sleepy.py:Sleepy"]
-    command += ["--cases", str(cases), "--quiet", "--out", "run", *options]
-    start = time.perf_counter()
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, cwd=folder)
-    spent = time.perf_counter() - start
-    twice = folder / "run" / "repeats.jsonl"  # some cases run a second time
-    return spent, cases + (len(twice.read_bytes().splitlines()) if twice.exists() else 0)
-
-
-def slow_controllers(case_s: float, cases: int) -> dict[str, list[float]]:
-    """Return seconds of whole commands with a slow controller, and the gain of many workers.
-
-    With the cases to .9 of the truth, which the gain may cost.
-    """
-    few, one = 24, ("--workers", "1")
-    many = ("--workers", str(FLIGHT_WORKERS), "--in-flight", str(FLIGHT))
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
-        quick_s, ran = slow_campaign(folder / "quick", HARDLY_S, cases, *one)
-        few_quick_s, few_ran = slow_campaign(folder / "few-quick", HARDLY_S, few, *one)
-        few_s, _ = slow_campaign(folder / "few", case_s, few, *one)
-        many_s, _ = slow_campaign(folder / "many", case_s, cases, *many)
-    one_s = quick_s + ran * (case_s - HARDLY_S)
-    return cases_in_flight() | {
-        "s_on_one": [one_s],
-        "s_on_one_computed_over_measured": [(few_quick_s + few_ran * (case_s - HARDLY_S)) / few_s],
-        "s_on_many": [many_s],
-        "gain": [one_s / many_s],
-    }
-
-
-def cases_to_most(in_flight: int | None, seed: int, levels: tuple[int, ...]) -> float:
-    """Return the cases until `coverage` has .9 of the truth of design2; infinite for not yet."""
-    settings = CampaignSettings(
-        vut="design2",
-        levels=levels,
-        scenario=US23,
-        cases=SEARCHED,
-        seed=seed,
-        in_flight=in_flight,
-    )
-    plan = resolve(settings)
-    target = 0.9 * sum(fmc(ground_truth(plan, level).failures) for level in levels)
-    with tempfile.TemporaryDirectory() as scratch:
-        found = run_campaign(settings, plan, Path(scratch) / "run").outcomes
-    for count in range(5, SEARCHED + 1, 5):
-        failing = [o.case for o in found[:count] if o.failed]
-        at = {level: [case for case in failing if case.level == level] for level in levels}
-        if sum(fmc(to_unit(at[level], level, scenario=US23)) for level in levels) >= target:
-            return float(count)
-    return float("inf")
-
-
-def cases_in_flight() -> dict[str, list[float]]:
-    """Return the cases to .9 of the truth by seed, in batches and in flight."""
-    return {
-        f"cases_to_0.9_at_{name}_{how}": [
-            cases_to_most(in_flight, seed, levels) for seed in range(FLIGHT_SEEDS)
-        ]
-        for name, levels in (("all_levels", (0, 1, 2)), ("level_1", (1,)))
-        for how, in_flight in (("in_batches", None), ("in_flight", FLIGHT))
-    }
+            alone_s = seconds(partial(run_all, one))
+            figures["cases on two over one"].append(alone_s / seconds(partial(run_all, two)))
+            figures["cases per s on one"].append(PAIR_CASES / alone_s)
+            figures["computing on two over one"].append(rate(two) / rate(one))
+    handled = [main_process_rate(CAMPAIGN_CASES) for _ in range(ROUNDS)]
+    figures["cases per s of the main process"] = handled
+    rate_on_one = median(figures["cases per s on one"])
+    figures["workers that it feeds"] = [rate / rate_on_one for rate in handled]
+    return figures
 
 
 class Served(Workers):
@@ -300,149 +180,184 @@ class Served(Workers):
         return episodes
 
 
-def parent(cases: int) -> float:
+def main_process_rate(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
-    plan = resolve(CampaignSettings(vut=VUT, levels=(0,), scenario=US23))
-    pool = Pool(levels=(0,), scenario=US23)
+    plan, pool = resolve(UNIFORM), UNIFORM.pool
     served = Served(simulate(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
-    sampler = make_sampler("uniform", pool, 0)
-    search = SearchLoop(sampler, plan, cases, workers=served, batch=BATCH)
-    with (
-        tempfile.TemporaryDirectory() as scratch,
-        Journal.create(Path(scratch) / "run", {}) as journal,
-    ):
-        start = time.perf_counter()
-        search.run(lambda groups: journal.append(*groups))
-        return cases / (time.perf_counter() - start)
-
-
-def history_of(count: int, seen: Sequence[Outcome]) -> list[Outcome]:
-    """Return a history of that many outcomes: new places for what was measured once."""
-    rng = np.random.default_rng(2)
-    cases = from_unit(rng.random((count, 2)), 0, scenario=US23)
-    outcomes = []
-    for index, case in enumerate(cases):
-        outcome = replace(seen[index % len(seen)], index=index, batch=index // BATCH, case=case)
-        outcomes.append(outcome)
-    return outcomes
-
-
-def sampler_s(name: str, history: Sequence[Outcome]) -> float:
-    """Return the seconds for one batch after a history."""
-    sampler = make_sampler(name, Pool(levels=(0,), scenario=US23), 0)
-    sampler.tell(history)
-    return timed(partial(sampler.ask, BATCH))
-
-
-def timed(function: Callable[[], object]) -> float:
-    """Return the seconds that a function takes."""
-    start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
-
-
-def files(count: int, seen: Sequence[Outcome], folder: Path) -> dict[str, float]:
-    """Return the seconds for what is done with a finished campaign of that many cases."""
-    outcomes = history_of(count, seen)
-    text = "".join(map(to_line, outcomes)).encode()
-    run = Run(folder)
-    run.outcomes = outcomes
-    points = to_unit((outcome.case for outcome in failures(outcomes)), 0, scenario=US23)
-    found = {
-        "cases": float(count),
-        "failures": float(len(points)),
-        "file_mb": len(text) / 1e6,
-        "read_s": timed(lambda: read_outcomes(text, OUTCOMES, scenario=US23)),
-        "fmc_s": timed(lambda: fmc(points)),
-        "regions_s": timed(lambda: regions(points)),
-        "report_s": timed(lambda: write_report(run)),
-    }
-    found["report_mb"] = (folder / "report.html").stat().st_size / 1e6
-    return found
-
-
-def of_campaigns(chosen: argparse.Namespace, tell: Callable[[str], None]) -> dict[str, Any]:
-    """Return what samplers and files take after more and more outcomes."""
-    result: dict[str, Any] = {"samplers": {}, "files": []}
+    loop = SearchLoop(make_sampler("uniform", pool, 0), plan, cases, workers=served, batch=BATCH)
     with tempfile.TemporaryDirectory() as scratch:
-        settings = CampaignSettings(
-            vut=VUT, levels=(0,), sampler="uniform", cases=400, batch=400, scenario=US23
-        )
-        run = run_campaign(settings, resolve(settings), Path(scratch) / "run")
-        count = 100
-        while count <= chosen.history and "samplers" in chosen.only:
-            history = history_of(count, run.outcomes)
-            spent = {name: sampler_s(name, history) for name in SAMPLERS}
-            result["samplers"][count] = spent
-            shown = ", ".join(f"{name} {seconds:.3f}" for name, seconds in spent.items())
-            tell(f"samplers: seconds for a batch of {BATCH} after {count:,} cases: {shown}")
+        journal = Journal.create(Path(scratch) / "run", {})
+        with journal:
+            return cases / seconds(lambda: loop.run(lambda groups: journal.append(*groups)))
+
+
+def engines(_: int) -> Figures:
+    """Return the CPU time of a case by each engine, in us, and its ratio, round by round."""
+    plan = resolve(CampaignSettings(vut="design2", levels=(2,), scenario=US23))
+    plans = {"sumo": plan, "kinematic": plan.with_engine("kinematic")}
+    pool, rng = Pool(levels=(2,), scenario=US23), np.random.default_rng(2)
+    figures: Figures = {"sumo, us": [], "kinematic, us": [], "ratio": []}
+    with threadpool_limits(1):
+        for _ in range(ROUNDS):
+            cases = pool.cases(rng.random((CHUNK, 3)), 2)
+            failed = []
+            for name, one in plans.items():
+                simulate(one, cases[:200])  # SUMO starts
+                start_s = time.process_time()
+                episodes = simulate(one, cases)
+                figures[f"{name}, us"].append((time.process_time() - start_s) / CHUNK * 1e6)
+                failed.append([episode.outcome.failed for episode in episodes])
+            if failed[0] != failed[1]:
+                raise RuntimeError("the engines disagree about a verdict")
+            figures["ratio"].append(figures["sumo, us"][-1] / figures["kinematic, us"][-1])
+    return figures
+
+
+def campaign(folder: Path, *options: str) -> float:
+    """Return the seconds of the whole command of a campaign in a folder."""
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--quiet", *options]
+    quiet = partial(subprocess.run, check=True, stdout=subprocess.DEVNULL, cwd=folder)
+    return seconds(partial(quiet, command))
+
+
+def whole_campaigns(_: int) -> Figures:
+    """Return the seconds of whole commands on one worker and on two, and their ratio."""
+    options = ("--vut", "design2", "--sampler", "uniform", "--cases", str(CAMPAIGN_CASES))
+    figures: Figures = {"s on one": [], "s on two": [], "gain": []}
+    with tempfile.TemporaryDirectory() as scratch:
+        for number in range(ROUNDS):
+            for name, count in (("one", "1"), ("two", "2")):
+                out = ("--workers", count, "--out", f"{number}-{name}")
+                figures[f"s on {name}"].append(campaign(Path(scratch), *options, *out))
+            figures["gain"].append(figures["s on one"][-1] / figures["s on two"][-1])
+    return figures
+
+
+def slow_campaign(case_s: float, cases: int, *options: str) -> tuple[float, int]:
+    """Return the seconds of a whole command whose VUT sleeps, and the number of its cases."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        (folder / "sleepy.py").write_text(SLEEPY.format(case_s=case_s))
+        out = ("--cases", str(cases), "--out", "run")
+        spent_s = campaign(folder, "--vut", "sleepy.py:Sleepy", *out, *options)
+        twice = folder / "run" / "repeats.jsonl"  # some cases run a second time
+        if twice.exists():
+            cases += len(twice.read_bytes().splitlines())
+    return spent_s, cases
+
+
+def in_flight(_: int) -> Figures:
+    """Return what many workers gain with a slow controller, and the cases that they may cost."""
+    one = ("--workers", "1")
+    many = ("--workers", str(FLIGHT_WORKERS), "--in-flight", str(FLIGHT))
+    quick_s, ran = slow_campaign(HARDLY_S, FLIGHT_CASES, *one)
+    few_quick_s, few_ran = slow_campaign(HARDLY_S, FEW_CASES, *one)
+    few_s, _ = slow_campaign(CASE_S, FEW_CASES, *one)
+    many_s, _ = slow_campaign(CASE_S, FLIGHT_CASES, *many)
+    sleeps_s = CASE_S - HARDLY_S
+    one_s = quick_s + ran * sleeps_s
+    figures: Figures = {
+        "s on one": [one_s],
+        "s on one, computed over measured": [(few_quick_s + few_ran * sleeps_s) / few_s],
+        "s on many": [many_s],
+        "gain": [one_s / many_s],
+    }
+    for levels in ((0, 1, 2), (1,)):
+        for how, flight in (("in batches", None), ("in flight", FLIGHT)):
+            name = f"cases to .9 at levels {levels}, {how}"
+            figures[name] = [cases_to_most(flight, seed, levels) for seed in range(FLIGHT_SEEDS)]
+    return figures
+
+
+def cases_to_most(flight: int | None, seed: int, levels: tuple[int, ...]) -> float:
+    """Return the cases until `coverage` has .9 of the truth of design2; infinite for not yet.
+
+    Args:
+        flight: cases in flight; None for batches.
+        seed: seed of the search.
+        levels: levels of the POV.
+    """
+    settings = CampaignSettings(
+        vut="design2", levels=levels, scenario=US23, cases=SEARCHED, seed=seed, in_flight=flight
+    )
+    plan = resolve(settings)
+    target = 0.9 * sum(fmc(ground_truth(plan, level).failures) for level in levels)
+    with tempfile.TemporaryDirectory() as scratch:
+        outcomes = run_campaign(settings, plan, Path(scratch) / "run").outcomes
+    for count in range(5, SEARCHED + 1, 5):
+        coverage = 0.0
+        for level in levels:
+            failing = [o.case for o in outcomes[:count] if o.failed and o.case.level == level]
+            coverage += fmc(to_unit(failing, level, scenario=US23))
+        if coverage >= target:
+            return float(count)
+    return float("inf")
+
+
+def files(most: int) -> Figures:
+    """Return the seconds for a finished campaign of 10,000, 100,000, ... cases."""
+    figures: Figures = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        run = run_campaign(UNIFORM, resolve(UNIFORM), Path(scratch) / "run")
+        known, count = run.outcomes, 10_000
+        while count <= most:
+            cases = from_unit(np.random.default_rng(2).random((count, 2)), 0, scenario=US23)
+            outcomes = []
+            for index, case in enumerate(cases):  # new starts for what was measured once
+                outcome = known[index % len(known)]
+                outcomes.append(replace(outcome, index=index, batch=index // BATCH, case=case))
+            for name, value in of_files(run, outcomes).items():
+                figures[f"{count:,} cases: {name}"] = [value]
             count *= 10
-        count = 10_000
-        while count <= chosen.outcomes and "files" in chosen.only:
-            row = files(count, run.outcomes, run.folder)
-            result["files"].append(row)
-            tell("files: " + ", ".join(f"{name} {value:.3g}" for name, value in row.items()))
-            count *= 10
-    return result
+    return figures
+
+
+def of_files(run: Run, outcomes: list[Any]) -> dict[str, float]:
+    """Return sizes in MB, and seconds for reading, FMC, regions and report of outcomes."""
+    run.outcomes = outcomes
+    text = "".join(map(to_line, outcomes)).encode()
+    points = to_unit((outcome.case for outcome in failures(outcomes)), 0, scenario=US23)
+    work: dict[str, Callable[[], object]] = {
+        "read, s": lambda: read_outcomes(text, OUTCOMES, scenario=US23),
+        "FMC, s": lambda: fmc(points),
+        "regions, s": lambda: regions(points),
+        "report, s": lambda: write_report(run),
+    }
+    figures = {name: seconds(one) for name, one in work.items()}
+    report_mb = (run.folder / "report.html").stat().st_size / 1e6
+    return {
+        "failures": len(points),
+        "file, MB": len(text) / 1e6,
+        **figures,
+        "report, MB": report_mb,
+    }
+
+
+PARTS: dict[str, Callable[[int], Figures]] = {
+    "truth": truth,
+    "workers": workers,
+    "engines": engines,
+    "in-flight": in_flight,
+    "campaign": whole_campaigns,
+    "files": files,
+}
 
 
 def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument(
-        "--most", type=int, default=100_000, help="uniform cases of the largest run"
-    )
-    parser.add_argument("--campaign", type=int, default=20_000, help="cases of whole campaigns")
-    parser.add_argument("--case-s", type=float, default=1.0, help="seconds of a slow case")
-    parser.add_argument("--flight-cases", type=int, default=800, help="cases of a slow campaign")
-    parser.add_argument("--history", type=int, default=10_000, help="longest history of a sampler")
-    parser.add_argument("--outcomes", type=int, default=1_000_000, help="outcomes of a report")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="what to measure")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    add_record_option(parser)
-    chosen = parser.parse_args()
-
-    def tell(text: str) -> None:
-        if not chosen.json:
-            print(text, flush=True)
-
-    def tell_spread(part: str, found: dict[str, list[float]]) -> None:
-        for name, values in found.items():
-            median = statistics.median(values)
-            tell(f"{part}: {name}: {median:.2f} [{min(values):.2f}, {max(values):.2f}]")
-
-    result: dict[str, Any] = {"truth": []}
-    for row in truth(chosen.most) if "truth" in chosen.only else ():
-        result["truth"].append(row)
-        tell(
-            f"truth: {row['cases']:9,.0f} cases at {row['cases_per_s']:6.0f} cases/s, worker at "
-            f"most {row['worker_mb']:.0f} MB, this process {row['this_process_mb']:.0f} MB"
-        )
-    if {"workers", "parent"} & set(chosen.only):
-        result["workers"] = two_workers()
-        tell_spread("workers", result["workers"])
-    uniform = ("--sampler", "uniform", "--cases", str(chosen.campaign))
-    parts: dict[str, Callable[[], dict[str, list[float]]]] = {
-        "engines": partial(engines, CHUNK, ROUNDS),
-        "in-flight": partial(slow_controllers, chosen.case_s, chosen.flight_cases),
-        "campaign": partial(whole_campaigns, CAMPAIGN_ROUNDS, *uniform),
-        "default": partial(whole_campaigns, DEFAULT_ROUNDS),
-    }
-    for part, measure in parts.items():
-        if part in chosen.only:
-            result[part] = measure()
-            tell_spread(part, result[part])
-    if "parent" in chosen.only:
-        taken = [parent(chosen.campaign) for _ in range(ROUNDS)]
-        one = statistics.median(result["workers"]["cases_per_s_on_one"])
-        feeds = [rate / one for rate in taken]
-        result["parent"] = {"cases_per_s": taken, "feeds_workers": feeds}
-        tell_spread("parent", result["parent"])
-    if {"samplers", "files"} & set(chosen.only):
-        result |= of_campaigns(chosen, tell)
-    append_record(chosen.record, "scale", result)
-    if chosen.json:
-        print(json.dumps(result))
+    """Measure and print the parts that the command line names."""
+    parser = benchmark_parser(__doc__)
+    parser.add_argument("parts", nargs="*", metavar="PART", default=[*PARTS], help=", ".join(PARTS))
+    parser.add_argument("--most", type=int, default=1_000_000, help="cases of truth and files")
+    options = parser.parse_args()
+    unknown = set(options.parts) - PARTS.keys()
+    if unknown:
+        parser.error(f"choose parts from {', '.join(PARTS)}")
+    figures: dict[str, Figures] = {}
+    for part in options.parts:
+        figures[part] = PARTS[part](options.most)
+        for name, values in figures[part].items():
+            print(f"{part}: {name}: {spread(values)}", flush=True)
+    append_record(options.record, "scale", figures)
 
 
 if __name__ == "__main__":

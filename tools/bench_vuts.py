@@ -14,25 +14,22 @@ Rounds take turns over the kinds; the figures are medians in microseconds, with 
 
 from __future__ import annotations
 
-import argparse
-import json
 import shlex
-import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import redirect_stdout
+from collections import defaultdict
+from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import traci
-from bench_record import add_record_option, append_record
 from build_fmu import build_fmu
 from export_policy import export_onnx
+from measuring import append_record, benchmark_parser, spread
 
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
@@ -159,80 +156,67 @@ def us_of_peer(client: Path, folder: Path, episodes: int) -> float:
             process.wait()
 
 
+PEERS = {
+    "traci": "peer",
+    "python": "python, in process",
+    "python, 32 corridors": "in process, 32 corridors",
+}
+"""Kinds that are divided by another one."""
+
+
+def opened(folder: Path) -> dict[str, Driver]:
+    """Write the controllers of all kinds into a folder, and return their drivers by name."""
+    (folder / "law.py").write_text(LAW)
+    (folder / "client.py").write_text(CLIENT)
+    (folder / "subscriber.py").write_text(SUBSCRIBER)
+    export_onnx("vut1", folder / "vut1.onnx")
+    build_fmu(folder / "level0.fmu")
+    law = f"{folder / 'law.py'}:Vut"
+    clients = {}
+    for name in ("client", "subscriber"):
+        command = [sys.executable, str(folder / f"{name}.py"), "{port}"]
+        clients[name] = f"traci:{shlex.join(command)}"
+    in_process = ControllerOptions(in_process=True)
+    # A TraCI controller is told the road and the scenario; no SUMO of the host runs.
+    world: Any = SimpleNamespace(road=road_of(), scenario=US23)
+
+    def driver(spec: str, corridors: int = 1, options: ControllerOptions | None = None) -> Driver:
+        return load(spec, options or ControllerOptions()).open(corridors, world)
+
+    return {
+        "python": driver(law),
+        "python, in process": driver(law, options=in_process),
+        "python, 32 corridors": driver(law, 32),
+        "in process, 32 corridors": driver(law, 32, in_process),
+        "traci": driver(clients["client"]),
+        "traci, subscribing": driver(clients["subscriber"]),
+        "fmu": driver(f"fmu:{folder / 'level0.fmu'}"),
+        "onnx": driver(f"onnx:{folder / 'vut1.onnx'}?decision_period_s=0.1"),
+    }
+
+
 def main() -> None:
-    """Print a table, or with --json one object."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    add_record_option(parser)
+    """Print a table."""
+    parser = benchmark_parser(__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--episodes", type=int, default=20, help="episodes per round and kind")
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory() as name:
+    us: dict[str, list[float]] = defaultdict(list)
+    with tempfile.TemporaryDirectory() as name, ExitStack() as open_drivers:
         folder = Path(name)
-        (folder / "law.py").write_text(LAW)
-        (folder / "client.py").write_text(CLIENT)
-        (folder / "subscriber.py").write_text(SUBSCRIBER)
-        export_onnx("vut1", folder / "vut1.onnx")
-        build_fmu(folder / "level0.fmu")
-        command = shlex.join([sys.executable, str(folder / "client.py"), "{port}"])
-        subscribing = command.replace("client.py", "subscriber.py")
-
-        in_process = ControllerOptions(in_process=True)
-
-        # A TraCI controller is told the road and the scenario; no SUMO of ours runs here.
-        world: Any = SimpleNamespace(road=road_of(), scenario=US23)
-
-        def driver(spec: str, corridors: int = 1, given: ControllerOptions | None = None) -> Driver:
-            return load(spec, given or ControllerOptions()).open(corridors, world)
-
-        drivers = {
-            "python": driver(f"{folder / 'law.py'}:Vut"),
-            "python, in process": driver(f"{folder / 'law.py'}:Vut", given=in_process),
-            "python, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32),
-            "in process, 32 corridors": driver(f"{folder / 'law.py'}:Vut", 32, in_process),
-            "traci": driver(f"traci:{command}"),
-            "traci, subscribing": driver(f"traci:{subscribing}"),
-            "fmu": driver(f"fmu:{folder / 'level0.fmu'}"),
-            "onnx": driver(f"onnx:{folder / 'vut1.onnx'}?decision_period_s=0.1"),
-        }
-        measured: dict[str, Callable[[], float]] = {
-            kind: lambda d=d: us_per_step(d, options.episodes)  # type: ignore[misc]
-            for kind, d in drivers.items()
-        }
-        measured["peer"] = lambda: us_of_peer(folder / "client.py", folder, options.episodes)
-        found: dict[str, list[float]] = {kind: [] for kind in measured}
-        try:
-            for _ in range(options.rounds):
-                for kind, run in measured.items():
-                    found[kind].append(run())
-        finally:
-            for made in drivers.values():
-                made.close()
-    peers = {
-        "traci": "peer",
-        "python": "python, in process",
-        "python, 32 corridors": "in process, 32 corridors",
-    }
-    ratios = {
-        kind: [a / b for a, b in zip(found[kind], found[peer], strict=True)]
-        for kind, peer in peers.items()
-    }
-    result = {
-        "us_per_step": {kind: statistics.median(us) for kind, us in found.items()},
-        "ratio": {kind: statistics.median(values) for kind, values in ratios.items()},
-    }
-    append_record(options.record, "vuts", result)
-    if options.json:
-        print(json.dumps(result))
-        return
-    for kind, us in found.items():
-        print(f"{kind:24} {statistics.median(us):8.1f} us a step [{min(us):.1f}, {max(us):.1f}]")
-    for kind, peer in peers.items():
-        all_ = ratios[kind]
-        print(
-            f"{kind} costs {statistics.median(all_):.2f} times {peer} "
-            f"[{min(all_):.2f}, {max(all_):.2f}]"
-        )
+        drivers = opened(folder)
+        for driver in drivers.values():
+            open_drivers.callback(driver.close)
+        for _ in range(options.rounds):
+            for kind, driver in drivers.items():
+                us[kind].append(us_per_step(driver, options.episodes))
+            us["peer"].append(us_of_peer(folder / "client.py", folder, options.episodes))
+    for kind, values in us.items():
+        print(f"{kind:24} {spread(values, 1)} us a step")
+    for kind, peer in PEERS.items():
+        ratios = [a / b for a, b in zip(us[kind], us[peer], strict=True)]
+        print(f"{kind} costs {spread(ratios)} times {peer}")
+    append_record(options.record, "vuts", us)
 
 
 if __name__ == "__main__":

@@ -398,8 +398,7 @@ def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
 
     This is a pure function of the outcomes in the order of their index, so a resumed campaign ends
     where it would have ended. A search without a failure continues. A region of failures without a
-    case near it is in no coverage: the rule saves cases and proves nothing
-    (`python tools/bench_stopping.py` shows where it stops).
+    case near it is in no coverage: the rule saves cases and proves nothing.
 
     Args:
         outcomes: the outcomes.

@@ -39,8 +39,7 @@ class GprSampler(LevelwiseSampler):
     of q = mu^z1 Var^z2 need positive numbers. The picks of a batch follow each other, each with the
     variance conditioned on the earlier ones (it does not depend on their results): that spreads the
     batch out. The value of a query is multiplied by the share of its ball (radius rho of the FMC)
-    that no failure and no pick covers. `python tools/bench_samplers.py --ablate` measures the
-    effect of each choice.
+    that no failure and no pick covers.
     """
 
     about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"

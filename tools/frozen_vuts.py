@@ -1,7 +1,7 @@
-"""The frozen VUTs of the benchmark of samplers: `frozen:NAME`.
+"""The frozen VUTs of the contest of samplers: `frozen:NAME`.
 
 They are of families that real controllers are of, and each fails somewhere; none is good. Their
-constants are in this file and are never tuned: a change of a verdict ends the benchmark
+constants are in this file and are never tuned: a change of a verdict ends the contest
 (`problems.py`). All are for the merges of US-23. The kind is registered as this module is imported.
 """
 

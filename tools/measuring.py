@@ -1,7 +1,7 @@
-"""A record of benchmarks: `--record FILE` appends one JSON line, with the versions and the machine.
+"""What benchmarks share: a clock, medians with their spread, and `--record FILE`.
 
-Lines of one machine show how a ratio changes from version to version; absolute times of different
-machines do not compare.
+A record is one JSON line with the figures, the versions and the machine. Ratios on one machine
+compare from version to version; absolute times on different machines do not.
 """
 
 from __future__ import annotations
@@ -12,29 +12,48 @@ import os
 import platform
 import shutil
 import subprocess
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from statistics import median
+from typing import Any
 
-PACKAGES: Final = ("merge-sumo", "libsumo", "numpy")
+PACKAGES = ("merge-sumo", "libsumo", "numpy")
 
 
-def add_record_option(parser: argparse.ArgumentParser) -> None:
-    """Add `--record FILE` to the options of a benchmark."""
+def benchmark_parser(about: str | None) -> argparse.ArgumentParser:
+    """Return a parser with `--record FILE`, whose help is the docstring of a benchmark."""
+    parser = argparse.ArgumentParser(
+        description=about, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument(
         "--record", type=Path, metavar="FILE", help="append the figures to FILE, as one JSON line"
     )
+    return parser
 
 
-def append_record(file: Path | None, benchmark: str, figures: Mapping[str, Any]) -> None:
+def seconds(work: Callable[[], object]) -> float:
+    """Return the wall-clock seconds that a function takes."""
+    start_s = time.perf_counter()
+    work()
+    return time.perf_counter() - start_s
+
+
+def spread(values: Iterable[float], digits: int = 2) -> str:
+    """Return numbers as "median [least, most]"."""
+    known = sorted(values)
+    return f"{median(known):.{digits}f} [{known[0]:.{digits}f}, {known[-1]:.{digits}f}]"
+
+
+def append_record(file: Path | None, benchmark: str, figures: Mapping[Any, Any]) -> None:
     """Append the figures of a benchmark to a file; do nothing without one.
 
     Args:
         file: what `--record` names, begun where it does not exist.
         benchmark: name of the benchmark.
-        figures: what it measured, as JSON can hold it; medians over rounds.
+        figures: what it measured, as JSON can hold it.
     """
     if file is None:
         return
@@ -65,9 +84,9 @@ def _commit() -> str | None:
 
 def _cpu_model() -> str:
     """Return the name of the processor; on Linux as the kernel knows it."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        text = ""
-    names = [line.partition(":")[2].strip() for line in text.splitlines() if "model name" in line]
-    return names[0] if names else platform.processor() or platform.machine()
+    cpus = Path("/proc/cpuinfo")
+    if cpus.exists():
+        for line in cpus.read_text(encoding="utf-8").splitlines():
+            if "model name" in line:
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
