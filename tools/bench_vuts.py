@@ -22,8 +22,6 @@ import time
 from collections import defaultdict
 from contextlib import ExitStack, redirect_stdout
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import traci
@@ -38,6 +36,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
+from merge_sumo.sumo.world import World
 
 STEPS = 80
 """Of an episode."""
@@ -164,8 +163,13 @@ PEERS = {
 """Kinds that are divided by another one."""
 
 
-def opened(folder: Path) -> dict[str, Driver]:
-    """Write the controllers of all kinds into a folder, and return their drivers by name."""
+def opened(folder: Path, world: World) -> dict[str, Driver]:
+    """Write the controllers of all kinds into a folder, and return their drivers by name.
+
+    Args:
+        folder: folder of the controllers.
+        world: a world, of which a TraCI controller is told road and scenario.
+    """
     (folder / "law.py").write_text(LAW)
     (folder / "client.py").write_text(CLIENT)
     (folder / "subscriber.py").write_text(SUBSCRIBER)
@@ -177,8 +181,6 @@ def opened(folder: Path) -> dict[str, Driver]:
         command = [sys.executable, str(folder / f"{name}.py"), "{port}"]
         clients[name] = f"traci:{shlex.join(command)}"
     in_process = ControllerOptions(in_process=True)
-    # A TraCI controller is told the road and the scenario; no SUMO of the host runs.
-    world: Any = SimpleNamespace(road=road_of(), scenario=US23)
 
     def driver(spec: str, corridors: int = 1, options: ControllerOptions | None = None) -> Driver:
         return load(spec, options or ControllerOptions()).open(corridors, world)
@@ -204,7 +206,7 @@ def main() -> None:
     us: dict[str, list[float]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name, ExitStack() as open_drivers:
         folder = Path(name)
-        drivers = opened(folder)
+        drivers = opened(folder, open_drivers.enter_context(World(1, scenario=US23)))
         for driver in drivers.values():
             open_drivers.callback(driver.close)
         for _ in range(options.rounds):
