@@ -1,4 +1,4 @@
-"""Controllers: what one sees, how one answers, and an array of them that drives all corridors."""
+"""Controllers: their observation, their answers, and an array of them that drives all corridors."""
 
 from __future__ import annotations
 
@@ -39,16 +39,22 @@ class _State(NamedTuple):
 
 
 class Seen(_State):
-    """State of the road that a VUT sees at a step, without anything of the POV's driver.
+    """Observation of a VUT at a step: the state of the road, and nothing of the POV's driver.
 
     A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
 
-    In traffic the car that the VUT will meet counts as POV: the one that would be nearest to M when
-    the VUT is there, if the car kept its speed and the VUT drove the scenario's level-0 profile
+    In traffic the conflicting car counts as POV: the one that would be nearest to M when the VUT is
+    there, if the car kept its speed and the VUT drove the scenario's level-0 profile
     (`drivers.following.car_met`). `others` has all cars.
 
     On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
     M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.
+
+    Example:
+        ```python
+        def act(seen: Seen) -> float:
+            return 1.0 if seen.x_vut_m > seen.x_pov_m else -1.0
+        ```
 
     Attributes:
         t_s: time since the episode began.
@@ -59,7 +65,7 @@ class Seen(_State):
     """
 
     _traffic: tuple[Car, ...] = ()
-    _lane_m: Bounds | None = None
+    _lane_m: Bounds = 0.0, 0.0
     _merged: bool = False
 
     @property
@@ -71,38 +77,39 @@ class Seen(_State):
     @property
     def others(self) -> tuple[Car, ...]:
         """All cars of the mainline, the one in front first."""
-        cars = (car for row, car in enumerate(self.vehicles) if row != VUT)
+        cars = list(self.vehicles)
+        del cars[VUT]
         return tuple(sorted(cars, reverse=True))
 
     @property
     def lane_begin_m(self) -> float:
         """Where the acceleration lane begins; 0 where there is none."""
-        return 0.0 if self._lane_m is None else self._lane_m[0]
+        return self._lane_m[0]
 
     @property
     def lane_end_m(self) -> float:
         """Where it ends; 0 where there is none."""
-        return 0.0 if self._lane_m is None else self._lane_m[1]
+        return self._lane_m[1]
 
     @property
     def merged(self) -> bool:
         """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
-        return self.x_vut_m >= 0.0 if self._lane_m is None else self._merged
+        return self._merged if self.lane_begin_m < self.lane_end_m else self.x_vut_m >= 0.0
 
     @property
     def may_merge(self) -> bool:
-        """Whether a wish to merge, now, puts the VUT on the mainline in the next step.
+        """Whether a merge request, now, puts the VUT on the mainline in the next step.
 
         False after the merge, and where there is no acceleration lane.
         """
-        if self._lane_m is None or self._merged:
-            return False
-        return self.x_vut_m + self.v_vut_mps * DT_S >= self._lane_m[0]
+        next_m = self.x_vut_m + self.v_vut_mps * DT_S
+        is_on_lane = self.lane_begin_m < self.lane_end_m and not self._merged
+        return is_on_lane and next_m >= self.lane_begin_m
 
 
 def seen_in(
     t_s: float,
-    met: int,
+    facing: int,
     x_m: Sequence[float],
     v_mps: Sequence[float],
     lane_m: Bounds | None = None,
@@ -113,13 +120,13 @@ def seen_in(
 
     Args:
         t_s: time since the episode began.
-        met: row of the car that counts as POV.
+        facing: row of the car that counts as POV.
         x_m: positions by row.
         v_mps: speeds by row.
         lane_m: acceleration lane, None without one.
         merged: whether the VUT has left that lane.
     """
-    seen = Seen(t_s, x_m[met], v_mps[met], x_m[VUT], v_mps[VUT])
+    seen = Seen(t_s, x_m[facing], v_mps[facing], x_m[VUT], v_mps[VUT])
     if lane_m is not None:
         seen._lane_m, seen._merged = lane_m, merged
     if len(x_m) > 2:
@@ -135,7 +142,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         a_min_mps2: least acceleration of the scenario.
         a_max_mps2: largest acceleration of the scenario.
         lane_m: acceleration lane, None without one.
-        met: row of the car that counts as POV.
+        facing: row of the car that counts as POV.
         x_m: positions by row.
         v_mps: speeds by row.
     """
@@ -144,7 +151,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
     a_min_mps2: float
     a_max_mps2: float
     lane_m: tuple[float, float] | None
-    met: int
+    facing: int
     x_m: tuple[float, ...]
     v_mps: tuple[float, ...]
 
@@ -153,15 +160,15 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         """Return the start of a case."""
         scenario = case.scenario
         x_m, v_mps = np.array(case.starts(), dtype=np.float64).T
-        met = POV
+        facing = POV
         if len(x_m) > 2:
-            met = int(car_met(x_m[:, None], v_mps[:, None], scenario)[0])
+            facing = int(car_met(x_m[:, None], v_mps[:, None], scenario)[0])
         return cls(
             seed=case.told_seed,
             a_min_mps2=float(scenario.a_min_mps2),
             a_max_mps2=float(scenario.a_max_mps2),
             lane_m=scenario.lane_m,
-            met=met,
+            facing=facing,
             x_m=tuple(x_m.tolist()),
             v_mps=tuple(v_mps.tolist()),
         )
@@ -169,7 +176,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
     @property
     def seen(self) -> Seen:
         """The controller's observation at the start."""
-        return seen_in(0.0, self.met, self.x_m, self.v_mps, self.lane_m)
+        return seen_in(0.0, self.facing, self.x_m, self.v_mps, self.lane_m)
 
 
 class Controller(ABC):
@@ -244,23 +251,20 @@ class ControllerArray(ControllerDriver):
     def reset(self, corridor: int, start: Start) -> None:
         """Reset the controller of a corridor; an error is kept as the reason of its answer."""
         self._reasons[corridor], self._lanes_m[corridor] = None, start.lane_m
-        activity = "reset"
+        is_new = self._replace[corridor]
+        if is_new:
+            self._close(corridor)
         try:
             with self._deadline as deadline:
-                if self._replace[corridor]:
-                    activity = "created again for this episode"
-                    self._close(corridor)
-                    deadline.start()
+                deadline.start()
+                if is_new:
                     self._controllers[corridor] = self._new()
-                    deadline.stop()
-                    activity = "reset"
                 controller = self._controllers[corridor]
                 self._replace[corridor] = controller.single_use
-                deadline.start()
                 controller.reset(start)
                 deadline.stop()
         except BaseException as error:
-            self._fail(corridor, f"{activity}: {self._deadline.reason(error)}")
+            self._fail(corridor, f"reset: {self._deadline.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
@@ -322,46 +326,41 @@ class ControllerArray(ControllerDriver):
 
 
 class WrongAnswerError(Exception):
-    """A controller answered something that is not an acceleration, or not a wish."""
+    """A controller answered something that is not an acceleration, or not whether to merge."""
 
 
 def as_answer(answer: Any) -> tuple[float, int]:
-    """Return an answer as an acceleration and a wish, `NO_WISH` where it says nothing of one.
+    """Return an answer as an acceleration and a merge request, `NO_WISH` where it has none.
 
     Raises `WrongAnswerError` unless it is one real number or (number, whether to merge).
     """
     if type(answer) is float:
         return answer, NO_WISH
+    acceleration, wish = answer, NO_WISH
     if isinstance(answer, tuple | list) and len(answer) == 2:
         acceleration, merge = answer
-        return as_number(acceleration), as_wish(merge)
-    return as_number(answer), NO_WISH
+        wish = _as_wish(merge)
+    number = np.asarray(acceleration)
+    if number.shape != () or number.dtype.kind not in "fiu":
+        shown = _shown(acceleration)
+        raise WrongAnswerError(f"answered {shown} instead of a number, or (number, merge)")
+    return float(number), wish
 
 
-def as_number(answer: Any) -> float:
-    """Return an answer as a float; raises `WrongAnswerError` unless it is one real number."""
-    if isinstance(answer, (int, float, np.integer, np.floating)) and not isinstance(answer, bool):
-        return float(answer)
-    if isinstance(answer, np.ndarray) and answer.shape == () and answer.dtype.kind in "fiu":
-        return float(answer)
-    raise WrongAnswerError(f"answered {_shown(answer)} instead of a number, or (number, merge)")
-
-
-def as_wish(merge: Any) -> int:
-    """Return `MERGE` or `STAY`; raises `WrongAnswerError` unless it is True, False, 1 or 0."""
-    value = merge.item() if isinstance(merge, np.ndarray) and merge.shape == () else merge
-    is_number = isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating))
-    if is_number and value in (0, 1):
-        return MERGE if value else STAY
-    raise WrongAnswerError(f"wishes {_shown(merge)} instead of True or False, to merge or not")
+def _as_wish(merge: Any) -> int:
+    wish = np.asarray(merge)
+    if wish.shape != () or wish.dtype.kind not in "bfiu" or wish not in (0, 1):
+        shown = _shown(merge)
+        raise WrongAnswerError(f"wishes {shown} instead of True or False, to merge or not")
+    return MERGE if wish else STAY
 
 
 MERGES_ABOVE = 0.5
-"""A number that says whether to merge, as of a network or a unit, wishes it above this."""
+"""An output of a network or a unit above this is a merge request."""
 
 
 def as_merge(number: float) -> bool:
-    """Return whether a number wishes to merge; raises `WrongAnswerError` for NaN and infinity."""
+    """Return whether an output is a merge request; `WrongAnswerError` for NaN and infinity."""
     if not math.isfinite(number):
         raise WrongAnswerError(f"wishes {number} instead of a number, to merge or not")
     return number > MERGES_ABOVE

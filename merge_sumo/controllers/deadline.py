@@ -9,11 +9,10 @@ import threading
 from bdb import BdbQuit
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from types import FrameType, TracebackType
-from typing import Any, Self, TextIO
+from typing import Any, Self
 
 from merge_sumo.interrupt import Stopped
 from merge_sumo.scenario.trajectory import as_reason
@@ -33,7 +32,6 @@ heartbeat: list[Callable[[float], None]] = []
 process an interrupt is the controller's own doing."""
 
 
-@dataclass(slots=True)
 class Deadline:
     """Ends calls to a controller that take longer than the deadline.
 
@@ -48,37 +46,34 @@ class Deadline:
             answer = controller.act(seen)
             deadline.stop()
         ```
+
+    Attributes:
+        deadline_s: time for a call.
     """
 
-    deadline_s: float
-    _since_s: float = math.inf
-    _stdout: TextIO | None = None
-    _restore: Callable[[], None] | None = field(default=None, repr=False)
+    def __init__(self, deadline_s: float) -> None:
+        self.deadline_s, self._since_s = deadline_s, math.inf
+        self._is_timed = False
 
     def __enter__(self) -> Self:
         self._stdout, sys.stdout = sys.stdout, sys.stderr
-        if hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread():
-            handler = signal.signal(signal.SIGALRM, self._ring)
-            timer = signal.setitimer(signal.ITIMER_REAL, 0.0)
-
-            def restore() -> None:
-                signal.setitimer(signal.ITIMER_REAL, *timer)
-                signal.signal(signal.SIGALRM, handler)
-
-            self._restore = restore
+        is_main = threading.current_thread() is threading.main_thread()
+        self._is_timed = is_main and hasattr(signal, "setitimer")
+        if self._is_timed:
+            self._handler = signal.signal(signal.SIGALRM, self._ring)
+            self._timer = signal.setitimer(signal.ITIMER_REAL, 0.0)
         return self
 
     def __exit__(self, *_: object) -> None:
         self._since_s = math.inf
-        if self._restore is not None:
-            self._restore()
-            self._restore = None
-        if self._stdout is not None:
-            sys.stdout = self._stdout
+        if self._is_timed:
+            signal.setitimer(signal.ITIMER_REAL, *self._timer)
+            signal.signal(signal.SIGALRM, self._handler)
+        sys.stdout = self._stdout
 
     def start(self) -> None:
         """Begin the time of a call."""
-        if self._restore is not None:
+        if self._is_timed:
             # Set again for each call: an early ring would cut short a call that waits in C.
             first_s = RING_AFTER * self.deadline_s
             signal.setitimer(signal.ITIMER_REAL, first_s, self.deadline_s / 10)
@@ -139,6 +134,7 @@ def _place(error: BaseException) -> str:
     last: TracebackType | None = error.__traceback__
     while last is not None and last.tb_next is not None:  # a recursion leaves thousands
         last = last.tb_next
-    if last is None or Path(last.tb_frame.f_code.co_filename).parent == Path(__file__).parent:
+    if last is None:
         return ""
-    return f" ({Path(last.tb_frame.f_code.co_filename).name}, line {last.tb_lineno})"
+    file = Path(last.tb_frame.f_code.co_filename)
+    return "" if file.parent == Path(__file__).parent else f" ({file.name}, line {last.tb_lineno})"

@@ -92,7 +92,7 @@ def end_of(log: Path) -> str:
     with suppress(OSError):
         if _is_writable_log(log):
             with log.open("rb") as file:
-                file.seek(max(file.seek(0, os.SEEK_END) - 8000, 0))
+                file.seek(max(log.stat().st_size - 8000, 0))
                 text = file.read(8000)
     lines = text.decode("utf-8", errors="replace").splitlines()
     return "\n".join(map(printable, lines[-LINES:]))

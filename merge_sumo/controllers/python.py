@@ -8,6 +8,7 @@ import importlib.util
 import inspect
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib.metadata import EntryPoint
@@ -20,7 +21,6 @@ from numpy.typing import NDArray
 
 from merge_sumo.controllers.controller import (
     Controller,
-    ControllerArray,
     ControllerDriver,
     Seen,
     Start,
@@ -59,8 +59,7 @@ def installed_vuts() -> dict[str, EntryPoint]:
     """Return the VUTs that installed packages register, by name."""
     vuts: dict[str, EntryPoint] = {}
     for name, entries in entries_of("merge_sumo.vuts").items():
-        for entry in entries.values():
-            vuts[name] = entry
+        *_, vuts[name] = entries.values()
     return vuts
 
 
@@ -89,15 +88,17 @@ class OfPython(ControllerKind):
         acts = self._is_batched or callable(getattr(target, "act", None))
         if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
             raise self.refused(target)
-        by_place = int(not self._is_class or self._is_batched)  # what is observed, or the corridors
+        by_place = int(not self._is_class or self._is_batched)  # an observation, or the corridors
         defaults = defaults_of(target, by_place)
         self._keywords: dict[str, float] = {}
         self._attributes: dict[str, float] = {}
         for name, value in spec.numbers().items():
-            chosen = self._keywords if name in defaults else self._attributes
-            chosen[name] = value
-        if self._attributes and self._is_function:
-            raise spec.has_no(next(iter(self._attributes)), defaults)
+            if name in defaults:
+                self._keywords[name] = value
+            elif self._is_function:
+                raise spec.has_no(name, defaults)
+            else:
+                self._attributes[name] = value
         self._numbers: dict[str, float] = {}
         for name, value in (defaults | self._keywords).items():
             if (number := number_of(value)) is not None:
@@ -116,44 +117,38 @@ class OfPython(ControllerKind):
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
-        return PythonController(self.make(), self.present)
+        return PythonController(self)
 
-    def driver(self, corridors: int, _world: object) -> Driver:
+    def driver(self, corridors: int, world: object) -> Driver:
         """Return the driver of all corridors."""
         if self._is_batched:
             return BatchedVut(corridors, self)
-        return ControllerArray(corridors, self.controller, self.options.deadline_s)
+        return super().driver(corridors, world)
 
     def make(self, *corridors: int) -> Any:
         """Return a new object, made with the number of corridors where it acts in all of them."""
         target = self._target
         if self._is_function:
             return partial(target, **self._keywords) if self._keywords else target
+        if self._is_batched and not (self._is_class or self._attributes):
+            return target
         try:
+            made = copy.deepcopy(target)  # of a class, itself
             if self._is_class:
                 made = target(*corridors, **self._keywords)
-            elif self._is_batched and not self._attributes:
-                return target
-            else:
-                made = copy.deepcopy(target)
+            present = self.present(made)
+            for name, value in self._attributes.items():
+                if name in present:
+                    setattr(made, name, value)
         except (Exception, SystemExit) as error:
-            if not self._is_class:
-                raise UserError(
-                    f"{self.spec} cannot be copied for the episodes that run at a time "
-                    f"({text_of(error)}): give its class, or a function that makes no difference "
-                    "between them"
-                ) from error
-            given = f" with {corridors[0]} corridors" if corridors else " without arguments"
-            what = f"{type(error).__name__}: {text_of(error)}"
-            raise UserError(f"{self.spec} cannot be made{given}: {what}") from error
-        present = self.present(made) if self._attributes else {}
-        for name, value in self._attributes.items():
+            how = "copied for each corridor (give its class)"
+            if self._is_class:
+                how = f"made with {corridors[0]} corridors" if corridors else "made"
+            why = f"{type(error).__name__}: {text_of(error)}"
+            raise UserError(f"{self.spec} cannot be {how}: {why}") from error
+        for name in self._attributes:
             if name not in present:
                 raise self.spec.has_no(name, present)
-            try:
-                setattr(made, name, value)
-            except Exception as error:
-                raise UserError(f"{self.spec}: {name} cannot be set") from error
         return made
 
     def present(self, made: Any) -> dict[str, float]:
@@ -217,12 +212,10 @@ class HereKind(OfPython):
                 "again"
             )
         target = objects[self.spec.argument]
-        try:
+        with suppress(TypeError, OSError):  # it was typed at a prompt
             file = inspect.getsourcefile(target if is_code(target) else type(target))
-        except (TypeError, OSError):
-            file = None
-        if file and Path(file).is_file():
-            self.code = (Path(file),)
+            if file and Path(file).is_file():
+                self.code = (Path(file),)
         return target
 
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
@@ -243,18 +236,16 @@ class PythonController(Controller):
     function has nothing to reset.
     """
 
-    def __init__(self, thing: Any, present: Callable[[Any], dict[str, float]]) -> None:
-        """Drive by a thing; `present` gives its parameters."""
-        self._thing, self._present = thing, present
-        self._act: Callable[[Seen], Any] = getattr(thing, "act", thing)
-        self._reset = getattr(thing, "reset", None)
-        is_function = inspect.isroutine(thing) or isinstance(thing, partial)
-        self.single_use = self._reset is None and not is_function
+    def __init__(self, kind: OfPython) -> None:
+        """Make the object of a kind."""
+        self._kind, self._thing = kind, kind.make()
+        self._act: Callable[[Seen], Any] = getattr(self._thing, "act", self._thing)
+        is_function = inspect.isroutine(self._thing) or isinstance(self._thing, partial)
+        self.single_use = not is_function and getattr(self._thing, "reset", None) is None
 
     def reset(self, start: Start) -> None:
         """Call `reset`, if there is one."""
-        if self._reset is not None:
-            _reset(self._reset, start.seen, seed=start.seed)
+        _reset(self._thing, start.seen, seed=start.seed)
 
     def act(self, seen: Seen) -> Any:
         """Ask the object."""
@@ -267,7 +258,7 @@ class PythonController(Controller):
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
-        return self._present(self._thing)
+        return self._kind.present(self._thing)
 
     def close(self) -> None:
         """Call `close`, if there is one."""
@@ -288,9 +279,8 @@ class BatchedVut(ControllerDriver):
         self._kind, self._deadline = kind, Deadline(kind.options.deadline_s)
         self._object = kind.make(corridors)
         self._replace = False
-        self._raised: str | None = None
-        self._wrong: dict[int, str] = {}
-        """Errors of single corridors: their reset raised one, or their merge request is invalid."""
+        self._errors: dict[int, str] = {}
+        """By corridor: its reset failed, its merge request is invalid, or the last act failed."""
         self._lanes_m = np.zeros((2, corridors))
 
     def reset(self, corridor: int, start: Start) -> None:
@@ -298,27 +288,25 @@ class BatchedVut(ControllerDriver):
 
         After an act that failed all episodes begin, and a new object serves them.
         """
-        self._wrong.pop(corridor, None)
+        self._errors.pop(corridor, None)
         self._lanes_m[:, corridor] = start.lane_m or (0.0, 0.0)
         try:
             with self._deadline as deadline:
                 deadline.start()
                 if self._replace:
                     self._object, self._replace = self._kind.make(self.corridors), False
-                reset = getattr(self._object, "reset", None)
-                if reset is not None:
-                    _reset(reset, corridor, start.seen, seed=start.seed)
+                _reset(self._object, corridor, start.seen, seed=start.seed)
                 deadline.stop()
         except BaseException as error:
-            self._wrong[corridor] = f"reset: {self._deadline.reason(error)}"
+            self._errors[corridor] = f"reset: {self._deadline.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
         Raises `VutLostError` when it fails and several episodes run: the one at fault is unknown.
         """
-        self._raised = self._wishes = None
-        seen, k = _batch(scene, self._lanes_m), self.corridors
+        self._wishes, k = None, self.corridors
+        seen = _batch(scene, self._lanes_m)
         try:
             with self._deadline as deadline:
                 deadline.start()
@@ -330,25 +318,26 @@ class BatchedVut(ControllerDriver):
                     f"these and {k} wishes"
                 )
         except BaseException as error:
-            self._raised = self._deadline.reason(error)
-            self._replace = True
-            if scene.active.sum() > 1:
-                raise VutLostError(self._raised) from None
-            return np.full(self.corridors, np.nan)
+            reason, self._replace = self._deadline.reason(error), True
+            running = np.flatnonzero(scene.active).tolist()
+            if len(running) > 1:
+                raise VutLostError(reason) from None
+            self._errors = dict.fromkeys(running, reason) | self._errors
+            return np.full(k, np.nan)
         answer = answer.astype(np.float64)
         if answer.ndim == 2:
-            answer, wishes = answer
-            self._take(wishes, scene.active)
-        answer[list(self._wrong)] = np.nan
+            answer, requests = answer
+            self._take(requests, scene.active)
+        answer[list(self._errors)] = np.nan
         return answer
 
-    def _take(self, wishes: FloatArray, active: NDArray[np.bool_]) -> None:
+    def _take(self, requests: FloatArray, active: NDArray[np.bool_]) -> None:
         """Take whether to merge, 1 or 0, (K,), where an episode runs."""
-        known = (wishes == MERGE) | (wishes == STAY)
-        self._wishes = np.where(active & known, wishes == MERGE, NO_WISH).astype(np.int8)
+        known = (requests == MERGE) | (requests == STAY)
+        self._wishes = np.where(active & known, requests == MERGE, NO_WISH).astype(np.int8)
         for corridor in np.flatnonzero(active & ~known).tolist():
-            wrong = f"wishes {wishes[corridor]} instead of 1 or 0, to merge or not"
-            self._wrong.setdefault(corridor, wrong)
+            wrong = f"wishes {requests[corridor]} instead of 1 or 0, to merge or not"
+            self._errors.setdefault(corridor, wrong)
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
@@ -356,7 +345,7 @@ class BatchedVut(ControllerDriver):
 
     def reason(self, corridor: int) -> str | None:
         """Return what went wrong in a corridor."""
-        return self._wrong.get(corridor) or self._raised
+        return self._errors.get(corridor)
 
     def close(self) -> None:
         """Call `close`, if there is one."""
@@ -386,7 +375,7 @@ class SeenBatch:
 
     @property
     def may_merge(self) -> NDArray[np.bool_]:
-        """Whether a wish to merge, now, puts the VUT on the mainline in the next step, (K,)."""
+        """Whether a merge request, now, puts the VUT on the mainline in the next step, (K,)."""
         has_lane = self.lane_begin_m < self.lane_end_m
         next_m = self.x_vut_m + self.v_vut_mps * DT_S
         may: NDArray[np.bool_] = has_lane & ~self.merged & (next_m >= self.lane_begin_m)
@@ -395,19 +384,20 @@ class SeenBatch:
 
 def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
     """Return the observation of a scene; `lanes_m`, (2, K), has begin and end of the lanes."""
-    x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
+    active, step, x_m, v_mps, *_ = scene = copy.deepcopy(scene)
+    x_m, v_mps = np.delete(x_m, VUT, axis=0), np.delete(v_mps, VUT, axis=0)
     order = np.argsort(-x_m, axis=0, kind="stable")
     begin_m, end_m = lanes_m.copy()
     merged = scene.x_vut_m >= 0.0
     if scene.merged is not None:
         merged = np.where(begin_m < end_m, scene.merged, merged)
     return SeenBatch(
-        active=scene.active.copy(),
-        t_s=np.round(scene.step * DT_S, 1),
-        x_pov_m=scene.x_pov_m.copy(),
-        v_pov_mps=scene.v_pov_mps.copy(),
-        x_vut_m=scene.x_vut_m.copy(),
-        v_vut_mps=scene.v_vut_mps.copy(),
+        active=active,
+        t_s=np.round(step * DT_S, 1),
+        x_pov_m=scene.x_pov_m,
+        v_pov_mps=scene.v_pov_mps,
+        x_vut_m=scene.x_vut_m,
+        v_vut_mps=scene.v_vut_mps,
         x_others_m=np.take_along_axis(x_m, order, axis=0),
         v_others_mps=np.take_along_axis(v_mps, order, axis=0),
         lane_begin_m=begin_m,
@@ -422,12 +412,11 @@ def _close(thing: Any) -> None:
         thing.close()
 
 
-def _reset(reset: Callable[..., Any], *arguments: Any, seed: int) -> None:
-    """Call a reset, with the seed of the episode where it takes one."""
-    if takes_seed(reset):
-        reset(*arguments, seed=seed)
-    else:
-        reset(*arguments)
+def _reset(thing: Any, *arguments: Any, seed: int) -> None:
+    """Call `reset` of an object that has it, with the seed of the episode where it takes one."""
+    reset = getattr(thing, "reset", None)
+    if reset is not None:
+        reset(*arguments, **({"seed": seed} if takes_seed(reset) else {}))
 
 
 def _module_of(source: str) -> ModuleType:
@@ -436,25 +425,27 @@ def _module_of(source: str) -> ModuleType:
         if source.endswith(".py"):
             check_code(Path(source))
             return module_of_file(Path(source))
-        # As a user who starts Python in the working folder expects, its modules can be imported.
-        folder = str(Path.cwd())
-        is_new = folder not in sys.path
-        if is_new:
-            sys.path.append(folder)
-        try:
-            found = importlib.util.find_spec(source.partition(".")[0])
-            if found is not None and found.has_location and found.origin is not None:
-                check_code(Path(found.origin))
-            return importlib.import_module(source)
-        finally:
-            if is_new:
-                sys.path.remove(folder)
+        return _imported(source)
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        if source.endswith(".py") and isinstance(error, OSError):
-            raise UserError(f"cannot read the VUT {source}: {error.strerror}") from error
         raise _cannot_load(source, error) from error
+
+
+def _imported(name: str) -> ModuleType:
+    """Return a module; as for a user who starts Python there, it may be in the working folder."""
+    folder = str(Path.cwd())
+    is_new = folder not in sys.path
+    if is_new:
+        sys.path.append(folder)
+    try:
+        found = importlib.util.find_spec(name.partition(".")[0])
+        if found is not None and found.has_location and found.origin is not None:
+            check_code(Path(found.origin))
+        return importlib.import_module(name)
+    finally:
+        if is_new:
+            sys.path.remove(folder)
 
 
 def _cannot_load(what: str, error: BaseException) -> UserError:

@@ -1,15 +1,11 @@
-"""How a class, a function or an object is called, and which numbers it has.
-
-A VUT that cannot be called is refused by a sentence with the file and line of its method.
-"""
+"""How a class, a function or an object is called, and which numbers it has."""
 
 from __future__ import annotations
 
 import inspect
 import math
 import os
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Mapping
 from inspect import Parameter
 from pathlib import Path
 from types import MemberDescriptorType
@@ -40,45 +36,48 @@ def check_methods(vut: Any) -> None:
     for name, arguments in (OF_A_BATCH if batched else OF_ONE).items():
         method = inspect.getattr_static(owner, name, None)
         if inspect.isfunction(method):
-            seeded = name == "reset" and takes_seed(method)
-            check_call(method, ("self", *arguments), seeded=seeded)
+            check_call(method, ("self", *arguments))
+
+
+def _parameters(function: Callable[..., Any]) -> Mapping[str, Parameter]:
+    """Return the parameters of a function by name; none where Python does not know them."""
+    try:
+        return inspect.signature(function).parameters
+    except (TypeError, ValueError):
+        return {}
 
 
 def takes_seed(reset: Callable[..., Any]) -> bool:
     """Return whether a `reset` has a parameter `seed`: then it is called with the episode's."""
-    try:
-        return "seed" in inspect.signature(reset).parameters
-    except (TypeError, ValueError):
-        return False
+    return "seed" in _parameters(reset)
 
 
-def check_call(
-    function: Callable[..., Any], arguments: tuple[str, ...], *, seeded: bool = False
-) -> None:
+def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None:
     """Raise `UserError` where a function cannot be called with some arguments in order.
 
-    Args:
-        function: the function to check.
-        arguments: names of the arguments, for the sentence.
-        seeded: whether it is also called with the keyword `seed`.
+    The sentence has the file and line of the function.
     """
-    known = partial(function, seed=0) if seeded else function
-    if fits(known, len(arguments)) is not False:
-        return
     name = getattr(function, "__name__", "it")
-    parameters = ", ".join(inspect.signature(function).parameters)
+    if fits(function, len(arguments), seeded=name == "reset"):
+        return
+    parameters = ", ".join(_parameters(function))
     called = f"{name}({parameters}) is called as {name}({', '.join(arguments)})"
     raise UserError(printable(f"{_place(function)}{called}"))
 
 
-def fits(function: Callable[..., Any], count: int) -> bool | None:
-    """Return whether a function takes exactly `count` positional arguments; None if unknown."""
+def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> bool:
+    """Return whether a function takes a number of positional arguments, as far as is known.
+
+    Args:
+        function: the function.
+        count: number of arguments.
+        seeded: whether it is also called with the keyword `seed` if it has it.
+    """
+    keywords = {"seed": 0} if seeded and takes_seed(function) else {}
     try:
-        bound = inspect.signature(function).bind
-    except (TypeError, ValueError):
-        return None
-    try:
-        bound(*range(count))
+        inspect.signature(function).bind(*range(count), **keywords)
+    except ValueError:  # Python does not know the signature
+        return True
     except TypeError:
         return False
     return True
@@ -102,24 +101,16 @@ def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
         by_place: number of its first arguments that are given by their place.
     """
     defaults: dict[str, Any] = {}
-    if not is_code(target):
-        return defaults
-    try:
-        parameters = list(inspect.signature(target).parameters.values())
-    except (TypeError, ValueError):  # Python does not know the signature
-        return defaults
-    for parameter in parameters[by_place:]:
-        if parameter.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
-            defaults[parameter.name] = parameter.default
+    if is_code(target):
+        for parameter in list(_parameters(target).values())[by_place:]:
+            if parameter.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
+                defaults[parameter.name] = parameter.default
     return defaults
 
 
 def attributes_of(made: Any) -> dict[str, float]:
-    """Return the public attributes of an object that are numbers; no code of it runs."""
-    try:
-        names = set(object.__getattribute__(made, "__dict__"))
-    except AttributeError:
-        names = set()
+    """Return the public attributes of an object that are numbers; no property of it runs."""
+    names: set[str] = set(getattr(made, "__dict__", ()))
     for owner in type(made).__mro__:
         names |= set(vars(owner))
     found: dict[str, float] = {}
