@@ -1,4 +1,4 @@
-"""Cases files: which cases of a campaign go into one, and how it is written."""
+"""Cases files: the choice of cases, and how they are written."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,6 +26,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
+from merge_sumo.scenario.scenario import Scenario
 
 MOST = 40
 """Cases of a file where the user names none."""
@@ -36,27 +38,30 @@ ABOUT = """\
 
 
 def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
-    """Return a comparison of a cases file with its text of now, and notes on what changed.
+    """Return a comparison of a cases file with its current text, and notes on the changes.
 
     Args:
         compared: the comparison.
         file: the cases file.
-        path: where the file of now would be.
+        path: place of a file with the current text.
     """
     (step,), (_, now) = compared.steps, compared.versions
     outcomes = {one.index: one for one in (*file.outcomes, *now.outcomes)}
     before = cases_toml(file, file.outcomes, path, file.settings.vut)
     text = cases_toml(file, outcomes.values(), path, now.vut)
-    notes = list[str]()
+    notes: list[str] = []
     for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
-        notes += [] if old == new else [f"- {old.strip()}", f"+ {new.strip()}"]
-    for index, one in ((one.b.index, one) for one in step.cases):
+        if old != new:
+            notes += [f"- {old.strip()}", f"+ {new.strip()}"]
+    for one in step.cases:
+        index = one.b.index
+        reason = file.accepted.get(index)
         if one.change in GOT_WORSE:
             why = cause(one.b, now.motions([index]).get(index))
             notes.append(f"case {index}, {one.change}: {why}")
-        elif reason := file.accepted.get(index):
-            so = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
-            notes.append(f"case {index} is accepted ({reason}) and {so}")
+        elif reason:
+            result = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
+            notes.append(f"case {index} is accepted ({reason}) and {result}")
     if not any(one.is_tested for one in now.outcomes):
         notes.append(judge(now.outcomes).nothing_tested)
     notes += compared.notes
@@ -64,10 +69,11 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
 
 
 def watching(run: Run) -> list[Outcome]:
-    """Return at most 40 outcomes of a campaign: of more, those that watch a controller.
+    """Return at most 40 outcomes of a campaign: of more, those that detect changes of a controller.
 
-    A quarter are the worst failures of regions. The others pass, if as many do, the levels in turn:
-    by turns that of least margin and of least clearance that lies apart, and the farthest.
+    A quarter are the worst failures of regions. The others pass where enough cases do: of each
+    level in turn the one of least margin, then the one of least clearance, both a radius from those
+    chosen before, then the farthest one.
     """
     if len(run.outcomes) <= MOST:
         return run.outcomes
@@ -76,14 +82,19 @@ def watching(run: Run) -> list[Outcome]:
     chosen = failing[: MOST // 4]
     for turn, level in product(range(MOST), run.levels):
         left = [o for o in cases if o.case.level == level and passes(o) and o not in chosen]
-        if left and len(chosen) < MOST:
-            known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
-            points = to_unit((one.case for one in left), level, scenario)
-            away = cKDTree(known).query(points)[0]
-            near = [(one.margin, one.measures.clearance_m, 0.0)[turn % 3] for one in left]
-            apart = away > radius_for(points.shape[1]) if turn % 3 < 2 else away
-            # The last key decides first; no clearance is the largest.
-            chosen.append(left[np.lexsort((np.array(near, dtype=float), -1.0 * apart))[0]])
+        if not left or len(chosen) == MOST:
+            continue
+        known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
+        points = to_unit((one.case for one in left), level, scenario)
+        away = cKDTree(known).query(points)[0]
+        if turn % 3 == 2:
+            place = away.argmax()
+        else:
+            values = [(one.margin, one.measures.clearance_m)[turn % 3] for one in left]
+            is_near = away <= radius_for(points.shape[1])
+            # The last key decides first; a missing clearance is the largest.
+            place = np.lexsort((np.array(values, dtype=float), is_near))[0]
+        chosen.append(left[place])
     return [*chosen, *failing[MOST // 4 :]][:MOST]
 
 
@@ -105,14 +116,14 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
 
     Args:
         run: the campaign.
-        indices: the cases; without any, at most 40 that watch a controller.
+        indices: the cases; without any, those of `watching`.
         target: the new file, or a folder for it.
 
     Returns:
         The path of the file.
 
     Raises:
-        UserError: if there is no such case, or the file cannot be written.
+        UserError: there is no such case, or the file cannot be written.
     """
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = new_file_in(target, f"cases{SUFFIX}")
@@ -128,7 +139,7 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
 
 
 def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
-    """Return a cases file for a path; `vut` is who drove.
+    """Return the text of a cases file.
 
     Args:
         run: the campaign.
@@ -136,34 +147,41 @@ def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> s
         path: path of the file.
         vut: the VUT that drove.
     """
-    scenario = run.scenario
     ordered = sorted(outcomes, key=lambda one: (one.case.level, one.index))
-    usual, place = {one.name: one.default for one in fields(scenario)}, scenario.to_record()
-    if len(Path(scenario.net or "").parts) > 1:
-        place["net"] = f"./{Path(os.path.relpath(str(scenario.net), path.parent)).as_posix()}"
-    place = {name: one for name, one in place.items() if name == "name" or one != usual.get(name)}
     head = {name: run.record.get(name) for name in Head.__struct_fields__}
-    head |= {
-        "vut": vut,
-        "policies_sha256": policies_of(run, ordered),
-        "scenario": place,
-        "cases": None,
-    }
+    head["vut"], head["scenario"] = vut, _scenario(run.scenario, path)
+    head["policies_sha256"] = policies_of(run, ordered)
     head["tolerance"] = run.tolerance if isinstance(run, CasesFile) else TOLERANCE
+    del head["cases"]
     lines = [f"{name} = {toml_value(one)}" for name, one in head.items() if one is not None]
-    lines += ["cases = [", *(f"  {_line(run, outcome)}," for outcome in ordered), "]"]
-    return ABOUT + "\n".join(lines) + "\n"
+    lines.append("cases = [")
+    lines += [f"  {_line(run, outcome)}," for outcome in ordered]
+    return ABOUT + "\n".join([*lines, "]"]) + "\n"
+
+
+def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
+    """Return the name of a scenario, and its values that are not those by default."""
+    usual = {field.name: field.default for field in fields(scenario)}
+    record = scenario.to_record()
+    if len(Path(scenario.net or "").parts) > 1:
+        record["net"] = f"./{Path(os.path.relpath(str(scenario.net), path.parent)).as_posix()}"
+    return {k: one for k, one in record.items() if k == "name" or one != usual.get(k)}
 
 
 def _line(run: Run, outcome: Outcome) -> str:
-    """Return the line of a case: verdict and what decided it, its place, and what is accepted."""
-    accepted = run.accepted if isinstance(run, CasesFile) and not passes(outcome) else {}
-    record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
-    record |= {"accepted": accepted.get(outcome.index)}
-    record |= {"end": None} if outcome.measures.end.is_tested else {}
-    deciding = () if run.criterion.require else sorted(condition_of(run.criterion.words).names)
-    told = ("index", "level", "verdict", "end", "severity", "margin", *deciding, "error")
-    place = (of.field for of in run.scenario.dimensions(outcome.case.level))
-    line = {name: short(record.get(name)) for name in told}
-    line |= {name: record.get(name) for name in (*place, "draw", "accepted")}
+    """Return the line of a case: verdict and deciding measures, its place, and its acceptance."""
+    line = {"index": outcome.index, "level": outcome.case.level, "verdict": verdict_of(outcome)}
+    measures = ["severity"] if outcome.measures.end.is_tested else ["end", "severity"]
+    line |= {name: outcome.measures.value(name) for name in measures}
+    line["margin"] = outcome.margin
+    if not run.criterion.require:
+        for name in sorted(condition_of(run.criterion.words).names):
+            line.setdefault(name, outcome.measures.value(name))
+    line["error"] = outcome.measures.error
+    line = {name: short(value) for name, value in line.items()}
+    for dimension in run.scenario.dimensions(outcome.case.level):
+        line[dimension.field] = getattr(outcome.case, dimension.field)
+    line["draw"] = outcome.case.draw or None
+    if isinstance(run, CasesFile) and not passes(outcome):
+        line["accepted"] = run.accepted.get(outcome.index)
     return toml_value({name: value for name, value in line.items() if value is not None})

@@ -1,10 +1,8 @@
-"""The page of a comparison: what changed from version to version, and both motions of each case.
-
-It is one HTML file without scripts that loads nothing.
-"""
+"""The page of a comparison: changes, and both motions of each case, in one file without scripts."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -21,6 +19,8 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
 SHOWN = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
+REGIONS = 20
+"""Regions of a level that are listed."""
 DRAWN = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
     *(Change.STILL_CONTACT, Change.FIXED),
@@ -44,7 +44,12 @@ def write_against(run: Run) -> None:
 
 def comparison_page(compared: Comparison) -> str:
     """Return the page of a comparison as HTML."""
-    outcomes = next(version.outcomes for version in compared.versions if version.outcomes)
+    steps = [(step, _maps(step), _sections(step, compared)) for step in compared.steps]
+    vehicles = max(
+        outcome.case.scenario.vehicles
+        for version in compared.versions
+        for outcome in version.outcomes[:1]
+    )
     return page(
         "comparison.html.jinja",
         styles=STYLES,
@@ -53,16 +58,15 @@ def comparison_page(compared: Comparison) -> str:
         counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
         fmc=fmc_rows(compared),
         change_in_words=change_in_words,
-        steps=[(step, _maps(step), _sections(step, compared)) for step in compared.steps],
-        vehicles=max(outcome.case.scenario.vehicles for outcome in outcomes),
-        # Regions of a level that are listed.
-        most=20,
+        steps=steps,
+        vehicles=vehicles,
+        most=REGIONS,
         cut=cut,
     )
 
 
 def _maps(step: Step) -> dict[int, Any]:
-    """Return by level its coordinates, and where cases changed; what broke lies on top."""
+    """Return by level its coordinates, and where cases changed; those that broke lie on top."""
     maps: dict[int, Any] = {}
     for one in reversed(step.cases):
         if one.change in DRAWN:
@@ -73,70 +77,58 @@ def _maps(step: Step) -> dict[int, Any]:
 
 
 def _sections(step: Step, compared: Comparison) -> list[tuple[Change, int, Any]]:
-    """Return each change with the number of its cases, and of the first of them the picture.
+    """Return each change with the number of its cases, and the picture of the first of them.
 
-    Of a case: what became of it; by version its number, folder, outcome, and cause; the charts;
-    when the motions begin to differ.
+    Of a case: its change; by version the number, folder, outcome, and cause; the charts; the time
+    from which on the motions differ.
     """
     sections, left = [], SHOWN
-    numbers = (step.before, step.after)
-    versions = [compared.versions[number - 1] for number in numbers]
-    folders = [version.folder for version in versions]
     for change in DRAWN:
         cases = [case for case in step.cases if case.change is change]
         shown = cases[:left]
         left -= len(shown)
-        pairs = [(one.a, one.b) for one in shown]
-        known = [
-            version.motions(outcome.index for outcome in outcomes)
-            for version, outcomes in zip(versions, zip(*pairs, strict=True), strict=False)
-        ]
         rows = []
-        for one, pair in zip(shown, pairs, strict=True):
-            found = [of.get(outcome.index) for of, outcome in zip(known, pair, strict=True)]
-            motions = [None if motion is None else motion.whole for motion in found]
-            words = [cause(outcome, own) for outcome, own in zip(pair, found, strict=True)]
-            both = list(zip(numbers, folders, pair, words, strict=True))
-            rows.append((one, both, _charts(*motions), _differ_s(*motions)))
+        for one in shown:
+            versions, motions = [], {}
+            sides = (("earlier", step.before, one.a), ("later", step.after, one.b))
+            for name, number, outcome in sides:
+                version = compared.versions[number - 1]
+                motion = version.motions([outcome.index]).get(outcome.index)
+                versions.append((number, version.folder, outcome, cause(outcome, motion)))
+                if motion is not None:
+                    motions[name] = motion.whole
+            rows.append((one, versions, _charts(motions), _differ_s(motions)))
         if cases:
             sections.append((change, len(cases), rows))
     return sections
 
 
-def _differ_s(earlier: FloatArray | None, later: FloatArray | None) -> float | None:
+def _differ_s(motions: Mapping[str, FloatArray]) -> float | None:
     """Return when two motions, (T + 1, A, 3), begin to differ; None where they do not."""
-    if earlier is None or later is None:
+    if len(motions) < 2:
         return None
+    earlier, later = motions.values()
     rows = min(len(earlier), len(later))
-    # In m, m/s and m/s2: motions that differ by less look alike.
+    # In m, m/s and m/s2: smaller differences cannot be seen.
     apart = (np.abs(earlier[:rows] - later[:rows]) > 0.005).any(axis=(1, 2))
-    if len(earlier) == len(later) and not apart.any():
-        return None
-    return round((int(apart.argmax()) if apart.any() else rows - 1) * DT_S, 1)
+    if apart.any():
+        return round(int(apart.argmax()) * DT_S, 1)
+    return None if len(earlier) == len(later) else round((rows - 1) * DT_S, 1)
 
 
-def _charts(earlier: FloatArray | None, later: FloatArray | None) -> list[dict[str, Any]]:
+def _charts(motions: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
     """Return speeds and positions of all cars in both motions, over the same axes."""
-    known = [
-        (name, one) for name, one in (("earlier", earlier), ("later", later)) if one is not None
-    ]
     charts = []
-    for title, k in (("speed, m/s", 1), (X_AXIS, 0)) if known else ():
-        values = np.concatenate([one[:, :, k].ravel() for _, one in known])
-        low, high = float(values.min()), float(values.max())
+    for title, k in (("speed, m/s", 1), (X_AXIS, 0)) if motions else ():
+        lines = []
         # The VUT lies on top.
-        cars = sorted(range(known[0][1].shape[1]), key=lambda car: car == VUT)
-        charts.append(
-            {
-                "title": title,
-                "low": low,
-                "high": max(high, low + 1.0),
-                "steps": max(1, *(len(one) - 1 for _, one in known)),
-                "lines": [
-                    (f"{VEHICLES[car]} {name}", np.round(one[:, car, k], 2).tolist())
-                    for car in cars
-                    for name, one in known
-                ],
-            }
-        )
+        for car in sorted(range(next(iter(motions.values())).shape[1]), key=lambda car: car == VUT):
+            for name, motion in motions.items():
+                values = np.round(motion[:, car, k], 2).tolist()
+                lines.append((f"{VEHICLES[car]} {name}", values))
+        low = min(min(values) for _, values in lines)
+        high = max(max(values) for _, values in lines)
+        steps = max(len(values) - 1 for _, values in lines)
+        chart = {"title": title, "low": low, "high": max(high, low + 1.0), "lines": lines}
+        charts.append(chart | {"steps": max(1, steps)})
     return charts

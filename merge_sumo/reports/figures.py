@@ -1,7 +1,7 @@
 """Pictures of experiments, drawn by matplotlib (the extra `plot`), and the page of a reproduction.
 
-One colour per sampler in all pictures, and one per level of the POV; all of them are told apart
-with any kind of colour vision (Okabe and Ito, 2008).
+A sampler and a level of the POV have a colour each in all pictures, which any kind of colour vision
+tells apart (Okabe and Ito, 2008).
 """
 
 from __future__ import annotations
@@ -116,14 +116,14 @@ def coverage_curves(title: str, study: SamplerStudy) -> Figure:
 
 
 def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
-    """Draw where cases were run and where they failed, a panel per sampler, in the pool's units.
+    """Draw cases and failures in the units of the pool, a panel per sampler.
 
-    The pale discs around failures are what FMC counts; of three coordinates the first two are
-    drawn, without discs.
+    Of two coordinates the discs around failures are those that FMC counts; of three the first two
+    are drawn.
 
     Args:
         title: title of the figure.
-        panels: what each panel shows, by its title.
+        panels: cases of each panel, by its title.
         level: level of the POV.
     """
     columns = min(len(panels), 3)
@@ -131,13 +131,19 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
     with _drawing(title, 3.6 * columns, 3.1 * rows + 0.4) as figure:
         for place, (name, panel) in enumerate(panels.items(), start=1):
             axes = figure.add_subplot(rows, columns, place)
-            _map(axes, panel, level, colour(name))
+            ink, size = colour(name), 3.0 if len(panel.points) > 2000 else 8.0
+            safe = _physical(panel.points[~panel.failed], level)
+            failing = _physical(panel.points[panel.failed], level)
+            dots: Any = {"linewidths": 0, "rasterized": True}
+            axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color="#c4c9cf", **dots)
+            if panel.points.shape[1] == 2:
+                _balls(axes, failing, level, ink)
+            axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
+            _pool_axes(axes, level)
             axes.label_outer()
-            failures, cases = int(np.sum(panel.failed)), len(panel.points)
-            axes.set_title(name, color=colour(name), fontweight="bold")
-            axes.set_title(
-                f"{failures} of {cases} fail, FMC {panel.fmc:.4f}", loc="right", fontsize=8.5
-            )
+            found = f"{len(failing)} of {len(panel.points)} fail, FMC {panel.fmc:.4f}"
+            axes.set_title(name, color=ink, fontweight="bold")
+            axes.set_title(found, loc="right", fontsize=8.5)
     return figure
 
 
@@ -147,31 +153,22 @@ def _physical(points: FloatArray, level: int) -> FloatArray:
     return np.asarray(low + points * (high - low), dtype=np.float64)
 
 
-def _map(axes: Axes, panel: Panel, level: int, ink: str) -> None:
+def _balls(axes: Axes, centres: FloatArray, level: int, ink: str) -> None:
     from matplotlib.collections import EllipseCollection
-    from matplotlib.colors import to_rgb
 
-    x, v, *more = US23.dimensions(level)
-    failing = _physical(panel.points[panel.failed], level)
-    safe = _physical(panel.points[~panel.failed], level)
-    size = 3.0 if len(panel.points) > 2000 else 8.0
-    dots: Any = {"linewidths": 0, "rasterized": True}
-    axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color="#c4c9cf", **dots)
-    if not more:
-        balls = EllipseCollection(
-            [2 * RADIUS * (x.high - x.low)],
-            [2 * RADIUS * (v.high - v.low)],
-            [0.0],
-            units="xy",
-            offsets=failing[:, :2],
-            offset_transform=axes.transData,
-            # Mixed with white, so that discs on discs stay one colour.
-            facecolor=tuple(0.22 * part + 0.78 for part in to_rgb(ink)),
-            linewidths=0,
-        )
-        axes.add_collection(balls)
-    axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
-    _pool_axes(axes, level)
+    width, height = (2 * RADIUS * (d.high - d.low) for d in US23.dimensions(level))
+    balls = EllipseCollection(
+        [width],
+        [height],
+        [0.0],
+        units="xy",
+        offsets=centres,
+        offset_transform=axes.transData,
+        facecolor=ink,
+        alpha=0.1,
+        linewidths=0,
+    )
+    axes.add_collection(balls)
 
 
 def _pool_axes(axes: Axes, level: int) -> None:
@@ -190,37 +187,32 @@ def predicted_margins(
 
     Args:
         title: title of the figure.
-        by_batch: predicted margins by the title of a panel.
+        by_batch: predicted margins by the number of batches.
         level: level of the POV.
-        truth: failing cases of the truth, (m, 2).
+        truth: failing cases of the truth in the unit square, (m, 2).
     """
     x, v = US23.dimensions(level)
     steps = np.linspace(-1.0, 1.0, 21)
-    failures = _physical(truth, level)
+    extent = (x.low, x.high, v.low, v.high)
+    failing = _physical(truth, level)
     rows, columns = -(-len(by_batch) // 2), min(len(by_batch), 2)
     with _drawing(title, 8.6, 6.6) as figure:
-        shown = []
         for place, (batch, predicted) in enumerate(by_batch.items(), start=1):
             axes = figure.add_subplot(rows, columns, place)
-            shown.append(axes)
-            n = len(predicted.margin)
-            across, up = np.linspace(x.low, x.high, n), np.linspace(v.low, v.high, n)
-            filled = axes.contourf(
-                across, up, np.minimum(predicted.margin, 1.0), steps, cmap="cividis", extend="min"
-            )
-            if predicted.margin.min() < 0.0 < predicted.margin.max():
-                axes.contour(across, up, predicted.margin, [0.0], colors="white", linewidths=1.6)
-            axes.scatter(
-                failures[:, 0], failures[:, 1], s=2, color="#D55E00", linewidths=0, alpha=0.5
-            )
-            run = _physical(predicted.learned.points, level)
-            axes.scatter(
-                run[:, 0], run[:, 1], s=9, color="white", edgecolors="black", linewidths=0.5
-            )
-            axes.set_title(f"after batch {batch}: {len(run)} cases")
+            margin = np.minimum(predicted.margin, 1.0)
+            look: Any = {"extent": extent, "cmap": "cividis", "extend": "min"}
+            filled = axes.contourf(margin, steps, **look)
+            if margin.min() < 0.0 < margin.max():
+                axes.contour(margin, [0.0], extent=extent, colors="white", linewidths=1.6)
+            marks: Any = {"s": 2, "color": "#D55E00", "linewidths": 0, "alpha": 0.5}
+            axes.scatter(*failing.T, **marks)
+            learned = _physical(predicted.learned.points, level)
+            marks = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.5}
+            axes.scatter(*learned.T, **marks)
+            axes.set_title(f"after batch {batch}: {len(learned)} cases")
             _pool_axes(axes, level)
             axes.label_outer()
-        bar = figure.colorbar(filled, ax=shown, shrink=0.85, ticks=steps[::5])
+        bar = figure.colorbar(filled, ax=figure.axes, shrink=0.85, ticks=steps[::5])
         bar.set_label("predicted margin (white line: 0, below which a case fails)")
     return figure
 
@@ -257,7 +249,12 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
 def write_reproduction(result: Reproduction, folder: Path) -> Path:
     """Write the table, the figures and the page of a reproduction; return the path of the page.
 
-    Raises `UserError` where a file is there already, or without matplotlib.
+    Args:
+        result: the reproduction.
+        folder: folder for the files.
+
+    Raises:
+        UserError: a file is there already, or matplotlib is missing.
     """
     write_new(folder / "table2.json", to_json(result.to_record()))
     write_new(folder / "table2.md", ("\n".join(result.lines()) + "\n").encode())
@@ -276,18 +273,13 @@ def _figures(result: Reproduction) -> Iterator[tuple[str, Figure]]:
     for one in result.columns.values():
         vut, level = one.column.vut, one.column.level
         against = f"{vut} against a level-{level} POV"
-        curves = coverage_curves(f"Coverage of {against}", one.study)
-        yield f"curves-level{level}", curves
+        yield f"curves-level{level}", coverage_curves(f"Coverage of {against}", one.study)
         yield f"cases-level{level}", maps(f"Failures of {against}", one.panels, level)
         if level == 1:
-            truth = one.panels["truth"]
-            yield (
-                f"gpr-surface-level{level}",
-                predicted_margins(
-                    f"The surrogate of gpr on {against}",
-                    *(one.predicted(), level, truth.points[truth.failed]),
-                ),
-            )
+            truth = one.panels[TRUTH]
+            failing, title = truth.points[truth.failed], f"The surrogate of gpr on {against}"
+            surface = predicted_margins(title, one.predicted(), level, failing)
+            yield f"gpr-surface-level{level}", surface
     scale = result.scale
     title = f"design2 against all levels, {scale.batches} batches of {2 * scale.batch}"
     yield "allocation", allocation(title, result.levels)

@@ -1,4 +1,4 @@
-"""Progress of what runs: bars on a terminal, elsewhere a line now and then."""
+"""Progress of campaigns and studies: bars on a terminal, elsewhere lines of text."""
 
 from __future__ import annotations
 
@@ -13,32 +13,33 @@ from typing import Self
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
-from merge_sumo.metrics.cause import failure_boxes
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import judge, one_per_case
+from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
-from merge_sumo.scenario.scenario import level_name
 
-PER = ((1.0, "s"), (60.0, "min"), (3600.0, "h"))
-"""Seconds of what a rate may be per; the first at which it is 1 or more is taken."""
 LINES = 10
-"""Maximum number of progress lines without a terminal."""
+"""Lines of a bar without a terminal, where none takes more than `SLOW_S`."""
+SLOW_S = 60.0
+REDRAWN_S = 0.25
+"""Minimum time between two pictures of a bar on a terminal."""
 
 
 def rate_text(count: float, elapsed_s: float, unit: str) -> str:
-    """Return a readable rate: "7,140 cases/s", "12 cases/s", "3.5 cases/min".
+    """Return a readable rate, such as "7,140 cases/s" or "3.5 cases/min".
 
     Args:
-        count: number of things done.
+        count: number of finished items.
         elapsed_s: time that they took.
-        unit: name of the things.
+        unit: name of the items.
     """
     if count <= 0.0 or elapsed_s <= 0.0:
         return f"- {unit}/s"
-    rates = [(count / elapsed_s * seconds, name) for seconds, name in PER]
-    rate, per = next(((rate, name) for rate, name in rates if rate >= 1.0), rates[-1])
-    return f"{rate:,.0f} {unit}/{per}" if rate >= 10.0 else f"{rate:.1f} {unit}/{per}"
+    rate, per = count / elapsed_s, "s"
+    if rate < 1.0:
+        rate, per = 60.0 * rate, "min"
+    number = f"{rate:,.0f}" if rate >= 10.0 else f"{rate:.1f}"
+    return f"{number} {unit}/{per}"
 
 
 def is_watched() -> bool:
@@ -49,55 +50,33 @@ def is_watched() -> bool:
 
 @dataclass(slots=True)
 class _Bar:
-    """A bar: its total, since when it counts, and how much was done before.
+    """A bar: time and count at its first update, and time and count as it was last shown."""
 
-    `said` and `said_s` are what was done, and when, as it was last shown; `task` draws it.
-    """
-
-    total: int
     start_s: float
-    before: int = 0
-    said: int = 0
-    said_s: float = -1e9
+    before: int
+    shown_s: float
+    shown: int = 0
     task: TaskID | None = None
-
-    def is_due(self, done: int, *, drawn: bool) -> bool:
-        """Return whether to show it: on a terminal what is fresh, else a tenth; the end always.
-
-        Where things take long, each of them is.
-        """
-        now_s = time.monotonic()
-        since, since_s = done - self.said, now_s - self.said_s
-        # Time after which every new count is printed.
-        slow = now_s - max(self.said_s, self.start_s) >= 60.0
-        enough = drawn or since * LINES >= self.total or (since > 0 and slow)
-        # Minimum time between two of these lines.
-        # Maximum age of a bar on a terminal.
-        due = enough and since_s >= (0.25 if drawn else 1.0)
-        if due or (done >= self.total and since > 0):
-            self.said, self.said_s = done, now_s
-            return True
-        return False
-
-    def note(self, done: int, unit: str) -> str:
-        """Return the rate, and the time that is left at it."""
-        counted, elapsed_s = done - self.before, time.monotonic() - self.start_s
-        rate = rate_text(counted, elapsed_s, unit)
-        if done >= self.total or counted <= 0:
-            return rate
-        left = timedelta(seconds=round((self.total - done) * elapsed_s / counted))
-        return f"{rate}  {left} left"
 
 
 class Bars:
-    """Progress bars by title; the first appears with the first thing that is counted.
+    """Progress bars by title; a bar appears with its first update.
 
-    So a command that is refused shows its sentence and no bar. Where there is no terminal to draw
-    on, a line stands after every tenth of a bar.
+    Without a terminal, a line is printed after every tenth of a bar.
+
+    Example:
+        >>> with Bars() as bars:
+        ...     for done in range(101):
+        ...         bars.counted("cases", done, 100, "cases")
     """
 
     def __init__(self, console: Console | None = None, *, shown: bool | None = True) -> None:
-        """Show nothing yet, or never where it is not to be `shown`; None is where it is watched."""
+        """Show nothing yet.
+
+        Args:
+            console: where to print; by default standard error.
+            shown: whether to show anything; None on a terminal and in a notebook only.
+        """
         self._console = console or Console(stderr=True, force_jupyter=False)
         self._is_shown = is_watched() if shown is None else shown
         self._progress = Progress(
@@ -108,39 +87,44 @@ class Bars:
             console=self._console,
         )
         self._bars: dict[str, _Bar] = {}
-        self._opened_s = time.monotonic()
 
     def counted(
         self, title: str, done: int, total: int, unit: str, note: str | Callable[[], str] = ""
     ) -> None:
-        """Set a bar that counts things called `unit`, with their rate and the time left.
-
-        A `note` that takes time to make is a function; it is called when it is shown.
+        """Update a bar, with the rate and the remaining time since its first update.
 
         Args:
             title: title of the bar.
-            done: number of things done.
-            total: number of all things.
-            unit: name of the things.
-            note: text after the bar.
+            done: number of finished items.
+            total: number of all items.
+            unit: name of the items.
+            note: text after the bar, or a function that makes it when it is shown.
         """
-        # What ends first began before: with the others, or when the bar before was full.
-        start_s = self._opened_s if done else time.monotonic()
-        bar = self._bars.setdefault(title, _Bar(total, start_s))
-        if done >= total:
-            self._opened_s = time.monotonic()
-        drawn = self._console.is_terminal
-        if not (self._is_shown and bar.is_due(done, drawn=drawn)):
+        now_s = time.monotonic()
+        bar = self._bars.setdefault(title, _Bar(now_s, done, now_s))
+        since, since_s = done - bar.shown, now_s - bar.shown_s
+        if self._console.is_terminal:
+            is_due = bar.task is None or since_s >= REDRAWN_S
+        else:
+            is_due = (since_s >= 1.0 and since * LINES >= total) or since_s >= SLOW_S
+        is_last = done >= total and since > 0
+        if not self._is_shown or not (is_due or is_last):
             return
-        text = note if isinstance(note, str) else note()
-        said = "  ".join(filter(None, (text.strip(), bar.note(done, unit))))
-        if not drawn:
-            self.say(f"{printable(title)}: {done:,}/{total:,}  {said}")
+        bar.shown, bar.shown_s = done, now_s
+        parts = [note if isinstance(note, str) else note()]
+        finished, elapsed_s = done - bar.before, now_s - bar.start_s
+        parts.append(rate_text(finished, elapsed_s, unit))
+        if finished > 0 and done < total:
+            left_s = (total - done) * elapsed_s / finished
+            parts.append(f"{timedelta(seconds=round(left_s))} left")
+        text = "  ".join(filter(None, parts))
+        if not self._console.is_terminal:
+            self.say(f"{printable(title)}: {done:,}/{total:,}  {text}")
             return
         if bar.task is None:
             self._progress.start()
             bar.task = self._progress.add_task(printable(title), total=total, note="")
-        self._progress.update(bar.task, completed=done, note=said)
+        self._progress.update(bar.task, completed=done, note=text)
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
@@ -152,22 +136,25 @@ class Bars:
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Leave the bars as they are; remove them where the work was stopped."""
-        # Not by the bars: Ctrl-C may have come before the first of them was noted.
+        # Ctrl-C may come between the start of the drawing and the first bar.
         if self._progress.live.is_started:
             self._progress.live.transient = error is not None
             self._progress.stop()
 
 
 class Counter(Bars):
-    """A bar that counts things called `unit`, with their rate."""
+    """A bar of finished items."""
 
     def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
         super().__init__(shown=shown)
         self._title, self._total, self._unit = title, total, unit
         self._count = 0
+        self._start_s = time.monotonic()
 
     def ended(self, count: int, note: str = "") -> None:
-        """Count things that have ended."""
+        """Count items that have finished."""
+        if not self._count:
+            self._bars[self._title] = _Bar(self._start_s, 0, self._start_s)
         self._count += count
         self.counted(self._title, self._count, self._total, self._unit, note)
 
@@ -189,33 +176,20 @@ class CampaignBars(Bars):
         self._outcomes: list[Outcome] = []
 
     def begin(self, title: str, before: Sequence[Outcome] = ()) -> None:
-        """Print what begins, and where its report is: the first case may take long.
+        """Print the title, and where the report is.
 
-        Cases that ran `before` a resume do not count in the rate.
+        Args:
+            title: title of the campaign.
+            before: outcomes of a campaign that is resumed; they do not count in the rate.
         """
         cases = counted(self._cases, "case")
         self.say(f"{printable(title)}: {cases}, watch {printable(str(self._folder / REPORT))}")
-        self._outcomes += before
-        self._bars["cases"] = _Bar(self._cases, time.monotonic(), len(before))
-        self.counted("cases", len(before), self._cases, "cases")
+        self.ended(before)
 
     def ended(self, outcomes: Sequence[Outcome]) -> None:
         """Count cases."""
-        before = len(self._outcomes)
         self._outcomes += outcomes
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
-        # Cases after which a campaign of more prints where failures lie so far.
-        if before < 100 <= len(self._outcomes) < self._cases:
-            self._say_where()
-
-    def _say_where(self) -> None:
-        """Print where the failures so far lie, in the largest region of each level."""
-        cases = one_per_case(self._outcomes, self._tolerated)
-        self.say(f"so far {judge(self._outcomes, self._tolerated).counts}")
-        for level in sorted({outcome.case.level for outcome in cases}):
-            for box in failure_boxes(cases, level)[:1]:
-                inside = f"{box.failures} of {counted(box.cases, 'case')} fail"
-                self.say(f"  POV level {level_name(level)}, {box.where}: {inside}")
 
     def _found(self) -> str:
         return ", ".join(judge(self._outcomes, self._tolerated).found)

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 import math
 import subprocess
 import sys
@@ -16,7 +15,6 @@ import polars
 import pytest
 from lxml import etree
 from scenariogeneration import xosc
-from support.calling import invoke
 from support.handmade import write_run
 
 import merge_sumo as ms
@@ -155,20 +153,6 @@ class TestTheCommand:
             ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
         with pytest.raises(UserError, match=r"end it in \.csv"):
             ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
-
-    def test_says_what_to_install(self, made, tmp_path, monkeypatch):
-        load = importlib.import_module
-
-        def refuse(name, *rest, **more):
-            if name.startswith("scenariogeneration"):
-                raise ImportError(name)
-            return load(name, *rest, **more)
-
-        monkeypatch.setattr(importlib, "import_module", refuse)
-        said = invoke("export", made.folder, 1, "--format", "openscenario", "--out", tmp_path)
-        assert isinstance(said.exception, UserError)
-        assert "merge-sumo[export]" in str(said.exception)
-        assert list(tmp_path.iterdir()) == []
 
 
 def test_no_export_loads_libsumo():

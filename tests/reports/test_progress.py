@@ -1,4 +1,4 @@
-"""What a person sees while a campaign runs, on a terminal and elsewhere."""
+"""The progress of a campaign, on a terminal and elsewhere."""
 
 # mypy: no-strict-optional
 
@@ -51,14 +51,6 @@ def said(run, tmp_path, clock, **how) -> str:
 def test_without_a_terminal_a_line_at_the_start_and_for_every_tenth(run, tmp_path, clock):
     first, *lines = said(run, tmp_path, clock).splitlines()
     assert first == f"a [b]: 180 cases, watch {tmp_path / REPORT}"
-    so_far = next(place for place, line in enumerate(lines) if line.startswith("so far "))
-    assert lines[so_far - 1].startswith("cases: 90/180  ")
-    assert lines[so_far].endswith(" in 100 cases")
-    del lines[so_far]
-    regions = [line for line in lines if line.startswith("  POV level ")]
-    assert [line[12] for line in regions] == ["0", "1", "2"], "the largest of each level"
-    assert all(line.endswith(" cases fail") for line in regions)
-    lines = [line for line in lines if line not in regions]
     failing = sum(outcome.failed for outcome in run.outcomes)
     assert len(lines) == 20
     assert lines[0].startswith("cases: 18/180  ")
@@ -79,11 +71,12 @@ def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated
     fails = next(outcome for outcome in run.outcomes if outcome.failed)
     passes = next(outcome for outcome in run.outcomes if not outcome.failed).measures
     bars, out = bars_for(tmp_path, cases=4, tolerated=0.5)
+    bars.begin("a")
     for draw, measures in enumerate((fails.measures, passes, fails.measures, fails.measures)):
         clock[0] += 10.0
         case = replace(fails.case, draw=draw)
         bars.ended([replace(fails, index=draw, case=case, measures=measures, margin=None)])
-    found = [line.split("  ")[1] for line in out.getvalue().splitlines()]
+    found = [line.split("  ")[1] for line in out.getvalue().splitlines()[1:]]
     unsure = "0 failures, 1 undecided"
     assert found == [unsure, "0 failures", unsure, unsure], "half of the runs is not more"
 
@@ -94,7 +87,6 @@ def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated
         (7140, 1.0, "7,140 cases/s"),
         (5, 2.0, "2.5 cases/s"),
         (1, 20.0, "3.0 cases/min"),
-        (1, 36_000.0, "0.1 cases/h"),
         (0, 5.0, "- cases/s"),
     ],
 )
