@@ -68,6 +68,11 @@ class CasesFile(Run):
             raise UserError(f"the cases file {path}: {at}{error}") from error
         self.record["levels"] = self.levels
 
+    @property
+    def levels(self) -> list[int]:
+        """The POV levels of the cases."""
+        return sorted({outcome.case.level for outcome in self.outcomes})
+
     def _add(self, line: dict[str, Any]) -> None:
         """Add the case of a line; raise `UserError` where it is none."""
         if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
