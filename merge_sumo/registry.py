@@ -28,6 +28,9 @@ class Registry(Mapping[str, T], Generic[T]):
     It is read like a dictionary. An unknown name, a name that stands twice, and an object that
     cannot be loaded or is of another kind raise `UserError`.
 
+    Attributes:
+        ours: objects of this package by name; a program may add its own.
+
     Example:
         SAMPLERS["gpr"]  # imports the class
     """
@@ -52,9 +55,9 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         self.group, self.noun = group, noun
         self._accepts, self._contract = accepts, contract
-        self._ours: dict[str, EntryPoint | T] = {}
+        self.ours: dict[str, EntryPoint | T] = {}
         for name, item in ours.items():
-            self._ours[name] = EntryPoint(name, item, group) if isinstance(item, str) else item
+            self.ours[name] = EntryPoint(name, item, group) if isinstance(item, str) else item
 
     @property
     def packages(self) -> list[str]:
@@ -62,18 +65,18 @@ class Registry(Mapping[str, T], Generic[T]):
         return sorted({package for found in entries_of(self.group).values() for package in found})
 
     def __iter__(self) -> Iterator[str]:
-        return iter(dict.fromkeys((*self._ours, *entries_of(self.group))))
+        return iter(dict.fromkeys((*self.ours, *entries_of(self.group))))
 
     def __len__(self) -> int:
         return len(list(iter(self)))
 
     def __contains__(self, name: object) -> bool:
-        return name in self._ours or name in entries_of(self.group)
+        return name in self.ours or name in entries_of(self.group)
 
     def __getitem__(self, name: str) -> T:
         bringers: dict[str, EntryPoint | T] = dict(entries_of(self.group).get(name, {}))
-        if name in self._ours:
-            bringers[OURS] = self._ours[name]
+        if name in self.ours:
+            bringers[OURS] = self.ours[name]
         if len(bringers) > 1:
             packages = " and ".join(sorted(bringers))
             raise UserError(

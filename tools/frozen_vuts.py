@@ -164,4 +164,4 @@ class FrozenKind(ControllerKind):
         return FROZEN_VUTS[self.spec.argument](corridors)
 
 
-KINDS.register("frozen", FrozenKind)
+KINDS.ours["frozen"] = FrozenKind
