@@ -5,7 +5,7 @@ python tools/readme_commands.py "Install"  only those under that heading
 
 The pages come in the order of the site's navigation (`mkdocs.yml`), then README, which ends with
 the tests. A ```bash block is for what CI cannot run as it stands: the start page's are a test
-(`tests/docs/test_start_page.py`).
+(`tests/docs/test_tutorials.py`).
 """
 
 from __future__ import annotations

@@ -31,14 +31,10 @@ def page(name):
 
 
 @cache
-def truth(vut, level, cases, **settings):
-    """Return the truth of a VUT at a level."""
-    return ms.truth(vut, level=level, cases=cases, **settings).truths[level]
-
-
 def figures(vut, level, cases, **settings):
     """Return failures, FMC as pages write it, and the sizes of the regions of a truth."""
-    record = truth(vut, level, cases, **settings).to_record()
+    (truth,) = ms.truth(vut, level=level, cases=cases, **settings).truths.values()
+    record = truth.to_record()
     failures = record["failures"]
     sizes = [size for size in record["region_sizes"] if size >= REAL_REGION * failures]
     return failures, f"{record['fmc']:.4f}".lstrip("0") if failures else "0", sizes
