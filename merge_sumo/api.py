@@ -22,7 +22,6 @@ from dataclasses import asdict, fields, replace
 from functools import cache, partial, update_wrapper
 from itertools import pairwise
 from pathlib import Path
-from time import perf_counter
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -41,7 +40,7 @@ from merge_sumo.analysis import rerun as rerunning
 from merge_sumo.analysis import stress as ladder
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Comparison
-from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance
+from merge_sumo.analysis.counterfactuals import note_avoidance
 from merge_sumo.analysis.explanation import EXPLANATIONS, ExplanationResult, note_explanation
 from merge_sumo.analysis.probability import PROBABILITY, ProbabilityResult
 from merge_sumo.analysis.reproduction import Reproduction
@@ -583,6 +582,10 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
+    def on_part(title: str, done: int, total: int, unit: str) -> None:
+        bars.counted(title, done, total, unit)
+        check()
+
     workers = where.workers
     if workers is None and settings.cases <= FEW_CASES and not settings.may_vary:
         workers = 1
@@ -592,7 +595,6 @@ def run_and_report(
             bars,
             RunningReport(folder) as report,
         ):
-            begun_s = perf_counter()
             done = run_campaign(
                 settings,
                 plan,
@@ -603,14 +605,10 @@ def run_and_report(
                 begin=partial(bars.begin, title),
             )
             result = CampaignRun(done, config.gates)
-            plan = replace(plan, against=None)
-            on_part = partial(bars.counted, "careful drivers", unit="failures")
-            known = avoidance(done, plan, workers=available, check=check, on_part=on_part)
-            if known:
-                AVOIDANCE.write_lines(folder, known)
-            on_part = partial(bars.counted, "uniform starts", unit="cases")
-            note_shares(done, plan, available, perf_counter() - begun_s, check, on_part)
-            note_explanation(done, plan, check)
+            study = RunStudy(done, settings, replace(plan, against=None), available)
+            note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
+            note_shares(study, partial(on_part, "uniform starts", unit="cases"))
+            note_explanation(study)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:

@@ -16,6 +16,7 @@ import tempfile
 from pathlib import Path
 
 from merge_sumo.analysis.counterfactuals import CAREFUL, TAKES_OVER, avoidance
+from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -54,7 +55,7 @@ def row(vut: str, cases: int, workers: int | None) -> str:
             plan = resolve(settings)
             with open_workers(plan.workers(workers)) as there:
                 run = run_campaign(settings, plan, Path(folder) / str(level), workers=there)
-                failing = avoidance(run, plan, workers=there)
+                failing = avoidance(RunStudy(run, settings, plan, there))
             found = summarise(run.outcomes, (level,)).levels[level]
             failures.append(found.failures)
             coverage.append(f"{found.fmc:.4f}")

@@ -1,4 +1,4 @@
-"""Why a case fails: the smallest change of one thing with which it passes."""
+"""Why a case fails: the smallest change of one coordinate or parameter with which it passes."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from merge_sumo.scenario.case import Case, coordinates
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
-from merge_sumo.workers import Workers, open_workers
+from merge_sumo.workers import open_workers
 
 START_STEPS = 160
 """Values of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
 PARAMETER_STEPS = 40
-"""Values of the grid over the range of a parameter, each of which is another VUT."""
+"""Values of the grid over the range of a parameter; each of them is another VUT."""
 BLOCK = 16
 """Values of a side of the grid that run at a time, so that workers have something to do."""
 PSI = 0.0
@@ -39,7 +39,7 @@ Trial = tuple[ControllerSpec, Case]
 
 
 class Axis(Record, frozen=True):
-    """Values of one thing, and the nearest to that of a failure with which it passes.
+    """Values of a coordinate or a parameter, and the nearest ones with which a failure passes.
 
     Values are whole numbers of units of their last digit.
 
@@ -64,10 +64,10 @@ class Axis(Record, frozen=True):
     above: float | None = None
 
     @property
-    def passing(self) -> tuple[float, ...]:
+    def passing(self) -> list[float]:
         """The nearest values that pass, the smallest change first."""
-        found = (value for value in (self.below, self.above) if value is not None)
-        return tuple(sorted(found, key=lambda value: abs(value - self.value)))
+        found = [value for value in (self.below, self.above) if value is not None]
+        return sorted(found, key=lambda value: abs(value - self.value))
 
     @property
     def scale(self) -> float:
@@ -90,13 +90,13 @@ class Axis(Record, frozen=True):
 
 
 class Explanation(Record, frozen=True):
-    """The smallest changes of one thing that were found to make a failure pass.
+    """The smallest changes of one coordinate or parameter with which a failure passes.
 
     Attributes:
         index: of the case in its campaign.
         start: its coordinates, with psi at level 2, in the pool's order.
-        levels: by name of another level of the POV, whether the case passes there.
-        parameters: the parameters of the VUT that were named.
+        levels: whether the case passes at other levels of the POV, by their name.
+        parameters: parameters of the VUT.
         vut: the VUT that drove; None for that of the campaign.
     """
 
@@ -108,16 +108,15 @@ class Explanation(Record, frozen=True):
 
     @property
     def key(self) -> tuple[int, str]:
-        """The case and the VUT, of which a file has one explanation."""
+        """The case and the VUT: a file has one explanation of them."""
         return self.index, self.vut or ""
 
     @property
     def nearest_start(self) -> tuple[str, float] | None:
         """The coordinate and the value of the smallest change of the start that passes."""
-        nearest = None
-        least = math.inf
+        nearest, least = None, math.inf
         for axis in self.start:
-            for value in axis.passing[:1]:
+            for value in axis.passing:
                 share = abs(value - axis.value) / (axis.high - axis.low)
                 if share < least:
                     least, nearest = share, (axis.name, value)
@@ -161,43 +160,41 @@ def failure_of(run: Run, index: int | None) -> Outcome:
     return outcome
 
 
-def note_explanation(
-    run: Run, plan: SimulationPlan, check: Callable[[], None] = lambda: None
-) -> None:
+def note_explanation(study: RunStudy) -> None:
     """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
     Nothing is written for drivers that need SUMO, nor where the engines differ.
 
     Args:
-        run: the campaign.
-        plan: how its cases ran.
-        check: called before each step of the search; may raise to stop there.
+        study: the campaign, and how its cases run.
     """
-    worst = failures(run.cases)[:1]
-    if plan.needs_sumo is None and worst:
+    worst = failures(study.run.cases)[:1]
+    if study.plan.needs_sumo is None and worst:
+        plan = study.plan.with_engine(None)
         # Worker processes would take longer to start than these cases.
         with suppress(UserError), open_workers(1) as here:
-            _write(run, _Search(plan.with_engine(None), worst[0], here, check).explanation())
+            here_alone = replace(study, plan=plan, workers=here)
+            _write(study.run, _Search(here_alone, worst[0]).explanation(()))
 
 
 def explain(
     study: RunStudy, index: int | None = None, ranges: Sequence[Range] = ()
 ) -> ExplanationResult:
-    """Explain a failure of a campaign, and write that into its folder.
+    """Explain a failure of a campaign, and write the explanation into its folder.
 
     Args:
         study: the campaign, and how its cases run.
-        index: of the failure; the worst by default.
+        index: index of the failure; by default the worst.
         ranges: parameters of the VUT that are searched, too.
 
     Raises:
-        UserError: for an index without a failure, for a campaign with a net or POVs of another
-            day, for a parameter that the VUT does not have, and where a case that runs a second
-            time ends otherwise.
+        UserError: for an index without a failure, for a campaign with another net or other POVs,
+            for a parameter that the VUT does not have, and where a case that runs a second time
+            ends otherwise.
     """
     outcome = failure_of(study.run, index)
     study.check_same_system()
-    found = _Search(study.plan, outcome, study.workers).explanation(ranges)
+    found = _Search(study, outcome).explanation(ranges)
     if study.settings.vut != study.run.settings.vut:
         found = replaced(found, vut=study.settings.vut)
     _write(study.run, found)
@@ -214,104 +211,83 @@ def _write(run: Run, found: Explanation) -> None:
 class _Search:
     """Runs a failure again with other values."""
 
-    def __init__(
-        self,
-        plan: SimulationPlan,
-        outcome: Outcome,
-        workers: Workers | None = None,
-        check: Callable[[], None] = lambda: None,
-    ) -> None:
-        """Take the failure, and how it runs.
+    def __init__(self, study: RunStudy, outcome: Outcome) -> None:
+        """Take the failure, and how its cases run."""
+        self._study, self._index, self._case = study, outcome.index, outcome.case
+        self._vut = study.plan.vut.spec
+        self._stated: dict[Trial, bool] = {}
+        """The trials of the explanation, and whether they pass."""
 
-        Args:
-            plan: how its cases run.
-            outcome: the failure.
-            workers: where they run, by default in this process.
-            check: called before cases run; may raise to stop there.
-        """
-        self._plan, self._outcome, self._case = plan, outcome, outcome.case
-        self._workers, self._check = workers, check
-        self._claims: dict[Trial, bool] = {}
-        """Whether cases pass that the explanation states."""
-
-    def explanation(self, ranges: Sequence[Range] = ()) -> Explanation:
+    def explanation(self, ranges: Sequence[Range]) -> Explanation:
         """Search along all axes, and confirm the result in SUMO.
 
         Raises:
             UserError: where a case that runs a second time ends otherwise.
         """
-        case, vut = self._case, self._plan.vut.spec
-        present = values_of(self._plan.vut, ranges)
-        trials = [(vut, case)]
-        levels = [level for level in self._plan.povs.levels if level != case.level]
-        for level in levels:
-            trials.append((vut, replace(case, level=level, svo_rad=PSI if level == 2 else None)))
-        itself, *at_levels = self._passes(self._plan, trials)
-        if itself:
-            raise self._ends_otherwise()
-        self._claims = dict(zip(trials, (itself, *at_levels), strict=True))
+        case, plan = self._case, self._study.plan
+        present = values_of(plan.vut, ranges)
+        self._stated[self._vut, case] = False
+        self._confirm(plan)
+        levels = {}
+        for level in plan.povs.levels:
+            if level != case.level:
+                psi = PSI if level == 2 else None
+                other = self._vut, replace(case, level=level, svo_rad=psi)
+                levels[level_name(level)] = self._stated[other] = self._passes(plan, [other])[0]
         start = []
         for c in coordinates(case.scenario, (case.level,)):
-            bounds = c.dimension.low, c.dimension.high
-            axis = _axis(c.field, getattr(case, c.field), *bounds, c.digits, START_STEPS)
+            value, bounds = getattr(case, c.field), (c.dimension.low, c.dimension.high)
+            axis = _axis(c.field, value, *bounds, c.digits, START_STEPS)
             start.append(self._searched(axis, self._with_start))
         parameters = []
         for r in ranges:
             axis = _axis(r.name, present[r.name], r.low, r.high, r.digits, PARAMETER_STEPS)
             parameters.append(self._searched(axis, self._with_parameter))
-        in_sumo = replace(self._plan, engine=Engine.SUMO)
-        if self._passes(in_sumo, list(self._claims)) != list(self._claims.values()):
-            raise self._ends_otherwise()
-        names = map(level_name, levels)
-        of_levels = dict(zip(names, at_levels, strict=True))
-        return Explanation(self._outcome.index, tuple(start), of_levels, tuple(parameters))
+        self._confirm(replace(plan, engine=Engine.SUMO))
+        return Explanation(self._index, tuple(start), levels, tuple(parameters))
+
+    def _confirm(self, plan: SimulationPlan) -> None:
+        if self._passes(plan, list(self._stated)) != list(self._stated.values()):
+            raise UserError(
+                f"case {self._index} ends otherwise when it runs again: the VUT is not that of the "
+                "campaign, or does not repeat itself, and nothing can be said of its changes"
+            )
 
     def _searched(self, axis: Axis, trial: Callable[[str, float], Trial]) -> Axis:
         """Return an axis with the nearest values that pass."""
 
         def ask(values: list[float]) -> list[bool]:
-            return self._passes(self._plan, [trial(axis.name, value) for value in values])
+            trials = [trial(axis.name, value) for value in values]
+            return self._passes(self._study.plan, trials)
 
-        for side, sign in (("below", -1), ("above", 1)):
-            found = nearest(axis, sign, ask)
-            if found is not None:
-                fails, passes = found
-                axis = replaced(axis, **{side: passes})
-                self._claims[trial(axis.name, passes)] = True
-                if (fails - axis.value) * sign > 0.0:
-                    self._claims[trial(axis.name, fails)] = False
-        return axis
+        below, above = nearest(axis, -1, ask), nearest(axis, 1, ask)
+        for value in (below, above):
+            if value is not None:
+                self._stated[trial(axis.name, value)] = True
+        return replaced(axis, below=below, above=above)
 
     def _with_start(self, name: str, value: float) -> Trial:
         changed: dict[str, Any] = {name: value}
-        return self._plan.vut.spec, replace(self._case, **changed)
+        return self._vut, replace(self._case, **changed)
 
     def _with_parameter(self, name: str, value: float) -> Trial:
-        return self._plan.vut.spec.with_values({name: value}), self._case
+        return self._vut.with_values({name: value}), self._case
 
     def _passes(self, plan: SimulationPlan, trials: Sequence[Trial]) -> list[bool]:
         """Run trials, those of a VUT at a time; a value that the controller refuses fails."""
-        self._check()
         passes = dict.fromkeys(trials, False)
         for spec in dict.fromkeys(spec for spec, _ in trials):
-            cases = [case for of, case in trials if of == spec]
-            own = spec == plan.vut.spec
+            of_vut = [trial for trial in trials if trial[0] == spec]
             try:
-                vut = plan.vut if own else plan.vut.with_spec(spec)
-                ran = evaluate(replace(plan, vut=vut), cases, self._workers, pass_of)
-                for case, passed in zip(cases, ran, strict=True):
-                    passes[spec, case] = passed
+                if spec != plan.vut.spec:
+                    plan = replace(plan, vut=plan.vut.with_spec(spec))
+                cases = [case for _, case in of_vut]
+                passed = evaluate(plan, cases, self._study.workers, pass_of)
+                passes |= zip(of_vut, passed, strict=True)
             except UserError:
-                if own:
+                if spec == self._vut:
                     raise
         return [passes[trial] for trial in trials]
-
-    def _ends_otherwise(self) -> UserError:
-        return UserError(
-            f"case {self._outcome.index} ends otherwise when it runs again: the VUT is another "
-            "than that of the campaign, or does not repeat itself, and nothing can be said of its "
-            "changes"
-        )
 
 
 def _axis(name: str, value: float, low: float, high: float, digits: int, steps: int) -> Axis:
@@ -321,10 +297,8 @@ def _axis(name: str, value: float, low: float, high: float, digits: int, steps: 
     return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def nearest(
-    axis: Axis, sign: int, ask: Callable[[list[float]], list[bool]]
-) -> tuple[float, float] | None:
-    """Search one side of an axis for the first value that passes.
+def nearest(axis: Axis, sign: int, ask: Callable[[list[float]], list[bool]]) -> float | None:
+    """Return the first value of one side of an axis that passes; None where none does.
 
     The values of the grid run until one passes; then the interval before it is halved. Verdicts are
     not monotone: a pass between two values of the grid is missed.
@@ -333,9 +307,6 @@ def nearest(
         axis: the axis.
         sign: 1 for the values above that of the failure, -1 for those below.
         ask: returns whether values pass.
-
-    Returns:
-        The value before, which does not pass, and the first that does; None where none passes.
     """
     grid = axis.grid(sign)
     for begin in range(0, len(grid) - 1, BLOCK):
@@ -353,7 +324,7 @@ def nearest(
             passes = middle
         else:
             fails = middle
-    return fails / axis.scale, passes / axis.scale
+    return passes / axis.scale
 
 
 def pass_of(episode: Episode) -> bool:

@@ -1,13 +1,12 @@
-"""The paper's results in one go: what Table II and the figures show, our numbers and the paper's.
+"""The paper's results: Table II and the figures, with our numbers and the paper's.
 
-Every number is the median over seeds; a picture of single cases shows the seed whose coverage is
-the median. Same seeds and same versions give the same files.
+Every number is the median over seeds; a picture of single cases is of the seed with the median.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from merge_sumo import config
 from merge_sumo.analysis.run_study import OnPart, check_least
-from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, Study
+from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, Search, Study
 from merge_sumo.analysis.truth import TRUTH_CASES
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -36,7 +35,7 @@ from merge_sumo.workers import Workers
 
 SAMPLERS = ("uniform", "annealing", "subset", "gpr", "coverage")
 ADAPTIVE = ("gpr", "coverage")
-"""The paper's sampler and ours: whose shares of the truth and of the levels are shown."""
+"""The paper's sampler and ours, of which shares of the truth and of the levels are shown."""
 SURFACE_BATCHES = (1, 4, 13, 20)
 """Batches after which the paper shows its surrogate."""
 SURFACE_POINTS = 81
@@ -45,7 +44,7 @@ SURFACE_POINTS = 81
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of Table II: a VUT against one POV level, and what the paper found.
+    """A column of Table II: a VUT against one POV level, and the numbers of the paper.
 
     Attributes:
         paper: FMC of the truth and of each sampler that the paper has.
@@ -57,24 +56,23 @@ class Column:
 
     @property
     def title(self) -> str:
-        """What stands above the column."""
+        """The title of the column."""
         return f"level-{self.level} POV, {self.vut}"
 
 
-PAPERS = ("truth", "uniform", "annealing", "subset", "gpr")
-TABLE_II = tuple(
-    Column(vut, level, dict(zip(PAPERS, found, strict=True)))
-    for vut, level, found in (
-        ("design1", 0, (0.1296, 0.0223, 0.0497, 0.0830, 0.1012)),
-        ("design2", 1, (0.0849, 0.0144, 0.0184, 0.0445, 0.0585)),
-        ("design2", 2, (0.0073, 0.0, 0.0006, 0.0019, 0.0032)),
-    )
-)
+TABLE_II = []
+for _vut, _level, *_fmc in (
+    ("design1", 0, 0.1296, 0.0223, 0.0497, 0.0830, 0.1012),
+    ("design2", 1, 0.0849, 0.0144, 0.0184, 0.0445, 0.0585),
+    ("design2", 2, 0.0073, 0.0, 0.0006, 0.0019, 0.0032),
+):
+    _paper = dict(zip(("truth", *SAMPLERS[:4]), _fmc, strict=True))
+    TABLE_II.append(Column(_vut, _level, _paper))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scale:
-    """How much is run. The default is the paper's.
+    """The numbers of cases and seeds, by default those of the paper.
 
     Attributes:
         seeds: runs of each sampler.
@@ -89,31 +87,33 @@ class Scale:
     batch: int = 20
 
 
-def quick(seeds: int) -> Scale:
-    """Return a scale for a first look and for tests: it shows that all works, and no more."""
-    return Scale(seeds=seeds, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
+QUICK = Scale(seeds=2, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
+"""The scale of a first look and of tests: it shows that all works, and no more."""
 
 
 def scale_of(asked: config.Reproduce) -> Scale:
-    """Return the scale of the options; `UserError` for numbers that make none."""
+    """Return the scale of the options; `UserError` for no seeds."""
     check_least(asked, seeds=1)
-    if asked.quick:
-        return quick(2 if asked.seeds is None else asked.seeds)
-    return Scale() if asked.seeds is None else Scale(seeds=asked.seeds)
+    scale = QUICK if asked.quick else Scale()
+    return scale if asked.seeds is None else replace(scale, seeds=asked.seeds)
 
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Cases at one level in the unit cube, (n, d), which of them failed, (n,), and their FMC."""
+    """Cases at one level in the unit cube, (n, d), and which of them failed, (n,)."""
 
     points: FloatArray
     failed: NDArray[np.bool_]
-    fmc: float
+
+    @property
+    def fmc(self) -> float:
+        """Their failure mode coverage."""
+        return fmc(self.points[self.failed])
 
 
 @dataclass(frozen=True, slots=True)
 class PredictedMargins:
-    """What a surrogate predicts after a number of batches.
+    """The predictions of a surrogate after a number of batches.
 
     Attributes:
         margin: on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
@@ -126,7 +126,7 @@ class PredictedMargins:
 
 @dataclass(frozen=True, slots=True)
 class LevelBatches:
-    """How a sampler went on over batches at each level, one row per seed, (seeds, batches).
+    """The batches of a sampler at each level, one row per seed, (seeds, batches).
 
     Attributes:
         cases: cases at the level in each batch.
@@ -147,35 +147,36 @@ class ColumnResult:
     @cached_property
     def panels(self) -> dict[str, Panel]:
         """Cases of the truth, and of each sampler with the seed whose coverage is its median."""
-        level = self.column.level
-        truth, searches = self.study.truths[level], reversed(self.study.searches.items())
-        shown = Panel(truth.points, truth.margin < 0.0, fmc(truth.failures))
-        found = {name: of_name[_median_seed(of_name)].outcomes for name, of_name in searches}
-        return {"truth": shown, **{name: _panel(one, level) for name, one in found.items()}}
+        truth = self.study.truths[self.column.level]
+        panels = {"truth": Panel(truth.points, truth.margin < 0.0)}
+        for name, searches in reversed(self.study.searches.items()):
+            panels[name] = _panel(searches[_median_seed(searches)].outcomes, self.column.level)
+        return panels
 
     def predicted(self) -> dict[int, PredictedMargins]:
-        """Return what the surrogate of `gpr` predicts after some batches of its median search."""
+        """Return the predictions of the surrogate of `gpr` after some batches, of one search."""
         searches, level = self.study.searches["gpr"], self.column.level
         seed = _median_seed(searches)
         axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+        grid = np.stack(np.meshgrid(axis, axis), axis=-1)
         result = {}
-        for batch in (b for b in SURFACE_BATCHES if b <= len(searches[seed].fmc)):
-            known = [outcome for outcome in searches[seed].outcomes if outcome.batch < batch]
-            sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
-            sampler.tell(known)
-            margin = predicted_margin(sampler.history(level), grid)
-            square = margin.reshape(SURFACE_POINTS, SURFACE_POINTS)
-            result[batch] = PredictedMargins(square, _panel(known, level))
+        for batch in SURFACE_BATCHES:
+            if batch <= len(searches[seed].fmc):
+                known = [outcome for outcome in searches[seed].outcomes if outcome.batch < batch]
+                sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
+                sampler.tell(known)
+                margin = predicted_margin(sampler.history(level), grid.reshape(-1, 2))
+                square = margin.reshape(grid.shape[:2])
+                result[batch] = PredictedMargins(square, _panel(known, level))
         return result
 
 
 @dataclass(frozen=True, repr=False)
 class Reproduction(Result):
-    """What ran.
+    """The results of the paper, and ours.
 
     Attributes:
-        scale: how much of it.
+        scale: the numbers of cases and seeds.
         columns: those of Table II, by title.
         levels: all levels together, by sampler.
         policies_sha256: the POVs.
@@ -192,13 +193,14 @@ class Reproduction(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return Table II for a program."""
+        columns = []
+        for one in self.columns.values():
+            columns.append({**to_plain(one.column), **one.study.to_record()})
         return {
             "scale": to_plain(self.scale),
             "versions": self.versions,
             "policies_sha256": self.policies_sha256,
-            "columns": [
-                {**to_plain(one.column), **one.study.to_record()} for one in self.columns.values()
-            ],
+            "columns": columns,
         }
 
 
@@ -209,26 +211,25 @@ def reproduce(
     workers: Workers | None = None,
     on_part: OnPart = lambda *_: None,
 ) -> Reproduction:
-    """Run what Table II and the figures need.
-
-    The POVs are those of `policies`, by default the shipped ones; `on_part` is told how far it is.
-    Raises `UserError` where a level has no POV.
+    """Run the searches and truths of Table II and the figures.
 
     Args:
         scale: numbers of cases and seeds.
         policies: folder of the POV networks; by default the shipped ones.
         workers: where cases run; by default this process.
-        on_part: called with the title of a part, its cases that are done, and all.
+        on_part: called with the progress of each part.
+
+    Raises:
+        UserError: where a level has no POV.
     """
     povs = Povs(policies=policies or policies_of(US23))
-
-    def study(vut: str) -> Study:
-        folder = str(povs.policies)
-        settings = CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=folder)
-        return Study(resolve(settings), workers, on_part=on_part)
-
     for level in LEVELS:
         povs.check_level(level)
+    studies = {}
+    for vut in ("design1", "design2"):
+        folder = str(povs.policies)
+        settings = CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=folder)
+        studies[vut] = Study(resolve(settings), workers or Workers(), on_part=on_part)
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.
@@ -238,13 +239,12 @@ def reproduce(
             cases=scale.batches * scale.batch,
             truth_cases=scale.truth_cases[column.level],
         )
-        found = study(column.vut).compare((column.level,), SAMPLERS, asked)
+        found = studies[column.vut].compare((column.level,), SAMPLERS, asked)
         columns[column.title] = ColumnResult(column, found)
     batch = 2 * scale.batch
-    together = study("design2").searches(
-        LEVELS, ADAPTIVE, scale.seeds, scale.batches * batch, batch
-    )
-    levels = {name: _level_batches(of_name) for name, of_name in together.items()}
+    search = Search(levels=LEVELS, cases=scale.batches * batch, batch=batch)
+    together = studies["design2"].searches(search, ADAPTIVE, scale.seeds)
+    levels = {name: _level_batches(searches) for name, searches in together.items()}
     return Reproduction(scale, columns, levels, povs.sha256())
 
 
@@ -256,21 +256,20 @@ def _median_seed(searches: Sequence[SamplerRun]) -> int:
 
 def _panel(outcomes: Sequence[Outcome], level: int) -> Panel:
     points = to_unit((outcome.case for outcome in outcomes), level, US23)
-    failed = np.array([outcome.failed for outcome in outcomes])
-    return Panel(points, failed, fmc(points[failed]))
+    return Panel(points, np.array([outcome.failed for outcome in outcomes]))
 
 
 def _level_batches(searches: Sequence[SamplerRun]) -> LevelBatches:
-    shape = len(LEVELS), len(searches), len(searches[0].fmc)
-    cases, judged, total = np.zeros((3, *shape))
-    for seed, one in enumerate(searches):
-        for outcome in one.outcomes:
-            place = LEVELS.index(outcome.case.level), seed, outcome.batch
-            cases[place] += 1
-            if outcome.margin is not None:
-                judged[place] += 1
-                total[place] += outcome.margin
-    margin = np.divide(total, judged, out=np.full(shape, np.nan), where=judged > 0)
-    return LevelBatches(
-        dict(zip(LEVELS, cases, strict=True)), dict(zip(LEVELS, margin, strict=True))
-    )
+    cases, margin = {}, {}
+    for level in LEVELS:
+        cases[level] = np.zeros((len(searches), len(searches[0].fmc)))
+        margin[level] = np.full_like(cases[level], np.nan)
+        for seed, search in enumerate(searches):
+            at_level = [outcome for outcome in search.outcomes if outcome.case.level == level]
+            for batch in range(len(search.fmc)):
+                margins = [outcome.margin for outcome in at_level if outcome.batch == batch]
+                cases[level][seed, batch] = len(margins)
+                known = [one for one in margins if one is not None]
+                if known:
+                    margin[level][seed, batch] = np.mean(known)
+    return LevelBatches(cases, margin)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import CasesFile
@@ -10,17 +10,15 @@ from merge_sumo.analysis.comparison import (
     LISTED,
     PAGE,
     Change,
-    ComparedCase,
     Comparison,
-    Step,
     Version,
     in_order,
     of_two,
-    passes_less,
+    with_shares,
 )
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.again import campaign_in, command
-from merge_sumo.campaigns.repeats import Repeat, others_drive, repeat_of, unrepeatable
+from merge_sumo.campaigns.repeats import others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.kinds import waits_for_client
 from merge_sumo.errors import UserError
@@ -29,31 +27,32 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import LEVELS, OWN, AnyLevels, level_name, names_of_levels
 from merge_sumo.simulation.evaluate import evaluate, open_simulators
-from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.workers import Workers, workers_or_here
 
 AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
 """Changes whose cases run a second time, where a controller drives that may not repeat itself."""
 
 
 def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[Outcome]:
-    """Return cases of a campaign by their indices, by default all, of some levels or of all.
-
-    Raises `UserError` for an index without a case, and where there is no such case.
+    """Return cases of a campaign by their indices and levels.
 
     Args:
         run: the campaign.
         indices: indices of cases; none for all.
         level: levels of the cases.
+
+    Raises:
+        UserError: for an index or a level without a case, and where no case is left.
     """
-    found = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
-    asked, there = names_of_levels(level), tuple(map(level_name, run.levels))
-    names = there if asked == ("all",) else asked
-    for name in (name for name in names if name not in there):
-        raise UserError(
-            f"{run.folder} has no cases at level {name!r}: it has {', '.join(there)}, or all"
-        )
-    found = [one for one in found if level_name(one.case.level) in names]
+    outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or run.outcomes
+    recorded, names = tuple(map(level_name, run.levels)), names_of_levels(level)
+    if names == ("all",):
+        names = recorded
+    for name in names:
+        if name not in recorded:
+            raise UserError(
+                f"{run.folder} has no cases at level {name!r}: it has {', '.join(recorded)}, or all"
+            )
+    found = [outcome for outcome in outcomes if level_name(outcome.case.level) in names]
     if not found:
         raise UserError(f"{run.folder} has none of these cases: name others, or another level")
     return found
@@ -62,99 +61,90 @@ def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[O
 def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     """Run cases of a campaign again, with the settings of the study and their plan.
 
-    Raises `UserError` where net or POV are not the campaign's: then not only the VUT would have
-    changed.
+    A case that changed runs once more where its controller may not repeat itself.
+
+    Raises:
+        UserError: where the net or the POV are not those of the campaign.
     """
     run, settings = study.run, study.settings
-    levels = sorted({outcome.case.level for outcome in before})
-    study.check_same_system(levels, may_change=True)
-    plan = study.plan.for_cases(len(before))
-    with workers_or_here(study.workers) as processes:
-        open_simulators(plan, processes)
-        # In another order than the campaign's, which a VUT that remembers would repeat.
-        ran = _ran(plan, before[::-1], processes, study.on_cases)
-        after = [ran[outcome.index] for outcome in before]
-        earlier = replace(Version.of(run), outcomes=before, levels=levels)
-        compared = of_two(earlier, earlier.with_vut(settings.vut, after), _source(study))
-        (step,) = compared.steps
-        if isinstance(run, CasesFile):
-            judged = [replace(one, judged=run.change_of(one)) for one in step.cases]
-            step = replace(step, cases=judged)
-        changed = [one.b for one in step.cases if one.change in AGAIN and one.runs_b is None]
-        again = _ran(plan, others_drive(changed, settings)[::-1], processes)
-    step, notes = _repeated(step, ran, again)
-    differing = [one for one in step.cases if one.change is not Change.BOTH]
-    indices = [one.b.index for one in differing[:LISTED]]
-    drivers = {"vut": settings.vut, "pov": settings.pov}
-    page = command("rerun", run.folder, indices, **drivers, out=free(PAGE))
-    return replace(compared, steps=(step,), notes=notes, page_command=page)
-
-
-def _source(study: RunStudy) -> str:
-    """Return in a sentence where the cases come from, and how to search with the version of now.
-
-    A scenario in a file that is not here has no command.
-    """
-    settings, before = study.settings, study.run.settings.vut
-    earlier = None if before == settings.vut or waits_for_client(before) else before
-    drivers = {"vut": settings.vut, "against": earlier, "pov": settings.pov}
-    some_levels = OWN not in settings.levels and settings.levels != LEVELS
-    own_rule = settings.fail_when != settings.scenario.criterion
-    search = campaign_in(
-        settings.scenario,
-        **drivers,
-        level=",".join(map(str, settings.levels)) if some_levels else None,
-        fail_when=settings.fail_when if own_rule else None,
+    levels = {outcome.case.level for outcome in before}
+    study.check_same_system(sorted(levels), may_change=True)
+    study = replace(study, plan=study.plan.for_cases(len(before)))
+    open_simulators(study.plan, study.workers)
+    ran = _ran(study, before, study.on_cases)
+    motions = {index: episode.trajectory for index, episode in ran.items()}
+    earlier = replace(Version.of(run), outcomes=before)
+    later = replace(
+        earlier,
+        vut=settings.vut,
+        folder=None,
+        outcomes=[ran[outcome.index].outcome for outcome in before],
+        motions=lambda indices: {index: motions[index] for index in indices},
     )
-    return (
-        f"the cases come from the search of {study.run.vut} as it was recorded, so what the "
-        "version of now alone fails may lie elsewhere"
-        f"{f': `{search}` searches there' if search else ''}"
-    )
-
-
-def _ran(
-    plan: SimulationPlan,
-    outcomes: Sequence[Outcome],
-    workers: Workers,
-    on_cases: Callable[[int], None] = lambda _: None,
-) -> dict[int, Episode]:
-    """Run the cases of outcomes, in their order; return what became of them by index."""
-    by_index = dict[int, Episode]()
-    cases = [outcome.case for outcome in outcomes]
-    for old, now in zip(outcomes, evaluate(plan, cases, workers), strict=True):
-        by_index[old.index] = now.at(old.index, old.batch)
-        on_cases(1)
-    return by_index
-
-
-def _repeated(
-    step: Step, ran: Mapping[int, Episode], again: Mapping[int, Episode]
-) -> tuple[Step, tuple[str, ...]]:
-    """Return what changed by two runs of each case that did, and sentences on what differs.
-
-    A case whose two runs differ is not repeatable, unless the VUT reaches its goal in neither:
-    chance may be what changed it. Where there are such cases, the shares of cases that pass with
-    each version decide.
-    """
-    found, cases = list[Repeat](), list[ComparedCase]()
-    for one in step.cases:
-        index = one.b.index
-        if index in again:
-            found.append(repeat_of(ran[index].outcome, ran[index].trajectory, again[index]))
-            reached = one.b.is_tested or again[index].outcome.is_tested
-            if reached and not found[-1].same:
-                one = replace(one, judged=Change.NOT_REPEATABLE)  # noqa: PLW2901
-        cases.append(one)
+    compared = of_two(earlier, later, _source(study))
+    (step,) = compared.steps
+    cases = step.cases
+    if isinstance(run, CasesFile):
+        cases = [replace(one, change=run.change_of(one)) for one in cases]
+    changed = [one.b for one in cases if one.change in AGAIN and one.runs_b is None]
+    again = _ran(study, others_drive(changed, settings))
+    repeats = []
+    for row, one in enumerate(cases):
+        second = again.get(one.b.index)
+        if second is None:
+            continue
+        repeats.append(repeat_of(one.b, motions[one.b.index], second))
+        # Where the VUT reaches its goal neither time, the change is not chance.
+        if not repeats[-1].same and (one.b.is_tested or second.outcome.is_tested):
+            cases[row] = replace(one, change=Change.NOT_REPEATABLE)
     step = replace(step, cases=in_order(cases))
-    notes = list(filter(None, [unrepeatable(found)]))
+    notes = []
+    if warning := unrepeatable(repeats):
+        notes.append(warning)
     if number := step.count(Change.NOT_REPEATABLE):
-        sides = [one.a for one in cases], [one.b for one in cases]
-        chance, less = passes_less(*sides)
-        step = replace(step, chance=chance, passes_less=less)
+        step = with_shares(step, [one.a for one in cases], [one.b for one in cases])
         notes.append(
             f"Not counted one by one, as it may be chance: {counted(number, 'change')}. Draw "
             "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "
             "or compare campaigns of both versions with `repeat`"
         )
-    return step, tuple(notes)
+    differing = [one.b.index for one in step.cases if one.change is not Change.BOTH]
+    drivers = {"vut": settings.vut, "pov": settings.pov}
+    page = command("rerun", run.folder, differing[:LISTED], **drivers, out=free(PAGE))
+    return replace(compared, steps=(step,), notes=tuple(notes), page_command=page)
+
+
+def _ran(
+    study: RunStudy, outcomes: Sequence[Outcome], on_cases: Callable[[int], None] = lambda _: None
+) -> dict[int, Episode]:
+    """Run the cases of outcomes again; return their episodes by index."""
+    # In another order than that of the campaign, which a VUT with a memory would repeat.
+    backwards = outcomes[::-1]
+    ran = evaluate(study.plan, [outcome.case for outcome in backwards], study.workers)
+    episodes = {}
+    for old, episode in zip(backwards, ran, strict=True):
+        episodes[old.index] = episode.at(old.index, old.batch)
+        on_cases(1)
+    return episodes
+
+
+def _source(study: RunStudy) -> str:
+    """Return a sentence on the origin of the cases, with the command of a search of today's VUT."""
+    settings, before = study.settings, study.run.settings.vut
+    earlier = None if before == settings.vut or waits_for_client(before) else before
+    some_levels = OWN not in settings.levels and settings.levels != LEVELS
+    own_rule = settings.fail_when != settings.scenario.criterion
+    search = campaign_in(
+        settings.scenario,
+        vut=settings.vut,
+        against=earlier,
+        pov=settings.pov,
+        level=",".join(map(str, settings.levels)) if some_levels else None,
+        fail_when=settings.fail_when if own_rule else None,
+    )
+    source = (
+        f"the cases come from the search of {study.run.vut} as it was recorded, so what the "
+        "version of now alone fails may lie elsewhere"
+    )
+    # A scenario in a file that is not here has no command.
+    return f"{source}: `{search}` searches there" if search else source

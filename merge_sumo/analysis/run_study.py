@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -80,30 +80,34 @@ def check_least(asked: object, **least: int) -> None:
 class RunStudy:
     """A recorded campaign, and how a study runs cases of it.
 
+    Example:
+        study = RunStudy(run, settings, resolve(settings))
+        margins = study.simulate(study.plan, cases, margin_of)
+
     Attributes:
         run: the campaign.
         settings: those of the campaign, except for policies that are elsewhere and how a VUT is
             hosted.
         plan: that of the settings, with the engine of the study.
         workers: where cases run, by default in this process; they decide no result.
-        on_cases: told how many cases have just ended.
+        on_cases: called with the number of cases that have just ended.
     """
 
     run: Run
     settings: CampaignSettings
     plan: SimulationPlan
-    workers: Workers | None = None
+    workers: Workers = field(default_factory=Workers)
     on_cases: Callable[[int], None] = lambda _: None
 
     def simulate(
-        self, cases: Sequence[Case], plan: SimulationPlan, keep: Callable[[Episode], T]
+        self, plan: SimulationPlan, cases: Sequence[Case], keep: Callable[[Episode], T]
     ) -> list[T]:
-        """Run cases; return what is kept of each, in their order.
+        """Run cases; return the kept part of each, in order.
 
         Args:
-            cases: cases of the plan's scenario.
             plan: that of the study, or with changes.
-            keep: gives the part of an episode that is kept.
+            cases: cases of the plan's scenario.
+            keep: returns the part of an episode that is kept; a function with a name.
         """
         results = []
         for result in evaluate(plan, cases, self.workers, keep):

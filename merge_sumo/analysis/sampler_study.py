@@ -1,4 +1,4 @@
-"""Samplers beside each other and beside the truth of a VUT: searches with many seeds."""
+"""Samplers in comparison with each other and with the truth of a VUT: searches with many seeds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import accumulate, chain
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -37,20 +37,23 @@ from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.workers import Workers, workers_or_here
+from merge_sumo.workers import Workers
 
 MOST_PROBES = 10_000
-"""Failures of a truth of which a covered share is one, at most: its error is then below .01."""
+"""Maximum number of failures of which a covered share is one: its error is then below .01."""
 COMPARED_BATCH = 20
-"""Cases of a batch by default, of samplers that choose none: that of Table II."""
+"""Cases of a batch by default, for samplers without a batch of their own: that of Table II."""
+
+Task = tuple[str, int]
+"""A search: the name of the sampler, and its seed."""
 
 
 @dataclass(frozen=True, slots=True)
 class SamplerRun:
-    """What one sampler did with one seed.
+    """A search of one sampler with one seed.
 
     Attributes:
-        outcomes: what became of every case, in order.
+        outcomes: the outcomes in order.
         fmc: failure mode coverage after each batch, summed over the levels.
     """
 
@@ -62,60 +65,55 @@ class SamplerRun:
         return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
 
     def covered_shares(self, level: int, points: FloatArray) -> FloatArray:
-        """Return the share of points, (m, d), that its failures cover after each batch."""
+        """Return the share of points, (m, d), that the failures cover after each batch."""
+        failing = self.failures(level)
         failed = [o.batch for o in self.outcomes if o.failed and o.case.level == level]
-        batches, places = np.array(failed, dtype=int), self.failures(level)
-        numbers = np.unique([outcome.batch for outcome in self.outcomes])
-        first = np.full(len(points), np.inf)
-        for number in numbers[::-1]:
-            first[covered(points, places[batches == number])] = number
-        return np.array([(first <= number).mean() for number in numbers])
+        batches = np.array(failed, dtype=int)
+        is_covered = np.zeros(len(points), dtype=bool)
+        shares = []
+        for batch in range(len(self.fmc)):
+            is_covered |= covered(points, failing[batches == batch])
+            shares.append(is_covered.mean())
+        return np.array(shares)
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """A search of the pool of a plan's scenario.
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Search:
+    """The searches of a benchmark, which differ in sampler and seed.
 
     Attributes:
-        name: the sampler.
         levels: POV levels.
         cases: number of cases.
         batch: cases of a batch; None for those of the sampler, or `COMPARED_BATCH`.
-        seed: of the sampler.
     """
 
-    name: str
     levels: tuple[int, ...]
     cases: int
     batch: int | None
-    seed: int
 
-
-def search(plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
-    """Run searches in this process."""
-    found = []
-    for task in tasks:
-        pool = Pool(levels=task.levels, scenario=plan.scenario)
-        model = controller_model_of(plan, pool, task.seed)
-        sampler, ran = make_sampler(task.name, pool, task.seed, model), SamplerRun([], [])
-        batch = task.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-        groups: Groups = []
-        SearchLoop(sampler, plan, task.cases, batch=batch).run(groups.extend)
-        for group in groups:
-            ran.outcomes.extend(episode.outcome for episode in group)
-            ran.fmc.append(sum(fmc(ran.failures(level)) for level in task.levels))
-        found.append(ran)
-    return found
+    def run(self, plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
+        """Run searches in this process."""
+        searches = []
+        pool = Pool(levels=self.levels, scenario=plan.scenario)
+        for name, seed in tasks:
+            sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
+            batch = self.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
+            groups: Groups = []
+            SearchLoop(sampler, plan, self.cases, batch=batch).run(groups.extend)
+            search = SamplerRun([], [])
+            for group in groups:
+                search.outcomes.extend(episode.outcome for episode in group)
+                search.fmc.append(sum(fmc(search.failures(level)) for level in self.levels))
+            searches.append(search)
+        return searches
 
 
 def _lost_search(task: Task) -> SamplerRun:
-    raise UserError(
-        f"the search of {task.name} with seed {task.seed} ended its worker process each time"
-    )
+    raise UserError(f"the search of {task[0]} with seed {task[1]} ended its process each time")
 
 
 def names_of(asked: config.Benchmark) -> list[str]:
-    """Return the names of the samplers that are compared; `UserError` for none, or no seeds."""
+    """Return the names of the samplers to compare; `UserError` for none, or no seeds."""
     known = SAMPLERS if asked.samplers is None else asked.samplers
     listed = known.split(",") if isinstance(known, str) else known
     names = list(dict.fromkeys(map(str.strip, listed)))
@@ -126,24 +124,24 @@ def names_of(asked: config.Benchmark) -> list[str]:
 
 
 def title(vut: str, levels: Sequence[int]) -> str:
-    """Return what searches are called."""
+    """Return the title of searches."""
     return f"{vut} v level {'/'.join(map(level_name, levels))}"
 
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """A plan, and what truths and searches run it with.
+    """A plan, and how truths and searches of it run.
 
     Attributes:
         plan: how cases run.
         workers: where they run; by default in this process.
         cache: folder of the truths, by default the user's.
-        on_part: told how far each truth is, and all searches together.
+        on_part: called with the progress of each truth, and of all searches together.
         engine: what moves the vehicles of truths: see `SimulationPlan.with_engine`.
     """
 
     plan: SimulationPlan
-    workers: Workers | None = None
+    workers: Workers = field(default_factory=Workers)
     cache: Path | None = None
     on_part: OnPart = lambda *_: None
     engine: str | None = None
@@ -153,35 +151,34 @@ class Study:
 
         Args:
             level: level of the POV.
-            cases: number of cases; by default that of the study.
+            cases: number of cases; by default that of the paper.
             seed: seed of the cases.
         """
-        total, ended = TRUTH_CASES[level] if cases is None else cases, 0
-        title = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
+        total = TRUTH_CASES[level] if cases is None else cases
+        name = f"truth of {self.plan.vut.spec} at level {level_name(level)}"
 
-        def ran(more: int) -> None:
-            nonlocal ended
-            ended += more
-            self.on_part(title, ended, total, "cases", "")
+        def on_case(ended: int) -> None:
+            self.on_part(name, ended, total, "cases", "")
 
         plan = self.plan.at_level(level).with_engine(self.engine)
-        where: dict[str, Any] = {"workers": self.workers, "cache": self.cache, "on_cases": ran}
-        return ground_truth(plan, level, total, seed, **where)
+        return ground_truth(
+            plan, level, total, seed, workers=self.workers, cache=self.cache, on_case=on_case
+        )
 
     def truths(self, settings: CampaignSettings, asked: config.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
         by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
         if not self.plan.vut.files_are_known and not is_here(settings.vut):
             notice(
-                "nobody can tell what the program behind this VUT loads; this truth is kept "
-                "for its command and the files that are named there"
+                "merge-sumo does not know which files the program of this VUT loads; this truth is "
+                "kept for its command and the files that are named there"
             )
         return TruthResult(settings.vut, by_level, settings.criterion, settings.scenario)
 
     def compare(
         self, levels: tuple[int, ...], samplers: Sequence[str], asked: config.Benchmark
     ) -> SamplerStudy:
-        """Let each sampler search with the seeds 0, 1, ... beside the truth of each level.
+        """Let each sampler search with the seeds 0, 1, ..., and compare it with the truths.
 
         A dense truth is used where the cache has one.
 
@@ -190,41 +187,35 @@ class Study:
             samplers: names of the samplers.
             asked: options of the verb.
         """
-        truths = {level: self.truth(level, asked.truth_cases) for level in levels}
-        kept = {one: known_truth(self.plan, one, DENSE_CASES, cache=self.cache) for one in levels}
-        dense = {level: truth for level, truth in kept.items() if truth is not None}
-        searches = self.searches(levels, samplers, asked.seeds, asked.cases, asked.batch)
-        return SamplerStudy(searches, truths, dense)
+        truths, dense = {}, {}
+        for level in levels:
+            truths[level] = self.truth(level, asked.truth_cases)
+            truth = known_truth(self.plan, level, DENSE_CASES, cache=self.cache)
+            if truth is not None:
+                dense[level] = truth
+        search = Search(levels=levels, cases=asked.cases, batch=asked.batch)
+        return SamplerStudy(self.searches(search, samplers, asked.seeds), truths, dense)
 
     def searches(
-        self,
-        levels: tuple[int, ...],
-        samplers: Sequence[str],
-        seeds: int,
-        cases: int,
-        batch: int | None,
+        self, search: Search, samplers: Sequence[str], seeds: int
     ) -> dict[str, list[SamplerRun]]:
         """Let each sampler search with each seed; return the searches by sampler.
 
         Args:
-            levels: levels of the POV.
+            search: levels, cases and batch.
             samplers: names of the samplers.
             seeds: number of seeds.
-            cases: cases of a search.
-            batch: cases of a batch; None for the wish of the sampler.
         """
-        numbers = range(seeds)
-        tasks = [Task(name, levels, cases, batch, seed) for name in samplers for seed in numbers]
-        for level in levels:
+        for level in search.levels:
             self.plan.povs.check_level(level)
-        plan = self.plan.for_cases(batch or COMPARED_BATCH)
-        shown = title(str(plan.vut.spec), levels)
-        with workers_or_here(self.workers) as processes:
-            searches = processes.run(partial(search, plan), tasks, _lost_search, chunk=1)
-            found: dict[str, list[SamplerRun]] = {name: [] for name in samplers}
-            for number, (task, one) in enumerate(zip(tasks, searches, strict=True), start=1):
-                found[task.name].append(one)
-                self.on_part(shown, number, len(tasks), "runs", task.name)
+        plan = self.plan.for_cases(search.batch or COMPARED_BATCH)
+        name = title(str(plan.vut.spec), search.levels)
+        tasks = [(sampler, seed) for sampler in samplers for seed in range(seeds)]
+        ran = self.workers.run(partial(search.run, plan), tasks, _lost_search, chunk=1)
+        found: dict[str, list[SamplerRun]] = {sampler: [] for sampler in samplers}
+        for number, ((sampler, _), one) in enumerate(zip(tasks, ran, strict=True), start=1):
+            found[sampler].append(one)
+            self.on_part(name, number, len(tasks), "runs", sampler)
         return found
 
 
@@ -238,15 +229,13 @@ class Spread:
 
     @classmethod
     def of(cls, values: ArrayLike) -> Spread:
-        """Return the spread of a number for each seed; NaN and infinite ones are none."""
-        ordered = np.sort(np.asarray(values, dtype=np.float64))  # NaN comes last
-
-        def quantile(part: float) -> float | None:
-            place = part * (len(ordered) - 1)
-            low, high = ordered[math.floor(place)], ordered[math.ceil(place)]
-            return float(low + place % 1.0 * (high - low)) if np.isfinite(high) else None
-
-        return cls(quantile(0.5), quantile(0.25), quantile(0.75))
+        """Return the spread of a number for each seed; NaN and infinity stand for no number."""
+        missing = 1e300  # larger than any number, and finite for the interpolation
+        known = np.nan_to_num(np.asarray(values, dtype=float), nan=missing, posinf=missing)
+        quantiles: list[float | None] = []
+        for value in np.quantile(known, (0.5, 0.25, 0.75)).tolist():
+            quantiles.append(value if value < 1e-9 * missing else None)
+        return cls(*quantiles)
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +245,7 @@ class SamplerSummary:
     Attributes:
         fmc: failure mode coverage.
         fmc_over_truth: as a share of the truth's; None where that is too small.
-        fmc_over_limit: as a share of all that is known to fail.
+        fmc_over_limit: as a share of that of all known failures.
         covered_share: share of the truth's failures within a radius of a failure found, the mean
             over the levels with any.
         failures: failures found.
@@ -282,13 +271,17 @@ class SamplerSummary:
 
 @dataclass(frozen=True, repr=False)
 class SamplerStudy(Result):
-    """Samplers beside each other, and beside the ground truth, over several seeds.
+    """Samplers in comparison with each other and with the ground truth, over several seeds.
+
+    Example:
+        study = ms.benchmark("design1", level=0, seeds=3)
+        print(study.samplers["coverage"].fmc.median)
 
     Attributes:
         searches: the searches of each sampler, one a seed.
         truths: the truth by level.
         dense: the dense truth of the levels that have one.
-        figure: file that was drawn, if any.
+        figure: file of the figure, if any.
     """
 
     searches: dict[str, list[SamplerRun]]
@@ -309,66 +302,76 @@ class SamplerStudy(Result):
     @cached_property
     def regions(self) -> list[tuple[int, FloatArray]] | None:
         """Level and points of each region of the truths; None where one cannot tell regions."""
-        if not all(truth.tells_regions for truth in self.truths.values()):
-            return None
-        return [(one, region) for one, t in self.truths.items() for region in t.real_regions()]
+        found = []
+        for level, truth in self.truths.items():
+            if not truth.tells_regions:
+                return None
+            found += [(level, region) for region in truth.real_regions()]
+        return found
 
     @cached_property
     def limit_fmc(self) -> float:
-        """Coverage of all that is known to fail, summed over the levels: no search has more.
+        """Coverage of all known failures, summed over the levels: no search has more.
 
         A truth of a few thousand cases misses places that searches find. At each level this is the
-        coverage of what truth and searches found together, or of a dense truth, if that is more.
+        coverage of the failures of truth and searches together, or of a dense truth, if it is more.
         """
-        known, total = list(chain.from_iterable(self.searches.values())), 0.0
+        total = 0.0
         for level, truth in self.truths.items():
-            failing = [truth.failures, *(search.failures(level) for search in known)]
-            failing = [points for points in failing if len(points)] or failing[:1]
-            dense = fmc(self.dense[level].failures) if level in self.dense else 0.0
-            total += max(fmc(np.concatenate(failing)), dense)
+            failing = [truth.failures]
+            for searches in self.searches.values():
+                failing += [search.failures(level) for search in searches]
+            dense = self.dense.get(level, truth)
+            known = np.concatenate([points for points in failing if len(points)] or failing[:1])
+            total += max(fmc(known), fmc(dense.failures))
         return total
 
     @cached_property
     def probes(self) -> dict[int, FloatArray]:
-        """The failing uniform cases of which the covered share is one, by level.
+        """The failures of truths of which the covered share is one, by level.
 
         They are those of the dense truth where there is one: the more, the smaller the error.
         """
-        points = {one: self.dense.get(one, truth).failures for one, truth in self.truths.items()}
-        return {level: failing[:MOST_PROBES] for level, failing in points.items() if len(failing)}
+        points = {}
+        for level, truth in self.truths.items():
+            failing = self.dense.get(level, truth).failures
+            if len(failing):
+                points[level] = failing[:MOST_PROBES]
+        return points
 
     @cached_property
     def samplers(self) -> dict[str, SamplerSummary]:
-        """What each sampler found."""
+        """The summary of each sampler."""
         return {name: self._summary(searches) for name, searches in self.searches.items()}
 
     def _summary(self, searches: Sequence[SamplerRun]) -> SamplerSummary:
-        """Return what one sampler found, one search a seed."""
         curves = np.array([search.fmc for search in searches])
-        divisor = math.nan if self.is_small else self.truth_fmc or math.nan
-        after = list(accumulate(Counter(o.batch for o in searches[0].outcomes).values()))
-        reached = curves >= (0.9 * divisor)
-        regions_found = [
-            math.nan
-            if self.regions is None
-            else sum(bool(covered(s.failures(one), place).any()) for one, place in self.regions)
-            for s in searches
-        ]
+        truth_fmc = math.nan if self.is_small else self.truth_fmc or math.nan
+        by_batch = Counter(outcome.batch for outcome in searches[0].outcomes)
+        after = list(accumulate(by_batch.values()))
         shares = np.full(curves.shape, np.nan)
-        if self.probes:
-            for row, search in zip(shares, searches, strict=True):
-                of_levels = [search.covered_shares(one, at) for one, at in self.probes.items()]
-                row[:] = np.mean(of_levels, axis=0)
+        failures: list[float] = []
+        regions_found: list[float] = []
+        cases_to_90_percent: list[float] = []
+        for row, search in enumerate(searches):
+            failures.append(sum(outcome.failed for outcome in search.outcomes))
+            reached = np.flatnonzero(curves[row] >= 0.9 * truth_fmc)
+            cases_to_90_percent.append(after[reached[0]] if len(reached) else math.inf)
+            of_levels = [search.covered_shares(level, at) for level, at in self.probes.items()]
+            if of_levels:
+                shares[row] = np.mean(of_levels, axis=0)
+            found = math.nan if self.regions is None else 0.0
+            for level, region in self.regions or ():
+                found += bool(covered(search.failures(level), region).any())
+            regions_found.append(found)
         return SamplerSummary(
             fmc=Spread.of(curves[:, -1]),
-            fmc_over_truth=Spread.of(curves[:, -1] / divisor),
+            fmc_over_truth=Spread.of(curves[:, -1] / truth_fmc),
             fmc_over_limit=Spread.of(curves[:, -1] / (self.limit_fmc or math.nan)),
             covered_share=Spread.of(shares[:, -1]),
-            failures=Spread.of([sum(o.failed for o in one.outcomes) for one in searches]),
+            failures=Spread.of(failures),
             regions_found=Spread.of(regions_found),
-            cases_to_90_percent=Spread.of(
-                np.where(reached.any(axis=1), np.array(after)[reached.argmax(axis=1)], np.inf)
-            ),
+            cases_to_90_percent=Spread.of(cases_to_90_percent),
             cases_by_batch=after,
             fmc_by_batch=np.quantile(curves, (0.25, 0.5, 0.75), axis=0).tolist(),
             covered_share_by_batch=np.median(shares, axis=0).tolist() if self.probes else None,

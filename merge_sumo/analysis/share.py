@@ -1,23 +1,20 @@
 """The share of all starts that fail, by uniform cases.
 
-A search looks for failures, so the share of its cases that fail says nothing of the pool. By the
-equations of motion thousands of uniform cases take less than a second; a share of them runs in
-SUMO, too (`simulation/kinematic_simulator.py`). A controller of a user is asked step by step, and
-takes as long without SUMO as in it: its cases run as those of the campaign do, in rounds, as many
-as fit into a part of the time of the campaign. Where further cases would take long, those of a
-campaign that drew its cases uniformly are counted.
+A search looks for failures, so the share of its cases that fail says nothing of the pool.
 """
+
+# By the equations of motion thousands of uniform cases take less than a second. A controller of a
+# user takes as long without SUMO as in it: it drives fewer cases, in SUMO.
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import perf_counter
 from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.run_study import StudyFile
+from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
@@ -27,25 +24,24 @@ from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import evaluate
-from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.workers import Workers, workers_or_here
+from merge_sumo.workers import workers_or_here
 
 CASES = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
-ROUND = 200
-"""Uniform cases of a level that run at a time where they run in SUMO, and the least of them."""
+LEAST = 200
+"""Minimum number of uniform cases of a level where they run in SUMO."""
 PART = 0.2
-"""Of the time of a campaign, for further rounds."""
+"""Their number as a share of the cases of the campaign, where that is more."""
 CONFIDENCE = 0.95
 STREAM = 11
-"""Key of the random stream, so that it is none of a sampler's."""
+"""Key of the random stream, which no sampler uses."""
 Count = Annotated[int, Meta(ge=0)]
 
 
 class LevelShare(Record, frozen=True):
-    """Uniform cases of a POV level: how many fail, and how many are not judged.
+    """Uniform cases of a POV level: how many fail, and how many have no verdict.
 
-    A case is not judged after an error, and where the VUT never reached the merge point.
+    A case has no verdict after an error, and where the VUT never reached the merge point.
     """
 
     level: Count
@@ -55,11 +51,11 @@ class LevelShare(Record, frozen=True):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The exact interval of the share; of no failure one-sided, from 0.
+        """The exact interval of the share; without failures one-sided, from 0.
 
         Cases without a verdict are safe for its lower end, and failures for the upper.
         """
-        confidence = CONFIDENCE - (0.0 if self.failures else 1.0 - CONFIDENCE)
+        confidence = CONFIDENCE if self.failures else 2.0 * CONFIDENCE - 1.0
         most = self.failures + self.without_verdict
         low, _ = clopper_pearson(self.failures, self.cases, confidence)
         _, high = clopper_pearson(most, self.cases, confidence)
@@ -88,9 +84,9 @@ SHARES = StudyFile("shares.json", Shares)
 
 
 def own_shares(run: Run) -> list[LevelShare]:
-    """Return the share of the cases of a campaign that fail; one that is undecided may fail.
+    """Return the share of the cases of a campaign that fail; undecided ones have no verdict.
 
-    It holds for all starts where the campaign drew its cases uniformly.
+    It is that of all starts where the campaign drew its cases uniformly.
     """
     unsure = undecided(run.outcomes, run.tolerated)
     shares = []
@@ -103,28 +99,19 @@ def own_shares(run: Run) -> list[LevelShare]:
 
 
 def note_shares(
-    run: Run,
-    plan: SimulationPlan,
-    workers: Workers | None = None,
-    took_s: float = 0.0,
-    check: Callable[[], None] = lambda: None,
-    on_part: Callable[[int, int], None] = lambda _done, _total: None,
+    study: RunStudy, on_part: Callable[[int, int], None] = lambda _done, _total: None
 ) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.
 
-    Further cases do not run for drivers that ask SUMO, with which it takes long (`probability`),
-    where one may fail in some of its runs, nor for a controller whose cases mostly end as errors.
-    Nothing is written where a case ends otherwise in SUMO than by eq. (4). The cases of a campaign
-    that drew them uniformly are such a measurement themselves, and are counted instead.
+    The cases of a campaign that drew them uniformly are counted where further ones take long or
+    decide nothing: for drivers that ask SUMO, where a case may fail in some of its runs, and where
+    most cases end as errors. Of other such campaigns nothing is written.
 
     Args:
-        run: the campaign.
-        plan: how it was run.
-        workers: where its cases ran, and those of a user's controller run here, too.
-        took_s: how long it took; cases in SUMO may take a part of that.
-        check: called after each level, and may raise.
-        on_part: told how many cases are done, and how many there are, from 0 on.
+        study: the campaign, and how it ran.
+        on_part: called with the number of cases that are done, and of all; may raise.
     """
+    run, plan = study.run, study.plan
     errors = sum(outcome.measures.end.is_error for outcome in run.outcomes)
     random = run.tolerated or run.scenario.sense.is_random
     if plan.asks_sumo or random or 2 * errors > len(run.outcomes):
@@ -132,56 +119,39 @@ def note_shares(
             SHARES.write(run.folder, Shares(tuple(own_shares(run))))
         return
     by_equations = plan.needs_sumo is None
-    size, budget_s = (CASES, 0.0) if by_equations else (ROUND, PART * took_s)
-    # By the equations of motion where the drivers allow it, else in SUMO.
+    count = max(LEAST, round(PART * len(run.outcomes) / len(run.levels)))
+    if by_equations:
+        count = CASES
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
-    streams = {level: stream(run.settings.seed, level) for level in run.levels}
-    # Of each level: cases, failures, cases without a verdict.
-    counts = {level: np.zeros(3, dtype=int) for level in run.levels}
-    done, begun_s = 0, perf_counter()
-    # Worker processes would take longer to start than the cases by the equations.
-    with workers_or_here(None if by_equations else workers) as processes:
-        while True:
-            round_s = perf_counter()
-            total = done + size * len(streams)
-            for level, rng in streams.items():
-                on_part(done, total)
-                uniform = uniform_cases(plan.scenario, level, size, rng)
-                try:
-                    results = list(evaluate(plan, uniform, processes, end_of))
-                except UserError:  # a rounding error turned a decision: eq. (4) alone does not tell
-                    return
-                counts[level] += (size, *np.sum(results, axis=0))
-                done += size
-                on_part(done, total)
-                check()
-            now_s = perf_counter()
-            if now_s - begun_s + (now_s - round_s) > budget_s:
-                break
-    shares = [LevelShare(level, *known.tolist()) for level, known in counts.items()]
+    shares: list[LevelShare] = []
+    # Worker processes would take longer to start than the cases by the equations of motion.
+    with workers_or_here(None if by_equations else study.workers) as workers:
+        for level in run.levels:
+            on_part(len(shares) * count, len(run.levels) * count)
+            cases = uniform_cases(plan.scenario, level, count, run.settings.seed)
+            try:
+                ended = list(evaluate(plan, cases, workers, end_of))
+            except UserError:  # eq. (4) and SUMO disagree, as a rounding error turned a decision
+                return
+            shares.append(LevelShare(level, count, *np.sum(ended, axis=0).tolist()))
+            on_part(len(shares) * count, len(run.levels) * count)
     SHARES.write(run.folder, Shares(tuple(shares)))
 
 
-def stream(seed: int, level: int) -> np.random.Generator:
-    """Return what draws the uniform cases of a level of a campaign with a seed."""
-    return np.random.default_rng([seed, STREAM, level])
-
-
-def uniform_cases(
-    scenario: Scenario, level: int, count: int, rng: np.random.Generator
-) -> list[Case]:
-    """Return uniform cases of a level.
+def uniform_cases(scenario: Scenario, level: int, count: int, seed: int) -> list[Case]:
+    """Return the uniform cases of a level of a campaign.
 
     Args:
         scenario: scenario of the cases.
         level: level of the POV.
         count: number of cases.
-        rng: random generator.
+        seed: seed of the campaign.
     """
+    rng = np.random.default_rng([seed, STREAM, level])
     points = rng.random((count, len(scenario.dimensions(level))))
     return Pool(levels=(level,), scenario=scenario).cases(points, level)
 
 
 def end_of(episode: Episode) -> tuple[bool, bool]:
-    """Return whether a case fails, and whether it is not judged."""
+    """Return whether a case fails, and whether it has no verdict."""
     return episode.outcome.failed, not episode.outcome.is_tested

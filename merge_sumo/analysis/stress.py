@@ -256,7 +256,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
             cases = [replace(outcome.case, scenario=plan.scenario) for outcome in tested]
             if one.case is not None:
                 cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
-            flips.append(flips_of(tested, study.simulate(cases, plan, verdict_of)))
+            flips.append(flips_of(tested, study.simulate(plan, cases, verdict_of)))
     except UserError as error:
         if one is NOTHING:
             raise

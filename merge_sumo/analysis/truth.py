@@ -7,7 +7,7 @@ import io
 import json
 import stat
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any
@@ -40,25 +40,24 @@ from merge_sumo.workers import Workers
 TRUTH_CASES = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 DENSE_CASES = 1_000_000
-"""Uniform cases of a dense truth: of what the paper's number of them has missed, it shows most."""
-COLUMNS = ("points", "margin", "in_sumo")
-"""Arrays of a truth in the cache."""
+"""Uniform cases of a dense truth, which shows most failures that the paper's number has missed."""
 MOST_FILES_BYTES = 1 << 26
-"""Of a truth, besides its numbers: names and hashes of files."""
+"""Maximum size of the names and hashes of files in a truth."""
 REAL_REGION = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH = 0.2
-"""A truth is too small to be divided by where as many further cases could add more than this to its
-FMC. Measured with designs 1 and 2 in two and three coordinates: truths of 2,500 to 160,000 cases
-that could add less had .77 to .97 of the coverage of 1,000,000 cases, the others .03 to .83."""
+"""A truth is too small to be divided by where the same number of further cases could add more than
+this share to its FMC. Measured with designs 1 and 2 in two and three coordinates: truths of 2,500
+to 160,000 cases that could add less had .77 to .97 of the coverage of 1,000,000 cases, the others
+.03 to .83."""
 MOST_ALONE = 0.05
-"""Share of failures without another one in the radius up to which regions can be told: where it is
-more, a region falls apart into single failures. Chosen, not tuned."""
+"""Maximum share of failures without another one in the radius: with more of them a region falls
+apart into single failures. Chosen, not tuned."""
 
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The ground truth of a VUT at a level: n uniform cases and what became of them.
+    """The ground truth of a VUT at a level: n uniform cases and their margins.
 
     Attributes:
         points: cases in the unit cube, (n, d).
@@ -75,17 +74,9 @@ class Truth:
         """Points of the failing cases, (m, d)."""
         return self.points[self.margin < 0.0]
 
-    def __repr__(self) -> str:
-        """Return in a line what was found."""
-        failures = self.failures
-        return (
-            f"<Truth: {len(failures)} failures in {len(self.points)} cases, "
-            f"FMC {fmc(failures):.4f}>"
-        )
-
     @property
     def growth(self) -> float:
-        """The largest share that as many further cases could add to FMC (`growth_bound`)."""
+        """The largest share that the same number of further cases could add to FMC."""
         return growth_bound(self.failures)
 
     @property
@@ -105,7 +96,7 @@ class Truth:
         return 1.0 - float(linked.mean()) if len(linked) else 0.0
 
     def to_record(self) -> dict[str, Any]:
-        """Return what JSON says of it."""
+        """Return the truth as JSON has it."""
         failures = self.failures
         return {
             "cases": len(self.margin),
@@ -122,12 +113,12 @@ class Truth:
         """Return the points of each disjoint region with a real share of the failures."""
         points = self.failures
         labels = regions(points)
-        groups = [points[labels == label] for label in np.unique(labels)]
-        return [group for group in groups if len(group) >= REAL_REGION * len(points)]
-
-
-OnCases = Callable[[int], None]
-"""Told how many cases have just ended."""
+        found = []
+        for label in np.unique(labels):
+            group = points[labels == label]
+            if len(group) >= REAL_REGION * len(points):
+                found.append(group)
+        return found
 
 
 def ground_truth(
@@ -138,24 +129,21 @@ def ground_truth(
     *,
     workers: Workers | None = None,
     cache: Path | None = None,
-    on_cases: OnCases = lambda _: None,
+    on_case: Callable[[int], None] = lambda _: None,
 ) -> Truth:
-    """Return the ground truth of a plan at a level, from the cache where it is there.
+    """Return the ground truth of a plan at a level, from the cache where it is kept.
 
-    Memory grows by 40 bytes a case and no more, whatever the number of cases.
-
-    The cache's key is a hash of level, cases, seed, engine and of what decides outcomes by the
-    plan, with the versions of the software. A truth is only used while the files are the same that
-    the VUT loaded. A plan for the kinematic engine also takes the truth that SUMO gave.
+    A truth is only used while the files that the VUT loaded are the same. A plan for the kinematic
+    engine also takes a truth by SUMO. Memory grows by 40 bytes a case, whatever their number.
 
     Args:
         plan: how cases run.
         level: POV level.
-        cases: uniform cases; by default those of the paper at the level.
-        seed: of their points.
+        cases: number of uniform cases; by default that of the paper at the level.
+        seed: seed of their points.
         workers: where they run, by default in this process.
         cache: folder of truths, by default the user's.
-        on_cases: told how many cases have just ended.
+        on_case: called with the number of cases that have ended.
 
     Raises:
         UserError: where nothing can be kept in the cache, or others can write it.
@@ -166,50 +154,42 @@ def ground_truth(
             raise UserError(f"`{name}` is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
     plan = plan.for_verdicts()
-    kept = TruthKey(plan.key(level), level, count, seed, plan.engine)
-    known = kept.read(plan.scenario, cache, (Engine.SUMO, plan.engine))
+    known = known_truth(plan, level, count, seed, cache=cache, engines=(Engine.SUMO, plan.engine))
     if known is not None:
-        return known[0]
-    path = kept.path(cache)
+        return known
+    path = TruthKey(plan.key(level), level, count, seed, plan.engine).path(cache)
     if not path.parent.is_dir():
         make_folder(path.parent, CACHE)
         path.parent.chmod(stat.S_IRWXU)
     check_own(path)
     check_private(path.parent)
-    points = np.random.default_rng([seed, level]).random(
-        (count, len(plan.scenario.dimensions(level)))
-    )
-    truth, files = _run(plan.at_level(level), level, points, workers, on_cases)
-    arrays, columns = io.BytesIO(), {name: getattr(truth, name) for name in COLUMNS}
-    np.savez(arrays, **columns, files=json.dumps(files), of=path.stem)
-    replace_own(path, arrays.getvalue())
-    return truth
-
-
-def _run(
-    plan: SimulationPlan,
-    level: int,
-    points: FloatArray,
-    workers: Workers | None,
-    on_cases: OnCases,
-) -> tuple[Truth, Files]:
-    """Run the cases at points, (n, d), and return the truth and the files that were loaded."""
-    margins, in_sumo = np.full(len(points), np.nan), 0
+    rng = np.random.default_rng([seed, level])
+    points = rng.random((count, len(plan.scenario.dimensions(level))))
+    uniform = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
+    margins, in_sumo = np.full(count, np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
-    cases = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
-    results = evaluate(plan, cases, workers, _margin_of)
-    for place, (margin, by_sumo, loaded) in enumerate(results):
-        margins[place] = margin
+    results = evaluate(plan.at_level(level), uniform, workers, _margin_of)
+    for row, (margin, by_sumo, loaded) in enumerate(results):
+        margins[row] = margin
         in_sumo += by_sumo
-        files |= {name: sha256 for name, sha256 in loaded.items() if name not in files}
-        on_cases(1)
-    return Truth(points, margins, in_sumo), files
+        files = loaded | files
+        on_case(row + 1)
+    content, text = io.BytesIO(), json.dumps(files)
+    np.savez(content, points=points, margin=margins, in_sumo=in_sumo, files=text, of=path.stem)
+    replace_own(path, content.getvalue())
+    return Truth(points, margins, in_sumo)
 
 
 def known_truth(
-    plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
+    plan: SimulationPlan,
+    level: int,
+    cases: int,
+    seed: int = 0,
+    *,
+    cache: Path | None = None,
+    engines: Iterable[Engine] = tuple(Engine),
 ) -> Truth | None:
-    """Return the truth that the cache has, by whichever engine; None where it has none.
+    """Return the truth that the cache has; None where it has none.
 
     Args:
         plan: how the cases would run.
@@ -217,15 +197,20 @@ def known_truth(
         cases: number of cases.
         seed: seed of the cases.
         cache: folder of the truths; by default that of the user.
+        engines: engines in the order of preference.
     """
     plan = plan.for_verdicts()
-    found = TruthKey(plan.key(level), level, cases, seed).read(plan.scenario, cache)
-    return None if found is None else found[0]
+    for engine in engines:
+        path = TruthKey(plan.key(level), level, cases, seed, engine).path(cache)
+        truth = read_truth(path, level, cases, plan.scenario)
+        if truth is not None:
+            return truth
+    return None
 
 
 @dataclass(frozen=True, slots=True)
 class TruthKey:
-    """What a truth in the cache is of; nothing of the VUT is loaded to look for it.
+    """The key of a truth in the cache.
 
     Attributes:
         plan: what decides the outcomes: `SimulationPlan.key` for the level.
@@ -242,64 +227,38 @@ class TruthKey:
     engine: Engine = Engine.SUMO
 
     def path(self, cache: Path | None = None) -> Path:
-        """Return the file of the cache that such a truth is in."""
+        """Return the file of the truth in the cache."""
         key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
-    def read(
-        self,
-        scenario: Scenario,
-        cache: Path | None = None,
-        engines: Iterable[Engine] = (Engine.SUMO, Engine.KINEMATIC),
-    ) -> tuple[Truth, Path] | None:
-        """Return the truth that is kept by the first of some engines, and its file; or None.
-
-        Args:
-            scenario: scenario of the cases.
-            cache: folder of the truths; by default that of the user.
-            engines: engines in the order of preference.
-        """
-        for engine in engines:
-            path = replace(self, engine=engine).path(cache)
-            truth = read_truth(path, self.level, self.cases, scenario)
-            if truth is not None:
-                return truth, path
-        return None
-
 
 def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
-    """Return what a file of the cache holds, which only its user can write.
+    """Return the truth in a file of the cache; None where it cannot be used.
 
-    None where there is none, or it is torn, of other shapes or types, or another truth under this
-    name, others can write the cache, or a file that the VUT loaded is not what it was.
+    That is where the file is missing or torn, has other shapes or belongs to another truth, where
+    others can write the cache, and where a file that the VUT loaded has changed.
 
     Args:
         path: the file.
-        level: level that it is to hold.
-        cases: number of cases that it is to hold.
+        level: level of the truth.
+        cases: its number of cases.
         scenario: scenario of the cases.
     """
     dims = len(scenario.dimensions(level))
     try:
-        numbers_bytes = 8 * cases * (dims + 1)
         check_private(path.parent)
-        if regular(path).stat().st_size > numbers_bytes + MOST_FILES_BYTES:
+        if regular(path).stat().st_size > 8 * cases * (dims + 1) + MOST_FILES_BYTES:
             return None
-        data = read_arrays(path, *COLUMNS, "files", "of")
-        points, margin, in_sumo = (data[name] for name in COLUMNS)
+        data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
         files = decode(str(data["files"]), dict[str, str | None])
         unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
-        if str(data["of"]) != path.stem or not unchanged:
-            return None
     except (OSError, UserError):
         return None
-    shapes = points.shape, margin.shape, in_sumo.shape
-    types = points.dtype.kind, margin.dtype.kind, in_sumo.dtype.kind
-    if shapes != ((cases, dims), (cases,), ()) or types != ("f", "f", "i"):
+    points, margin = data["points"], data["margin"]
+    has_shapes = points.shape == (cases, dims) and margin.shape == (cases,)
+    if not (unchanged and has_shapes and str(data["of"]) == path.stem):
         return None
-    if not ((points >= 0.0) & (points <= 1.0)).all() or not 0 <= in_sumo <= cases:
-        return None
-    return Truth(points, margin, int(in_sumo))
+    return Truth(points, margin, int(data["in_sumo"]))
 
 
 def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
@@ -313,10 +272,13 @@ def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
 class TruthResult(Result):
     """The ground truth of a VUT at one or more POV levels.
 
+    Example:
+        truth = ms.truth("design1", level=0).truths[0]
+        failing = truth.points[truth.margin < 0.0]
+
     Attributes:
         vut: the VUT.
-        truths: `Truth` by level: `points` in the unit cube, (n, d), their `margin`, (n,), and the
-            points of the `failures`, (m, d).
+        truths: the truth by level.
         criterion: what counts as a failure.
         scenario: the scenario of the cases.
     """
@@ -328,15 +290,12 @@ class TruthResult(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints: that of the level, or sums with a list of the levels."""
-        levels = [
-            {"vut": self.vut, "level": level, **truth.to_record(), "fail_when": self.criterion.text}
-            for level, truth in self.truths.items()
-        ]
+        same = {"vut": self.vut, "fail_when": self.criterion.text}
+        levels = [{**same, "level": one, **of.to_record()} for one, of in self.truths.items()]
         if len(levels) == 1:
             return levels[0]
         sums: dict[str, Any] = {}
         for name in ("cases", "failures", "fmc", "real_regions"):
             of_levels = [one[name] for one in levels]
             sums[name] = None if None in of_levels else sum(of_levels)
-        text, named = self.criterion.text, ",".join(map(level_name, self.truths))
-        return {"vut": self.vut, "level": named, **sums, "fail_when": text, "levels": levels}
+        return {**same, "level": ",".join(map(level_name, self.truths)), **sums, "levels": levels}

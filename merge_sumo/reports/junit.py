@@ -93,7 +93,8 @@ def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
     root = etree.Element("testsuites", name="merge-sumo compare")
     for step in compared.steps:
         before, after = compared.versions[step.before - 1], compared.versions[step.after - 1]
-        _step(root, printable(f"{before.folder} to {after.folder or after.vut}"), step)
+        name = printable(f"{before.folder} to {after.folder or after.vut}")
+        _step(root, name, step, every=compared.text is not None)
     _write(path, root)
 
 
@@ -128,14 +129,14 @@ def _gates(
             _wrong(test, "failure", "GATE", gate.sentence)
 
 
-def _step(root: etree._Element, name: str, step: Step) -> None:
-    """Add a suite of the cases that two versions ran, and that one of them fails."""
+def _step(root: etree._Element, name: str, step: Step, *, every: bool = False) -> None:
+    """Add a suite of the cases that changed, or of all that two versions ran."""
     suite = etree.SubElement(root, "testsuite", name=name)
     if step.passes_less:
         test = _test(suite, "share of cases that pass", "against")
         _wrong(test, "failure", REGRESSION, step_headline(step))
     for one in step.cases:
-        if one.change is Change.BOTH and not one.judged:
+        if one.change is Change.BOTH and not every:
             continue
         case = f"case {one.b.index}: {described(one.b.case)}"
         test = _test(suite, case, "against", one.b.measures.t_end_s)

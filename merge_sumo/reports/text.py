@@ -186,7 +186,7 @@ def comparison_headline(compared: Comparison) -> str:
 def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
     """Return by level the FMC of each version as text, of its own cases; "-" for none."""
     rows: dict[int, list[str]] = {}
-    for level in sorted({level for version in compared.versions for level in version.levels}):
+    for level in sorted({level for version in compared.versions for level in version.at}):
         rows[level] = []
         for version in compared.versions:
             found = version.at.get(level)

@@ -140,11 +140,8 @@ def test_a_new_error_or_contact_is_worse(file):
     fails = next(o for o in record.outcomes if not passes(o))
 
     def change(before, **measured):
-        return record.change_of(
-            ComparedCase(
-                before, replace(before, measures=Measures(**before.measures.values | measured))
-            )
-        )
+        after = replace(before, measures=Measures(**before.measures.values | measured))
+        return record.change_of(ComparedCase.of([before], [after]))
 
     assert change(safe, severity=Severity.CONTACT) == "worse but passing"
     assert change(safe, severity=Severity.HARSH) == "pass with both"
@@ -152,7 +149,7 @@ def test_a_new_error_or_contact_is_worse(file):
     record.accepted = {fails.index: "known", safe.index: "known"}
     assert change(fails) == "accepted"
     assert change(fails, end=End.VUT_ERROR, error="answered nan") == "broke"
-    assert record.change_of(ComparedCase(safe, replace(safe, margin=-0.1))) == "accepted"
+    assert record.change_of(ComparedCase.of([safe], [replace(safe, margin=-0.1)])) == "accepted"
 
 
 NOISY = (

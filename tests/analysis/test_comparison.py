@@ -28,7 +28,6 @@ from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.metrics.summary import RunsOfCase
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import Case, from_unit
@@ -74,7 +73,7 @@ def outcome(became: str, index: int = 0) -> Outcome:
     ],
 )
 def test_what_became_of_a_case(before, after, change, words):
-    one = ComparedCase(outcome(before), outcome(after))
+    one = ComparedCase.of([outcome(before)], [outcome(after)])
     assert (one.change, change_in_words(one)) == (change, words)
 
 
@@ -259,24 +258,14 @@ def test_bad_use_of_rerun_is_refused(command_line, run, arguments, part):
     assert_refused(command_line("rerun", run.folder, *arguments), part)
 
 
-def runs(failing: int, count: int) -> RunsOfCase:
+def runs(failing: int, count: int) -> list[Outcome]:
     """Return runs of a case, the failing ones first."""
     scores = [-600.0 if draw < failing else -20.0 for draw in range(count)]
-    made = [
-        Outcome(
-            draw,
-            0,
-            replace(CASE, draw=draw),
-            Measures(end=End.MERGED, score=score, t_end_s=8.0, dx_m=score + draw),
-        )
-        for draw, score in enumerate(scores)
-    ]
-    return RunsOfCase(CASE, tuple(made))
-
-
-def compared(before: tuple[int, int], after: tuple[int, int], tolerated: float) -> ComparedCase:
-    a, b = runs(*before), runs(*after)
-    return ComparedCase(a.deciding(tolerated), b.deciding(tolerated), a, b)
+    made = []
+    for draw, score in enumerate(scores):
+        measures = Measures(end=End.MERGED, score=score, t_end_s=8.0, dx_m=score + draw)
+        made.append(Outcome(draw, 0, replace(CASE, draw=draw), measures))
+    return made
 
 
 @pytest.mark.parametrize(
@@ -289,7 +278,7 @@ def compared(before: tuple[int, int], after: tuple[int, int], tolerated: float) 
     ],
 )
 def test_shares_that_chance_may_give_are_no_change(before, after, tolerated, change):
-    assert compared(before, after, tolerated).change is change
+    assert ComparedCase.of(runs(*before), runs(*after), tolerated).change is change
 
 
 COIN = """

@@ -13,13 +13,8 @@ import pytest
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 
-from merge_sumo.analysis.counterfactuals import (
-    AVOIDANCE,
-    Stage,
-    avoidance,
-    avoidances,
-    run_counterfactuals,
-)
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance, avoidances
+from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
@@ -32,18 +27,14 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import OWN, US23
-from merge_sumo.simulation.evaluate import opened_simulator, simulate
+from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.povs import Povs, own_pov
-
-
-def avoidance_of(run, workers=None, **other):
-    settings = settings_of(run.folder, run.record, controllers(run.record))
-    return avoidance(run, resolve(settings), workers=workers, **other)
 
 
 @pytest.fixture(scope="module")
 def found(run):
-    return avoidance_of(run)
+    settings = settings_of(run.folder, run.record, controllers(run.record))
+    return avoidance(RunStudy(run, settings, resolve(settings)))
 
 
 @pytest.fixture
@@ -112,9 +103,8 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path):
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= 10
     plan = replace(resolve(settings), vut=load("careful"))
-    with opened_simulator(plan) as ground:
-        in_sumo = avoidances(Stage(plan, ground.world, ground.pov), failing)
-    assert run_counterfactuals(plan, failing) == in_sumo
+    in_sumo = avoidances(plan, failing)
+    assert avoidances(plan.with_engine("kinematic"), failing) == in_sumo
     assert len({one.latest_takeover_s for one in in_sumo}) > 3
 
 
@@ -124,9 +114,9 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
         vut="level0", scenario=road, levels=(0,), cases=120, seed=4, fail_when="unsafe"
     )
     run = run_campaign(settings, tmp_path / "run")
-    plan = resolve(settings)
+    plan = resolve(settings).with_engine("kinematic")
     failing = [o for o in run.outcomes if o.failed]
-    found = run_counterfactuals(plan, [(o.index, run.trajectory(o.index)) for o in failing])
+    found = avoidances(plan, [(o.index, run.trajectory(o.index)) for o in failing])
     passing: list[list[str]] = [[] for _ in failing]
     for name in REFERENCES:
         by_name = plan_for(name, scenario=road, criterion=plan.criterion)
@@ -150,7 +140,7 @@ def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
     for one in found[:4]:
         failure = run.trajectory(one.index)
         failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
-    assert run_counterfactuals(plan_for("careful", povs=povs), failing) == found[:4]
+    assert avoidances(plan_for("careful", povs=povs), failing) == found[:4]
 
 
 class TestTheFile:

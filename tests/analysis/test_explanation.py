@@ -89,7 +89,7 @@ class TestACampaign:
         run = uniform("level0", tmp_path / "run", 60, level=0)
         assert run.failures
         assert not (run.folder / EXPLANATIONS.name).exists()
-        with pytest.raises(UserError, match=r"case \d+ ends otherwise .* the VUT is another"):
+        with pytest.raises(UserError, match=r"case \d+ ends otherwise .* the VUT is not that"):
             ms.explain(run)
 
 
@@ -140,8 +140,7 @@ def test_the_smallest_change_by_hand(tmp_path):
 
 def first(axis, sign, passing):
     """Return the first value of a side that passes."""
-    found = nearest(axis, sign, lambda values: list(map(passing, values)))
-    return None if found is None else found[1]
+    return nearest(axis, sign, lambda values: list(map(passing, values)))
 
 
 @pytest.mark.parametrize("value", [8.05, 8.1, 20.0])

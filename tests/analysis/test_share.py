@@ -12,7 +12,8 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo import api
 from merge_sumo.analysis import share
-from merge_sumo.analysis.share import SHARES, LevelShare, end_of, stream, uniform_cases
+from merge_sumo.analysis.run_study import RunStudy
+from merge_sumo.analysis.share import SHARES, LevelShare, end_of, note_shares, uniform_cases
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.simulation.evaluate import evaluate, simulate
 
@@ -80,13 +81,10 @@ def test_of_a_controller_of_ones_own_is_measured_too():
     assert shares is not None
     plan = resolve(campaign_settings(vut="own.py:Own", levels=(0, 1)))
     for level, one in enumerate(shares.levels):
-        assert one.cases >= 200
-        assert one.cases % 200 == 0
-        rng, failures = stream(4, level), 0
-        for _ in range(one.cases // 200):
-            cases = uniform_cases(plan.scenario, level, 200, rng)
-            failures += sum(failed for failed, _ in simulate(plan.for_verdicts(), cases, end_of))
-        assert one.failures == failures
+        assert one.cases == 200
+        cases = uniform_cases(plan.scenario, level, 200, seed=4)
+        ends = simulate(plan.for_verdicts(), cases, end_of)
+        assert one.failures == sum(failed for failed, _ in ends)
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
         assert any(said in line for line in run.lines())
@@ -108,27 +106,15 @@ def test_of_a_controller_that_errs_says_so_or_is_not_measured():
 
 
 @pytest.mark.usefixtures("own")
-def test_runs_as_many_starts_as_fit_into_a_fifth_of_the_campaign(monkeypatch):
-    """A level of a round takes 1 s, so a round of two levels 2 s."""
+def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
     settings = campaign_settings(vut="own.py:Own", levels=(0, 1), cases=4)
-    run, now_s = run_campaign(settings, Path("run")), [0.0]
+    run = run_campaign(settings, Path("run"))
+    run.outcomes *= 600
     told: list[tuple[int, int]] = []
-
-    def ran(_plan, cases, _workers, _keep):
-        now_s[0] += 1.0
-        return [(place == 0, False) for place in range(len(cases))]
-
-    monkeypatch.setattr(share, "perf_counter", lambda: now_s[0])
-    monkeypatch.setattr(share, "evaluate", ran)
-    for took_s, rounds in ((0.0, 1), (19.9, 1), (20.0, 2), (49.0, 4)):
-        told.clear()
-        share.note_shares(
-            run, resolve(settings), None, took_s, on_part=lambda *part: told.append(part)
-        )
-        expected = tuple(LevelShare(level, 200 * rounds, rounds) for level in (0, 1))
-        assert SHARES.read(run.folder).levels == expected
-        assert told[0] == (0, 400)
-        assert told[-1] == (400 * rounds, 400 * rounds)
+    monkeypatch.setattr(share, "evaluate", lambda _plan, cases, *_: [(True, False)] * len(cases))
+    note_shares(RunStudy(run, settings, resolve(settings)), lambda *part: told.append(part))
+    assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
+    assert (told[0], told[-1]) == ((0, 480), (480, 480))
 
 
 def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_named(tmp_path):

@@ -200,7 +200,7 @@ class TestBenchmark:
 class TestReproduce:
     def test_prints_the_table_and_where_the_rest_is(self, call, tmp_path, monkeypatch):
         scale = Scale(seeds=1, truth_cases=(100, 100, 100), batches=1, batch=6)
-        monkeypatch.setattr("merge_sumo.analysis.reproduction.quick", lambda seeds: scale)
+        monkeypatch.setattr("merge_sumo.analysis.reproduction.QUICK", scale)
         monkeypatch.setattr("merge_sumo.analysis.reproduction.TABLE_II", TABLE_II[:1])
         monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
         code, out, err = call("reproduce", "--quick", "--workers", 1, "--out", "here")

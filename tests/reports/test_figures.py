@@ -43,7 +43,7 @@ def test_curves_show_each_sampler_and_the_truth():
 
 
 def test_maps_show_cases_in_the_units_of_the_pool_and_the_balls_that_fmc_counts():
-    one = Panel(np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([True, False]), 0.0079)
+    one = Panel(np.array([[0.5, 0.5], [1.0, 0.0]]), np.array([True, False]))
     (axes,) = figures.maps("t", {"gpr": one}, 0).axes
     (balls,) = (c for c in axes.collections if isinstance(c, EllipseCollection))
     assert np.asarray(balls.get_offsets()).tolist() == [[-260.0, 30.0]]
