@@ -447,10 +447,10 @@ def check_vut(config: c.CheckVut) -> VutCheck:
     spec, _, _ = drivers_of(config.vut, None, 1)
     policies = None if config.policies is None else str(config.policies)
     fields = {"vut": spec, "levels": (0,), "policies": policies, **c.changed(config, c.Limits)}
-    plan = resolve(CampaignSettings(scenario=changed_scenario(config.scenario or US23), **fields))
+    scenario = changed_scenario(config.scenario or US23)
     with Bars() as bars:
         bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
-        return vut_check.check_vut(plan)
+        return vut_check.check_vut(CampaignSettings(scenario=scenario, **fields))
 
 
 def scenarios() -> Shown:

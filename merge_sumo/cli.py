@@ -377,6 +377,11 @@ def execute(words: Sequence[str]) -> int:
             f"too many arguments: {unused}; `merge-sumo {words[0]} --help` lists them"
         ) from error
     except CycloptsError as error:
+        token = getattr(error, "token", None)
+        if token is not None and token.value.startswith("--"):
+            raise UserError(
+                f"the option {token.keyword} needs a value before {token.value}"
+            ) from None
         raise UserError(str(error)) from error
     except SystemExit as ended:
         if isinstance(ended.__context__, BrokenPipeError):  # the reader of the help has gone

@@ -22,6 +22,10 @@ class UserError(Exception):
         return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", ())]
 
 
+class ControllerError(UserError):
+    """The code of a controller fails before it drives."""
+
+
 class WorkersLostError(UserError):
     """The cluster whose workers ran the cases is gone: what has run may be kept."""
 

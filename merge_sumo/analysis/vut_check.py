@@ -1,24 +1,26 @@
-"""A short check of a VUT before a campaign: what is wrong with it, and the cost of a step."""
+"""A short check of a VUT before a campaign: its faults, and the cost of a step."""
 
 from __future__ import annotations
 
 import statistics
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
+from merge_sumo.campaigns.plan import resolve
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.controllers.python import installed_vuts
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
-from merge_sumo.errors import UserError
+from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.result import Result, Shown
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
@@ -33,7 +35,7 @@ CORRIDORS = 4
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
 class VutCheck(Result):
-    """What is wrong with a VUT, and the cost of a step.
+    """The faults of a VUT, and the cost of a step.
 
     Example:
         found = ms.check_vut("my_vut.py:MyVut")
@@ -41,9 +43,9 @@ class VutCheck(Result):
 
     Attributes:
         vut: the VUT.
-        problems: sentences on what makes the VUT's results wrong or worthless.
-        notes: sentences on what its author may want to know.
-        us_per_step_median: cost of one step of one episode, microseconds, without SUMO; None for a
+        problems: sentences on faults that make results wrong or worthless.
+        notes: other sentences for the author of the VUT.
+        us_per_step_median: cost of one step of one episode without SUMO, microseconds; None for a
             VUT that does not start.
         us_per_step_worst: cost of the slowest step.
     """
@@ -67,22 +69,21 @@ class VutCheck(Result):
         return not self.problems
 
 
-def check_vut(plan: SimulationPlan) -> VutCheck:
-    """Let the VUT of a plan drive a few cases, some of them again, and one from standstill."""
+def check_vut(settings: CampaignSettings) -> VutCheck:
+    """Let a VUT drive a few cases, some of them again, and one from standstill."""
     problems: list[str] = []
     notes: list[str] = []
     cost_us: list[float] = []
-    with ExitStack() as opened:
-        try:
-            simulator = opened.enter_context(Simulator(plan.for_cases(CORRIDORS)))
-        except UserError as error:
-            problems.append(f"It does not start: {error}")
-        else:
+    try:
+        plan = resolve(settings).for_cases(CORRIDORS)
+        with _opened(plan) as simulator:
             timed = simulator.vut = _Timed(simulator.vut)
             problems, notes = _checked(simulator, plan)
             cost_us = timed.us_per_step
+    except ControllerError as error:
+        problems.append(f"It does not start: {error}")
     return VutCheck(
-        vut=str(plan.vut.spec),
+        vut=settings.vut,
         problems=problems,
         notes=notes,
         us_per_step_median=statistics.median(cost_us) if cost_us else None,
@@ -90,12 +91,19 @@ def check_vut(plan: SimulationPlan) -> VutCheck:
     )
 
 
+def _opened(plan: SimulationPlan) -> Simulator:
+    try:
+        return Simulator(plan)
+    except UserError as error:
+        raise ControllerError(str(error)) from error
+
+
 def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], list[str]]:
-    """Return what is wrong with the VUT of a simulator, and notes, in sentences."""
+    """Return the faults of the VUT of a simulator, and notes, in sentences."""
     cases = _ordinary_cases(plan.scenario)
     from_standstill = replace(cases[0], v_vut0_mps=0.0)
-    first = simulator.run(cases)
     problems = []
+    first = simulator.run(cases)
     wrong = [trajectory for trajectory in first if trajectory.end.is_error]
     if wrong:
         problems.append(
@@ -109,24 +117,23 @@ def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], lis
         problems += _differences("each case alone", first, alone)
         for corridor in range(simulator.world.corridors):
             simulator.vut.begin(corridor, from_standstill)
-        problems += _differences("a reset too many", first, simulator.run(cases))
-    if problems and not wrong:
-        problems.append(
-            "It draws random numbers, reads a clock, or keeps something from earlier episodes: in "
-            "its object (which attributes does `reset` not clear?), its class or its module."
-        )
+        problems += _differences("one more reset", first, simulator.run(cases))
+        if problems:
+            problems.append(
+                "It draws random numbers, reads a clock, or keeps something from earlier episodes: "
+                "in its object (which attributes does `reset` not clear?), its class or its module."
+            )
     outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
     in_vain = Counter(command for one in first for command in one.in_vain)
     notes = doubts(outcomes, plan.criterion, in_vain)
     if headline := mostly_clipped(outcomes):
         notes.insert(0, headline)
-    (trajectory,) = simulator.run([from_standstill])
-    if trajectory.end.is_error:
+    (last,) = simulator.run([from_standstill])
+    if last.end.is_error:
         problems.append(
-            f"From standstill it ends as VUT_ERROR at t = {trajectory.t_end_s} s: "
-            f"{trajectory.error}"
+            f"From standstill it ends as VUT_ERROR at t = {last.t_end_s} s: {last.error}"
         )
-    elif trajectory.end is End.TIMEOUT and not trajectory.v_vut_mps.any():
+    elif last.end is End.TIMEOUT and not last.v_vut_mps.any():
         problems.append("From standstill it never starts, although the road is free at last.")
     return problems, notes
 
@@ -140,7 +147,7 @@ def _ordinary_cases(scenario: Scenario) -> list[Case]:
 
 
 class _Timed(DriverWrapper):
-    """Notes the cost of a step of one corridor."""
+    """Measures the cost of a step of one corridor."""
 
     def __init__(self, driver: Driver) -> None:
         super().__init__(driver)
@@ -155,12 +162,12 @@ class _Timed(DriverWrapper):
 
 
 def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
-    """Return a sentence on the first of motions that differ and should be the same, if any."""
+    """Return a sentence on the first two motions that differ and should be the same, if any."""
     for one, other in zip(before, after, strict=True):
         if not np.array_equal(one.motion, other.motion):
             rows = min(len(one.motion), len(other.motion))
             differs = (one.motion[:rows] != other.motion[:rows]).any(axis=(1, 2))
-            step = int(differs.argmax()) if differs.any() else rows
+            step = np.append(differs, True).argmax()
             return [f"After {when} it drives differently from t = {step * DT_S:g} s on."]
     return []
 
@@ -169,11 +176,11 @@ def known_vuts(policies: Path | str | None) -> Shown:
     """Return the VUTs that can be tested, with the learned drivers of a folder or a library."""
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
-    names = {"built in": built_in, "installed": list(installed_vuts())}
-    lines = [f"{title}: {', '.join(known)}" for title, known in names.items() if known]
-    kinds = []
+    record: dict[str, Any] = {"built in": built_in, "installed": list(installed_vuts())}
+    lines = [f"{title}: {', '.join(names)}" for title, names in record.items() if names]
+    record["kinds"] = []
     for kind in KINDS.values():
         if kind.form:
-            kinds.append({"form": kind.form, "what": kind.what, "example": kind.example})
+            record["kinds"].append({"form": kind.form, "what": kind.what, "example": kind.example})
             lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
-    return Shown({**names, "kinds": kinds}, lines)
+    return Shown(record, lines)

@@ -24,7 +24,7 @@ from merge_sumo.controllers.deadline import heartbeat, text_of
 from merge_sumo.controllers.process import connected
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Scene, VutLostError
-from merge_sumo.errors import UserError
+from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.scenario.signals import Left
 from merge_sumo.spawning import named
 
@@ -74,6 +74,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
 
     Attributes:
         failed: why the request failed; "" where it did not.
+        is_finding: whether the code of the controller failed to load.
         max_corridors: corridors that one driver can serve.
         max_workers: processes that can have a driver.
         files: files of code that were loaded so far.
@@ -85,6 +86,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
     """
 
     failed: str = ""
+    is_finding: bool = False
     max_corridors: int | None = None
     max_workers: int | None = None
     files: list[bytes] = []
@@ -143,7 +145,8 @@ class _Host:
             reply = action(request)
         except (UserError, VutLostError) as error:
             # Names of files may not be valid text.
-            reply = HostReply(failed=str(error).encode(errors="backslashreplace").decode())
+            text = str(error).encode(errors="backslashreplace").decode()
+            reply = HostReply(failed=text, is_finding=isinstance(error, ControllerError))
         except Exception as error:
             reply = HostReply(failed=f"{type(error).__name__}: {text_of(error)}")
         if os.getpid() != process:

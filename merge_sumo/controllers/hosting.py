@@ -21,7 +21,7 @@ from merge_sumo.controllers.host import HostReply, HostRequest, HostSettings, de
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
-from merge_sumo.errors import UserError
+from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import Left, as_signals
@@ -114,6 +114,8 @@ class ControllerProcess(ChildProcess):
         except msgspec.MsgspecError:
             self.kill()
             raise ProcessDiedError(BROKEN) from None
+        if reply.is_finding:
+            raise ControllerError(reply.failed)
         if reply.failed:
             raise UserError(reply.failed)
         return reply
@@ -187,7 +189,7 @@ class HostedKind(ControllerKind):
         except ProcessDiedError as died:
             if again and not died.hung:
                 return self.process(again=False)
-            raise UserError(str(died)) from died
+            raise ControllerError(str(died)) from died
 
     def release(self) -> None:
         """End a process that no driver has taken."""
@@ -268,7 +270,7 @@ class HostedDriver(ControllerDriver):
         try:
             self._parameters = process.make(self.corridors).parameters
         except ProcessDiedError as died:
-            raise UserError(str(died)) from died
+            raise ControllerError(str(died)) from died
         return process
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
-from merge_sumo.printable import meant, quoted
+from merge_sumo.printable import meant
 
 DIGITS = 3
 """Digits of a rounded value relative to its range: 0.5..3 is rounded to thousandths."""
@@ -60,10 +60,9 @@ def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, 
         if name in values:
             raise UserError(f"`params` {name} is given twice: give each parameter once")
         if name not in known and controller.vut_type is not None:
-            middle = round((each.low + each.high) / 2.0, each.digits)
-            named = quoted(str(controller.spec.with_values({name: middle})))
             raise UserError(
-                f"`params` {name}: its value today is not known; name it, as in `vut` {named}"
+                f"`params` {name}: its present value is not known: write it into `vut` as "
+                f"{name}=VALUE"
             )
         if name not in known:
             hint = meant(name, known)

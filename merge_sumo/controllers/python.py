@@ -39,7 +39,7 @@ from merge_sumo.controllers.signatures import (
 )
 from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
-from merge_sumo.errors import UserError
+from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import check_code
 from merge_sumo.registry import entries_of
 from merge_sumo.scenario.case import FloatArray
@@ -448,8 +448,8 @@ def _imported(name: str) -> ModuleType:
             sys.path.remove(folder)
 
 
-def _cannot_load(what: str, error: BaseException) -> UserError:
-    return UserError(f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}")
+def _cannot_load(what: str, error: BaseException) -> ControllerError:
+    return ControllerError(f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}")
 
 
 def module_of_file(path: Path) -> ModuleType:

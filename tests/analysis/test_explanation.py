@@ -209,8 +209,8 @@ def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, w
         ms.explain(made.folder, index, params=params)
 
 
-def test_a_parameter_of_sumo_is_to_be_named_with_a_value_inside_its_range():
-    with pytest.raises(UserError, match=r"name it, as in `vut` 'sumo:IDM\?accel=1.5'"):
+def test_a_parameter_of_sumo_needs_its_present_value_in_the_spec():
+    with pytest.raises(UserError, match="write it into `vut` as accel=VALUE$"):
         values_of(load("sumo:IDM"), [Range("accel", 0.0, 3.0)])
 
 

@@ -72,6 +72,8 @@ def test_it_says_the_same_as_json(check):
             "    def act(self, seen):\n        return 0.0\n",
             "It does not start: ",
         ),
+        ("raise ValueError('no licence')\n", "It does not start: cannot load the VUT"),
+        ("import os\nos._exit(3)\n", "It does not start: opening the VUT"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(check, source, problem):
