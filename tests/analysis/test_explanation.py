@@ -210,7 +210,7 @@ def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, w
 
 
 def test_a_parameter_of_sumo_needs_its_present_value_in_the_spec():
-    with pytest.raises(UserError, match="write it into `vut` as accel=VALUE$"):
+    with pytest.raises(UserError, match="write it into `vut` as accel=VALUE"):
         values_of(load("sumo:IDM"), [Range("accel", 0.0, 3.0)])
 
 
