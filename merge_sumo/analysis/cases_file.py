@@ -1,4 +1,4 @@
-"""Cases in one small file to commit: it is all that runs them elsewhere, and names no code."""
+"""Cases in a small file to commit, with which they run elsewhere; it names no code."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TOLERANCE = 0.01
 
 
 class Head(Record, frozen=True):
-    """What a cases file holds, by the names of `campaign.json`, with a record a case."""
+    """The content of a cases file, by the names of `campaign.json`, with a record a case."""
 
     vut: str
     scenario: dict[str, Any]
@@ -43,11 +43,20 @@ class Head(Record, frozen=True):
 
 
 class CasesFile(Run):
-    """A cases file, as a campaign of which only what decided its cases is known."""
+    """A cases file, as a campaign of which only what decided its cases is recorded.
+
+    Example:
+        kept = CasesFile(Path("cases.toml"))
+        failures = [outcome for outcome in kept.outcomes if outcome.failed]
+
+    Attributes:
+        tolerance: loss of margin that is not yet worse.
+        accepted: reasons of failures that are accepted, by index of the case.
+    """
 
     def __init__(self, path: Path) -> None:
         _, record = read_toml(path, "cases file")
-        line: dict[str, Any] = {}
+        at = ""
         try:
             head = convert(record, Head)
             scenario = convert(head.scenario, Scenario)
@@ -58,15 +67,17 @@ class CasesFile(Run):
             del record["cases"]
             self._take(path, {**record, "scenario": scenario.to_record()}, path)
             self.tolerance, self.torn = head.tolerance, False
-            self._by_index = dict[int, Outcome]()
-            self.accepted = dict[int, str]()
+            self._by_index: dict[int, Outcome] = {}
+            self.accepted: dict[int, str] = {}
             for line in head.cases:
+                at = f"case {line.get('index')!r:.40}: "
                 self._add(line)
-            self.outcomes = list(self._by_index.values())
         except UserError as error:
-            at = f"case {line.get('index')!r:.40}: " if line else ""
             raise UserError(f"the cases file {path}: {at}{error}") from error
-        self.record["levels"] = self.levels
+        self.outcomes = list(self._by_index.values())
+        levels = sorted({outcome.case.level for outcome in self.outcomes})
+        self.record["levels"] = levels
+        self.settings = replace(self.settings, levels=tuple(levels))
 
     @property
     def levels(self) -> list[int]:
@@ -74,27 +85,29 @@ class CasesFile(Run):
         return sorted({outcome.case.level for outcome in self.outcomes})
 
     def _add(self, line: dict[str, Any]) -> None:
-        """Add the case of a line; raise `UserError` where it is none."""
+        """Add the case of a line; raise `UserError` where it is not a case."""
         if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
             raise UserError("it has a number that is not finite")
-        usual = Measures(end=End.MERGED, t_end_s=0.0)
-        unsaid: dict[str, Any] = {"level": None, "batch": 0}
-        unsaid |= dict.fromkeys(self.scenario.case_fields)
-        unsaid |= {name: usual.value(name) for name in measures_in(self.scenario)}
-        unsaid["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]
         verdict, accepted = line.pop("verdict", None), line.pop("accepted", None)
-        outcome = Outcome.from_json(to_json(unsaid | line), self.scenario)
+        merged = Measures(end=End.MERGED, t_end_s=0.0)
+        whole: dict[str, Any] = {"level": None, "batch": 0}
+        whole |= dict.fromkeys(self.scenario.case_fields)
+        for name in measures_in(self.scenario):
+            whole[name] = merged.value(name)
+        whole["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]
+        outcome = Outcome.from_json(to_json(whole | line), self.scenario)
         judged = verdict_of(outcome)
         if verdict != judged or (outcome.margin is None) != (judged == "error"):
             raise UserError(f"verdict is {verdict!r:.60}, but by margin and end it is {judged}")
-        if accepted is not None and not (isinstance(accepted, str) and accepted.strip()):
-            raise UserError(f"accepted is {accepted!r:.60}: it must be a reason")
         if outcome.index in self._by_index:
             raise UserError("its index is there twice")
         if sentences := outside_of_the_pool(outcome.case):
             raise UserError(sentences[0])
         self._by_index[outcome.index] = outcome
-        self.accepted |= {outcome.index: accepted} if accepted else {}
+        if accepted is not None:
+            if not (isinstance(accepted, str) and accepted.strip()):
+                raise UserError(f"accepted is {accepted!r:.60}: it must be a reason")
+            self.accepted[outcome.index] = accepted
 
     def outcome(self, index: int) -> Outcome:
         """Return the outcome of a case; `UserError` when the file has no such case."""
@@ -103,7 +116,10 @@ class CasesFile(Run):
         return self._by_index[index]
 
     def change_of(self, one: ComparedCase) -> Change:
-        """Return what the file calls a change; it excuses neither a new error nor a new contact."""
+        """Return the change of a case by the rules of the file.
+
+        It accepts neither a new error nor a new contact.
+        """
         a, b = one.a.measures, one.b.measures
         if b.error is not None and a.error is None:
             return Change.BROKE
@@ -111,8 +127,8 @@ class CasesFile(Run):
             less = short(one.a.margin) - short(one.b.margin) > self.tolerance
             touches = b.severity == Severity.CONTACT != a.severity
             return Change.WORSE if less or touches else Change.BOTH
-        is_known = one.a.index in self.accepted and not b.end.is_error
-        return Change.ACCEPTED if is_known and not passes(one.b) else one.change
+        is_accepted = one.a.index in self.accepted and not b.end.is_error
+        return Change.ACCEPTED if is_accepted and not passes(one.b) else one.change
 
 
 def verdict_of(outcome: Outcome) -> str:

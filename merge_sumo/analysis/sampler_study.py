@@ -78,7 +78,7 @@ class SamplerRun:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Search:
+class SearchSettings:
     """The searches of a benchmark, which differ in sampler and seed.
 
     Attributes:
@@ -193,11 +193,11 @@ class Study:
             truth = known_truth(self.plan, level, DENSE_CASES, cache=self.cache)
             if truth is not None:
                 dense[level] = truth
-        search = Search(levels=levels, cases=asked.cases, batch=asked.batch)
+        search = SearchSettings(levels=levels, cases=asked.cases, batch=asked.batch)
         return SamplerStudy(self.searches(search, samplers, asked.seeds), truths, dense)
 
     def searches(
-        self, search: Search, samplers: Sequence[str], seeds: int
+        self, search: SearchSettings, samplers: Sequence[str], seeds: int
     ) -> dict[str, list[SamplerRun]]:
         """Let each sampler search with each seed; return the searches by sampler.
 
