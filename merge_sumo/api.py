@@ -582,10 +582,6 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
-    def on_part(title: str, done: int, total: int, unit: str) -> None:
-        bars.counted(title, done, total, unit)
-        check()
-
     workers = where.workers
     if workers is None and settings.cases <= FEW_CASES and not settings.may_vary:
         workers = 1
@@ -606,9 +602,7 @@ def run_and_report(
             )
             result = CampaignRun(done, config.gates)
             study = RunStudy(done, settings, replace(plan, against=None), available)
-            note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
-            note_shares(study, partial(on_part, "uniform starts", unit="cases"))
-            note_explanation(study)
+            _note_studies(study, bars, check)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
@@ -633,6 +627,18 @@ def _resumption(
     if isinstance(where.workers, str):
         options["workers"] = where.workers
     return again("resume", folder, asdict(settings), **options)
+
+
+def _note_studies(study: RunStudy, bars: CampaignBars, check: Callable[[], None]) -> None:
+    """Write the studies of a campaign that has just ended."""
+
+    def on_part(title: str, done: int, total: int, unit: str) -> None:
+        bars.counted(title, done, total, unit)
+        check()
+
+    note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
+    note_shares(study, partial(on_part, "uniform starts", unit="cases"))
+    note_explanation(study)
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
