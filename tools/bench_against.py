@@ -38,7 +38,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.controller_model import ControllerModelPair
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, FloatArray, to_unit
-from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.evaluate import simulate
 
 TRIALS = Path(__file__).parent / "trial_vuts.py"
 LATER = "design2?x1_m=120"
@@ -121,7 +121,7 @@ class Versions:
         sampler = self.pair.settings(cases, seed).sampler
         (found,) = search(self.new, [Task(sampler, (self.pair.level,), cases, None, seed)])
         failing = [outcome.case for outcome in found.outcomes if outcome.failed]
-        outcomes = [episode.outcome for episode in evaluate(self.old, failing)]
+        outcomes = [episode.outcome for episode in simulate(self.old, failing)]
         return self._points(outcome.case for outcome in outcomes if passes(outcome))
 
     def _points(self, cases: Iterable[Case]) -> FloatArray:

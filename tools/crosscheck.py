@@ -37,7 +37,7 @@ from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator, corridors_of
@@ -129,7 +129,7 @@ class HighwayEnvSimulator(Simulator):
     def __init__(self, plan: SimulationPlan) -> None:
         with ExitStack() as opened:
             world = HighwayEnvWorld(corridors_of(plan, plan.corridors), plan.road, plan.scenario)
-            self._open_drivers(plan, world, None, opened)
+            self._open_drivers(plan, world, opened)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +166,7 @@ def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
     known = run.trajectories(outcome.index for outcome in run.outcomes)
     in_sumo = [*known.values()]
     fresh = uniform(settings, cases - len(in_sumo), seed)
-    in_sumo += [result.trajectory for result in evaluate(plan, fresh)] if fresh else []
+    in_sumo += [result.trajectory for result in simulate(plan, fresh)] if fresh else []
     largest_m, largest_mps = largest_deviations(plan, in_sumo)
     with HighwayEnvSimulator(plan) as simulator:
         ran = simulator.run([trajectory.case for trajectory in in_sumo])

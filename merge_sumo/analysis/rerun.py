@@ -26,7 +26,7 @@ from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import LEVELS, OWN, AnyLevels, level_name, names_of_levels
-from merge_sumo.simulation.evaluate import evaluate, open_simulators
+from merge_sumo.simulation.evaluate import evaluate, open_simulators, with_measures
 
 AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
 """Changes whose cases run a second time, where a controller drives that may not repeat itself."""
@@ -120,7 +120,8 @@ def _ran(
     """Run the cases of outcomes again; return their episodes by index."""
     # In another order than that of the campaign, which a VUT with a memory would repeat.
     backwards = outcomes[::-1]
-    ran = evaluate(study.plan, [outcome.case for outcome in backwards], study.workers)
+    again = [outcome.case for outcome in backwards]
+    ran = evaluate(study.plan, again, study.workers, with_measures)
     episodes = {}
     for old, episode in zip(backwards, ran, strict=True):
         episodes[old.index] = episode.at(old.index, old.batch)

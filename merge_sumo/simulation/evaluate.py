@@ -1,16 +1,16 @@
-"""From a plan and cases to episodes. Whatever runs cases does it here.
+"""From a plan and cases to episodes, for everything that runs cases.
 
 A process keeps its simulator open from one chunk of cases to the next.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from threading import RLock
-from typing import Any, TypeVar, overload
+from typing import TypeVar
 
 import numpy as np
 
@@ -29,50 +29,58 @@ from merge_sumo.workers import Job, Workers, when_worker_ends
 R = TypeVar("R")
 
 
-@overload
-def simulate(plan: SimulationPlan, cases: Iterable[Case]) -> list[Episode]: ...
-@overload
-def simulate(
-    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], R]
-) -> list[R]: ...
-def simulate(
-    plan: SimulationPlan, cases: Iterable[Case], keep: Callable[[Episode], Any] | None = None
-) -> list[Any]:
-    """Run cases in this process; return their episodes in order.
+def simulate(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
+    """Run cases in this process; return their episodes in order, with all measures.
 
     Where the plan has an earlier version of the VUT, each episode has that of the earlier version.
 
-    Args:
-        plan: how they run.
-        cases: cases of the plan's scenario.
-        keep: gives the part of an episode that is returned, by default all of it.
+    Example:
+        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=plan.scenario)
+        (episode,) = simulate(plan, [case])
 
     Raises:
         UserError: if the plan cannot be carried out.
     """
-    cases = list(cases)
+    return simulate_part(plan, cases, with_measures)
+
+
+def simulate_part(
+    plan: SimulationPlan, cases: Sequence[Case], keep: Callable[[Episode], R]
+) -> list[R]:
+    """Run cases in this process; return a part of each episode, in order.
+
+    Args:
+        plan: how they run.
+        cases: cases of the scenario of the plan.
+        keep: gives the part of an episode that is returned.
+
+    Raises:
+        UserError: if the plan cannot be carried out.
+    """
     if plan.against is not None:
-        both = _simulate_both(plan, cases)
-        return both if keep is None else list(map(keep, both))
+        return list(map(keep, _simulate_both(plan, cases)))
     with opened_simulator(plan) as simulator:
         trajectories = simulator.run(cases)
-        outcomes = _outcomes(plan, trajectories)
-        if keep is None:
-            for outcome in outcomes:
-                outcome.measures.compute_all()
         files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
-        episodes = []
-        for place, (outcome, trajectory) in enumerate(zip(outcomes, trajectories, strict=True)):
+        parts = []
+        for outcome in _outcomes(plan, trajectories):
+            index = outcome.index
             episode = Episode(
                 outcome,
-                trajectory,
+                trajectories[index],
                 files,
                 pov_files,
-                again=place in simulator.ran_again,
-                in_sumo=place in simulator.in_sumo,
+                again=index in simulator.ran_again,
+                in_sumo=index in simulator.in_sumo,
             )
-            episodes.append(episode)
-        return episodes if keep is None else list(map(keep, episodes))
+            parts.append(keep(episode))
+        return parts
+
+
+def with_measures(episode: Episode) -> Episode:
+    """Return an episode after all its measures are computed."""
+    episode.outcome.measures.compute_all()
+    return episode
 
 
 def lost(plan: SimulationPlan, case: Case) -> Episode:
@@ -85,42 +93,31 @@ def lost(plan: SimulationPlan, case: Case) -> Episode:
     return episode if plan.against is None else replace(episode, earlier=episode)
 
 
-@overload
-def evaluate(
-    plan: SimulationPlan, cases: Sequence[Case], workers: Workers | None = None
-) -> Iterator[Episode]: ...
-@overload
 def evaluate(
     plan: SimulationPlan,
     cases: Sequence[Case],
     workers: Workers | None,
     keep: Callable[[Episode], R],
-) -> Iterator[R]: ...
-def evaluate(
-    plan: SimulationPlan,
-    cases: Sequence[Case],
-    workers: Workers | None = None,
-    keep: Callable[[Episode], Any] | None = None,
-) -> Iterator[Any]:
+) -> Iterator[R]:
     """Simulate cases on workers; return their results in order, as they end.
 
     Args:
         plan: how they run.
-        cases: cases of the plan's scenario.
+        cases: cases of the scenario of the plan.
         workers: where they run; None for this process, which keeps its simulator open.
-        keep: gives the part of an episode that travels to this process, by default all of it. A
+        keep: gives the part of an episode that travels to this process, such as `with_measures`. A
             function that is found by its name.
 
     Raises:
         UserError: if the plan cannot be carried out.
     """
 
-    def lost_result(case: Case) -> Any:
-        return lost(plan, case) if keep is None else keep(lost(plan, case))
+    def lost_part(case: Case) -> R:
+        return keep(lost(plan, case))
 
     available = Workers() if workers is None else workers
     chunk = CHUNK if plan.engine is Engine.KINEMATIC else None
-    return available.run(partial(simulate, plan, keep=keep), cases, lost_result, chunk=chunk)
+    return available.run(partial(simulate_part, plan, keep=keep), cases, lost_part, chunk=chunk)
 
 
 def submit_cases(

@@ -2,9 +2,9 @@
 
 SUMO holds the state that eq. (4) gives, to rounding errors (`sumo/world.py` checks that in every
 step). Where the VUT and the POVs are drivers of this package, which need nothing of SUMO, an
-episode therefore ends without it as it ends in it, and takes a tenth of the time. That is never
-taken on trust: at least one case of a hundred, drawn at random, runs in SUMO as well, and the two
-must agree. A case that a rounding error could decide otherwise runs in SUMO, and that counts.
+episode has the same end without it, and takes a tenth of the time. At least one case of a hundred,
+drawn at random, runs in SUMO as well, and the two must agree. A case that a rounding error could
+decide otherwise is decided by SUMO.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import centre_lines
-from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.case import Case, described
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.kinematic_world import EquationWorld
@@ -29,13 +29,12 @@ from merge_sumo.simulation.simulator import Simulator, corridors_of
 CHECKED_SHARE = 0.01
 """Least share of the cases that run in SUMO as well."""
 CHUNK = 2500
-"""Cases that a worker takes at a time. A number of its own, whatever the workers, so that the same
-cases are checked."""
+"""Cases that a worker takes at a time: the same number for any workers, so that the same cases are
+checked."""
 CORRIDORS = 512
-"""Episodes at a time: enough for the calls of numpy to cost little, and their record fits into the
-cache."""
+"""Episodes at a time: many enough for quick calls of numpy, few enough for the cache."""
 ROUNDING = 1e-6
-"""What the engines may differ in, in m and m/s. Measured: 1e-11."""
+"""Largest difference between the engines, in m and m/s. Measured: 1e-11."""
 
 
 class KinematicSimulator(Simulator):
@@ -47,60 +46,51 @@ class KinematicSimulator(Simulator):
         self._sumo: Simulator | None = None
         with ExitStack() as opened:
             world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
-            self._open_drivers(plan, world, None, opened)
+            self._open_drivers(plan, world, opened)
 
     def run(self, cases: Sequence[Case]) -> list[Trajectory]:
         """Run cases; return their trajectories in order.
 
-        Raises `UserError` where a case ends otherwise in SUMO.
+        Raises:
+            UserError: if a case ends otherwise in SUMO.
         """
         ended = super().run(cases)
+        if not cases:
+            return ended
         close = self._close_calls(ended)
-        places = sorted(close | drawn(cases))
-        if places and self._sumo is None:
+        indices = sorted(close | drawn(cases))
+        if self._sumo is None:
             self._sumo = Simulator(replace(self._plan, engine=Engine.SUMO))
             self._opened.callback(self._sumo.close)
-        again = [cases[place] for place in places]
-        in_sumo = self._sumo.run(again) if self._sumo and places else []
-        for place, trajectory in zip(places, in_sumo, strict=True):
-            if place in close:
-                ended[place] = trajectory
+        in_sumo = self._sumo.run([cases[index] for index in indices])
+        for index, trajectory in zip(indices, in_sumo, strict=True):
+            if index in close:
+                ended[index] = trajectory
             else:
-                self._compare(ended[place], trajectory)
-        self.in_sumo = frozenset(places)
+                self._compare(ended[index], trajectory)
+        self.in_sumo = frozenset(indices)
         return ended
 
     def _close_calls(self, ended: Sequence[Trajectory]) -> set[int]:
-        """Return the places where a rounding error could turn the verdict or end another step.
+        """Return the indices where a rounding error could change the verdict or the last step.
 
-        For the end the VUT is put forward and back by one, in the last step and the one before; so
-        it is at M, and where the acceleration lane begins.
+        In the last step, or the one before, the VUT is then at M, or at an end of the lane.
         """
-        if not ended:
-            return set()
-        criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
-        last = np.concatenate([one.motion[-2:] for one in ended])
-        starts = np.cumsum([0, *(min(2, len(one.motion)) for one in ended)])[:-1]
-        x_m = last[..., 0].T
-        by_shift = []
-        for shift_m in (ROUNDING, -ROUNDING):
-            shifted_m = x_m.copy()
-            shifted_m[VUT] += shift_m
-            by_shift.append(self._plan.scenario.has_ended(shifted_m))
-        differ = by_shift[0] != by_shift[1]
-        begin_m, _ = self._plan.scenario.lane_m or (0.0, 0.0)
-        differ |= (np.abs(x_m[VUT] - begin_m) <= ROUNDING) | (np.abs(x_m[VUT]) <= ROUNDING)
-        unclear = np.logical_or.reduceat(differ, starts)
-        return {
-            place
-            for place, (one, of_end) in enumerate(zip(ended, unclear.tolist(), strict=True))
-            if of_end or criterion.is_close_call(one, ROUNDING, lines)
-        }
+        x_vut_m = np.empty((len(ended), 2))
+        for index, one in enumerate(ended):
+            x_vut_m[index] = one.motion[-2:, VUT, 0]  # one row counts twice
+        unclear = np.zeros(len(ended), dtype=np.bool_)
+        for place_m in (0.0, *(self._plan.scenario.lane_m or ())):
+            unclear |= (np.abs(x_vut_m - place_m) <= ROUNDING).any(axis=1)
+        close, lines = set(np.flatnonzero(unclear).tolist()), centre_lines(self._plan.road)
+        for index, one in enumerate(ended):
+            if index not in close and self._plan.criterion.is_close_call(one, ROUNDING, lines):
+                close.add(index)
+        return close
 
     def _compare(self, kinematic: Trajectory, sumo: Trajectory) -> None:
         """Raise `UserError` where a case ended otherwise in SUMO."""
-        lines = centre_lines(self._plan.road)
-        verdicts = [self._plan.criterion.judged(one, lines) for one in (kinematic, sumo)]
+        lines, criterion = centre_lines(self._plan.road), self._plan.criterion
         ours, theirs = kinematic.whole, sumo.whole
         if (
             kinematic.end is sumo.end
@@ -108,15 +98,14 @@ class KinematicSimulator(Simulator):
             and kinematic.motion.shape == sumo.motion.shape
             and ours.shape == theirs.shape
             and np.abs(ours - theirs)[..., :2].max() <= ROUNDING
-            and verdicts[0].failed == verdicts[1].failed
+            and criterion.judged(kinematic, lines).failed == criterion.judged(sumo, lines).failed
         ):
             return
         case = kinematic.case
-        fields = (d.field for d in case.scenario.dimensions(case.level))
-        where = ", ".join(f"{name} {getattr(case, name)!r}" for name in fields)
         raise UserError(
-            f"the case {where} at level {case.level} ends otherwise in SUMO ({_said(sumo)}) than "
-            f"by the equations of motion alone ({_said(kinematic)}): choose `engine` sumo"
+            f"the case {described(case)} at level {case.level} ends otherwise in SUMO "
+            f"({_end_of(sumo)}) than by the equations of motion alone ({_end_of(kinematic)}): "
+            "choose `engine` sumo"
         )
 
 
@@ -129,22 +118,20 @@ class SubstepSimulator(Simulator):
             most = CORRIDORS if plan.needs_sumo is None else plan.corridors
             corridors = corridors_of(plan, most)
             world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
-            self._open_drivers(plan, world, None, opened)
+            self._open_drivers(plan, world, opened)
 
 
 def drawn(cases: Sequence[Case]) -> set[int]:
-    """Return the places of the cases that are drawn at random to be checked.
+    """Return the indices of the cases that are drawn at random to be checked.
 
-    The cases decide, so that the same are drawn whatever worker has them.
+    The cases are the seed, so that the same are drawn in any worker.
     """
-    if not cases:
-        return set()
     seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
     count = math.ceil(CHECKED_SHARE * len(cases))
     return set(np.random.default_rng(seed).choice(len(cases), count, replace=False).tolist())
 
 
-def _said(trajectory: Trajectory) -> str:
+def _end_of(trajectory: Trajectory) -> str:
     """Return how an episode ended, in short."""
     x_m = ", ".join(f"{x:.6f}" for x in trajectory.motion[-1, :, 0].tolist())
     return f"{trajectory.end} after {trajectory.t_end_s} s at {x_m} m"

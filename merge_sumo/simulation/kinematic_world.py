@@ -1,7 +1,6 @@
-"""K corridors that are moved by the paper's equations of motion alone, without SUMO.
+"""K corridors that are moved by the equations of motion of the paper alone, without SUMO.
 
-SUMO holds the same state to 1e-9 m (`sumo/world.py` checks that in every step), so an episode ends
-in the same way. It is for drivers of the package, which need nothing of SUMO.
+SUMO holds the same state to 1e-9 m (`sumo/world.py` checks that in every step).
 """
 
 from __future__ import annotations
@@ -20,16 +19,30 @@ from merge_sumo.sumo.world import PARKING_M
 class EquationWorld:
     """The state of the vehicles in `corridors` independent corridors, by eq. (4).
 
-    `x_m` and `v_mps` have shape (A, corridors), as those of a `World`.
+    Example:
+        world = EquationWorld(1, road_for(US23), US23)
+        world.place(0, case.starts())
+        world.command(a_mps2)
+
+    Attributes:
+        x_m: positions, (A, corridors).
+        v_mps: speeds, (A, corridors).
     """
 
     vut_type: None = None
-    """SUMO drives none of its vehicles."""
+    """SUMO drives none of the vehicles."""
 
     def __init__(
         self, corridors: int, road: Corridor, scenario: Scenario, substeps: int = 1
     ) -> None:
-        """Park the vehicles of a scenario on a road; a step is integrated in so many parts."""
+        """Park the vehicles.
+
+        Args:
+            corridors: number of corridors.
+            road: the road.
+            scenario: the scenario.
+            substeps: number of parts in which a step is integrated.
+        """
         self.corridors, self.road, self.scenario = corridors, road, scenario
         self.substeps = substeps
         self.vehicles = scenario.vehicles
@@ -50,11 +63,10 @@ class EquationWorld:
             starts: (x in m, v in m/s) of each vehicle, in the order of rows.
             own: for a `World` alone.
         """
-        for row, (x, v) in enumerate(starts):
-            self.x_m[row, corridor], self.v_mps[row, corridor] = x, v
+        self.x_m[:, corridor], self.v_mps[:, corridor] = np.array(starts).T
 
     def park(self, corridor: int) -> None:
-        """Put the vehicles of a corridor aside, at a stand before M."""
+        """Park the vehicles of a corridor."""
         self.x_m[:, corridor], self.v_mps[:, corridor] = -PARKING_M, 0.0
 
     def advance(self) -> None:
@@ -74,15 +86,15 @@ class EquationWorld:
     def _in_parts(self, a_mps2: FloatArray) -> None:
         """Move all vehicles by eq. (4) with a shorter step, and the same accelerations.
 
-        An episode that ends in a part stands still for the others: its last row is that part.
+        An episode that ends in a part stays there for the others.
         """
         has_ended = self.scenario.has_ended
-        goes_on = np.ones(self.corridors, dtype=np.bool_)
+        moves = np.ones(self.corridors, dtype=np.bool_)
         ended_before = has_ended(self.x_m)
         part_s = DT_S / self.substeps
         for _ in range(self.substeps):
             x_m = self.x_m + self.v_mps * part_s
             v_mps = np.maximum(self.v_mps + a_mps2 * part_s, 0.0)
-            self.x_m = np.where(goes_on, x_m, self.x_m)
-            self.v_mps = np.where(goes_on, v_mps, self.v_mps)
-            goes_on = ended_before | ~has_ended(self.x_m)
+            self.x_m = np.where(moves, x_m, self.x_m)
+            self.v_mps = np.where(moves, v_mps, self.v_mps)
+            moves = ended_before | ~has_ended(self.x_m)

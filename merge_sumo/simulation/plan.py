@@ -1,4 +1,4 @@
-"""The plan of a simulation: everything that decides what becomes of a case."""
+"""The plan of a simulation: everything that decides the outcome of a case."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MAX_CORRIDORS = 32
 
 
 class Engine(StrEnum):
-    """What moves the vehicles of a case."""
+    """The engine that moves the vehicles of a case."""
 
     SUMO = "sumo"
     KINEMATIC = "kinematic"
@@ -36,22 +36,26 @@ class Engine(StrEnum):
 def versions() -> dict[str, str]:
     """Return the versions of the software that decide the outcome of a case.
 
-    Packages that bring measures or criteria are among it: records and verdicts depend on them.
+    Packages that bring measures are included, because records and verdicts depend on them.
     """
-    extensions = MEASURES.packages
-    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn", *extensions)
-    return {"python": platform.python_version()} | {name: _installed(name) for name in packages}
+    found = {"python": platform.python_version()}
+    packages = ("merge-sumo", "libsumo", "numpy", "scipy", "scikit-learn")
+    for package in (*packages, *MEASURES.packages):
+        found[package] = installed_version(package)
+    return found
 
 
-@cache
-def _installed(package: str) -> str:
-    """Return the version of a package, as it was when this process first asked: it is loaded."""
-    return version(package)
+installed_version = cache(version)
+"""The version of a package as it was when this process first asked, and loaded it."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SimulationPlan:
-    """What it takes to run cases in any process; it travels to workers with every chunk.
+    """Everything that a process needs to run cases; it travels to workers with every chunk.
+
+    Example:
+        plan = resolve(CampaignSettings(vut="design2"))
+        episodes = simulate(plan.with_engine("kinematic"), cases)
 
     Attributes:
         scenario: the scenario, with its follow-up after M.
@@ -60,7 +64,7 @@ class SimulationPlan:
         povs: the drivers of the mainline.
         criterion: when a case fails.
         against: an earlier version of the VUT, with which each case runs, too.
-        engine: what moves the vehicles; campaigns take SUMO.
+        engine: moves the vehicles; SUMO in campaigns.
         corridors: the most episodes at a time in SUMO; decides no outcome.
         substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more
             than one. Drivers are asked once a step.
@@ -81,9 +85,10 @@ class SimulationPlan:
     policies_sha256: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Note the learned drivers, unless they are given.
+        """Take the hashes of the learned drivers, unless they are given.
 
-        Raises `UserError` where the VUT cannot sense as the scenario says.
+        Raises:
+            UserError: if the scenario has sensors and the VUT does not use them.
         """
         if not self.scenario.sense.is_perfect and self.vut.vut_type is not None:
             raise UserError(
@@ -94,11 +99,11 @@ class SimulationPlan:
             object.__setattr__(self, "policies_sha256", self.povs.sha256())
 
     def key(self, level: int = OWN) -> dict[str, Any]:
-        """Return what decides the outcomes of cases at a level, as plain values for JSON.
+        """Return everything that decides the outcomes of cases at a level, as values for JSON.
 
-        The files of a VUT are left out, as they are known in full only after it drove: what is kept
-        under a key has their hashes beside it. Instead the working folder counts where a user's
-        code runs, because the same name may be another file in another folder.
+        The files of a VUT are left out, because all of them are known only after it drove. Where
+        code of a user runs, the working folder is included, because the same name may be another
+        file in another folder.
         """
         own = self.povs.own if level == OWN else None
         vut, pov = str(self.vut.spec), None if own is None else str(own.spec)
@@ -123,13 +128,13 @@ class SimulationPlan:
         return replace(self, vut=self.against, against=None)
 
     def at_level(self, level: int) -> SimulationPlan:
-        """Return the plan for the cases of a level, which a POV of another level does not meet."""
+        """Return the plan for the cases of a level, without the POV of the user at others."""
         if level == OWN:
             return self
         return replace(self, povs=replace(self.povs, own=None))
 
     def for_verdicts(self) -> SimulationPlan:
-        """Return the plan for verdicts alone: where these are those of M, without a follow-up."""
+        """Return the plan for verdicts alone: without a follow-up, if they are those of M."""
         if not self.criterion.is_papers or self.scenario.lane_m is not None:
             return self
         return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
@@ -137,11 +142,11 @@ class SimulationPlan:
     def with_engine(self, engine: str | None) -> SimulationPlan:
         """Return the plan with an engine; None is the kinematic one where the drivers allow it.
 
-        Raises `UserError` for an unknown name, and where the drivers do not allow it.
+        Raises:
+            UserError: if the name is unknown, or the drivers do not allow the engine.
         """
         if engine is None:
-            kinematic = self.needs_sumo is None
-            return replace(self, engine=Engine.KINEMATIC if kinematic else Engine.SUMO)
+            engine = Engine.KINEMATIC if self.needs_sumo is None else Engine.SUMO
         if engine not in list(Engine):
             raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
         if engine == Engine.KINEMATIC and self.needs_sumo is not None:
@@ -150,24 +155,24 @@ class SimulationPlan:
 
     @property
     def needs_sumo(self) -> str | None:
-        """Why cases run in SUMO alone, in a clause; None where eq. (4) moves vehicles as well."""
+        """The reason why cases need SUMO; None if eq. (4) suffices."""
         if self.povs.own is not None:
-            return f"the POV {self.povs.own.spec} is none of this package"
+            return f"the POV {self.povs.own.spec} is not one of this package"
         if not self.vut.by_arrays:
-            return f"the VUT {self.vut.spec} is none of this package"
+            return f"the VUT {self.vut.spec} is not one of this package"
         return None
 
     @property
     def asks_sumo(self) -> bool:
-        """Whether the VUT, or a POV that is none of this package, asks SUMO anything."""
+        """Whether the VUT, or the POV of the user, asks SUMO anything."""
         own = self.povs.own
         return self.vut.asks_sumo or (own is not None and own.asks_sumo)
 
     def workers(self, requested: AnyWorkers) -> int | str:
-        """Return the number of processes that run cases: as many as VUT and POV can serve.
+        """Return the number of processes that VUT and POV can serve, or the address of a cluster.
 
-        Those at an address are taken as they are. Raises `UserError` where more are requested than
-        that.
+        Raises:
+            UserError: if more are requested than that.
         """
         if isinstance(requested, str):
             return requested
@@ -179,7 +184,7 @@ class SimulationPlan:
         return replace(self, corridors=min(self.corridors, cases))
 
     def with_log(self, log: Path) -> SimulationPlan:
-        """Return the plan with what a user's drivers print added to a file."""
+        """Return the plan with a file for the output of the drivers of the user."""
         against = None if self.against is None else self.against.with_log(log)
         povs = self.povs.with_log(log)
         return replace(self, vut=self.vut.with_log(log), against=against, povs=povs)

@@ -1,10 +1,10 @@
-"""The drivers of the POV at each level, and the value from which each process opens them."""
+"""The drivers of the POV at each level, and the plan by which each process opens them."""
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -57,7 +57,7 @@ class Povs:
 
     def check_level(self, level: int) -> None:
         """Raise `UserError` where there is no POV of a level."""
-        check_level(level, self.policies, own=self.own is not None)
+        check_level(level, self.levels, self.policies)
 
     def sha256(self) -> dict[str, str]:
         """Return the hashes of the policies by name."""
@@ -69,11 +69,16 @@ class Povs:
         return {} if self.own is None else self.own.files or {}
 
     def with_log(self, log: Path) -> Povs:
-        """Return the same POVs, with the output of the user's POV added to a file."""
+        """Return the same POVs, with a file for the output of the POV of the user."""
         return self if self.own is None else replace(self, own=self.own.with_log(log))
 
     def corridors(self, asked: int, cars: int) -> int:
-        """Return how many corridors with `cars` cars on the mainline are served of those asked."""
+        """Return the number of corridors that are served.
+
+        Args:
+            asked: number of corridors that the VUT can serve.
+            cars: number of cars on the mainline of each.
+        """
         if self.own is None or self.own.max_corridors is None:
             return asked
         most = self.own.max_corridors
@@ -82,66 +87,66 @@ class Povs:
         return min(asked, most // cars)
 
 
-CHOICE = "0, 1, 2, several with commas, all alone, or own with `pov`"
-ONE = "0, 1 or 2, or own with `pov`"
+CHOICE = "0, 1, 2, all, or own with `pov`"
 
 
 def levels_in(policies: Path, *, own: bool) -> tuple[int, ...]:
     """Return the levels for which there is a POV; level 0 needs no policy."""
     trained = policies_sha256(policies)
-    learned = [level for level, name in POLICIES.items() if name in trained]
-    return (0, *learned, OWN) if own else (0, *learned)
+    levels = [0]
+    for level, name in POLICIES.items():
+        if name in trained:
+            levels.append(level)
+    if own:
+        levels.append(OWN)
+    return tuple(levels)
 
 
-def check_level(level: int, policies: Path, *, own: bool) -> None:
-    """Raise `UserError` where there is no POV of a level.
-
-    Args:
-        level: level of the POV.
-        policies: folder of the networks.
-        own: whether the user names a POV.
-    """
-    if level not in ALL_LEVELS:
-        raise UserError(f"there is no POV level {level}: choose {CHOICE}")
-    if level == OWN and not own:
-        raise UserError("`level` own is a POV that you bring: name it with `pov`")
-    if level not in levels_in(policies, own=own):
-        raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
-
-
-def parse_levels(
-    asked: AnyLevels,
-    policies: Path,
-    *,
-    own: bool,
-    choice: str = CHOICE,
-) -> tuple[int, ...]:
+def parse_levels(asked: AnyLevels, policies: Path, *, own: bool) -> tuple[int, ...]:
     """Return the named levels in their order; "all" are those that have a POV.
 
     Args:
         asked: names of levels.
         policies: folder of the networks.
         own: whether the user brings a POV.
-        choice: the end of the message for an unknown name.
 
     Raises:
-        UserError: for an unknown name, or if the user's POV would not drive.
+        UserError: for an unknown name, a level without a POV, or if the POV of the user would not
+            drive.
     """
     names = names_of_levels(asked)
+    available = levels_in(policies, own=own)
     if names == ("all",):
-        return levels_in(policies, own=own)
+        return available
     by_name = {level_name(level): level for level in ALL_LEVELS}
     for name in names:
         if name not in by_name:
-            raise UserError(f"there is no POV level {name!r}: choose {choice}")
-        check_level(by_name[name], policies, own=own)
+            raise UserError(f"there is no POV level {name!r}: choose {CHOICE}")
+        check_level(by_name[name], available, policies)
     if own and level_name(OWN) not in names:
         raise UserError(f"`pov` drives at `level` own or all, not at `level` {','.join(names)}")
     return tuple(level for name, level in by_name.items() if name in names)
 
 
+def check_level(level: int, available: Collection[int], policies: Path) -> None:
+    """Raise `UserError` where there is no POV of a level.
+
+    Args:
+        level: the level.
+        available: the levels that have a POV.
+        policies: folder of the networks.
+    """
+    if level in available:
+        return
+    if level == OWN:
+        raise UserError("`level` own is a POV that you bring: name it with `pov`")
+    if level in POLICIES:
+        raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
+    raise UserError(f"there is no POV level {level}: choose {CHOICE}")
+
+
 def one_level(text: str, policies: Path, *, own: bool) -> int:
-    """Return the one level of a name.
+    """Return the level of a name.
 
     Args:
         text: the name.
@@ -149,8 +154,8 @@ def one_level(text: str, policies: Path, *, own: bool) -> int:
         own: whether the user brings a POV.
     """
     if text == "all" or "," in text:
-        raise UserError(f"`level` {text} does not go here: choose {ONE}")
-    return parse_levels(text, policies, own=own, choice=ONE)[0]
+        raise UserError(f"`level` {text} does not go here: choose one level")
+    return parse_levels(text, policies, own=own)[0]
 
 
 def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
@@ -159,9 +164,12 @@ def policies_folder(policies: str | Path | None, scenario: Scenario) -> Path:
 
 
 def own_pov(text: str, options: ControllerOptions) -> ControllerKind:
-    """Return what makes the POV that a spec names; `UserError` for what cannot be one.
+    """Return the kind of the POV that a spec names.
 
     It is any VUT that can drive on the mainline, and is hosted with the same options.
+
+    Raises:
+        UserError: if it cannot be a POV.
     """
     try:
         own = load(text, options)
@@ -198,12 +206,9 @@ class PovLibrary(Driver):
         self._levels_playing.add(case.level)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return each corridor's answer by the driver of its level."""
-        levels = self._levels_playing
-        if levels == {0}:
-            return self._drivers[0].act(scene)
+        """Return the answer of the driver of each corridor, (K,)."""
         acceleration = np.zeros(self.corridors)
-        for level in levels:
+        for level in self._levels_playing:
             mine = scene.active & (self._level == level)
             if mine.any():
                 of_level = scene._replace(active=mine)
@@ -211,7 +216,7 @@ class PovLibrary(Driver):
         return acceleration
 
     def reason(self, corridor: int) -> str | None:
-        """Return what the driver of a corridor did wrong."""
+        """Return the error of the driver of a corridor."""
         return self._drivers[int(self._level[corridor])].reason(corridor)
 
     def files(self) -> tuple[Path, ...]:
@@ -247,16 +252,14 @@ class PovAdapter(DriverWrapper):
 
 
 def seen_from(case: Case, car: int) -> Case:
-    """Return a case as a VUT in the place of a car of the mainline would be told it.
+    """Return a case for a VUT in the place of a car of the mainline.
 
     It is on the mainline from the beginning, and has no acceleration lane.
     """
     starts = case.starts()
-    x_other_m, v_other_mps = starts.pop(VUT)
+    vut = starts.pop(VUT)
     x_m, v_mps = starts[car]
-    place: dict[str, Any] = {"x_vut0_m": min(x_m, BEFORE_M), "v_vut0_mps": v_mps}
-    if case.scenario.lane_m is not None:
-        place["lane_m"] = None
-    scenario = replace(case.scenario, **place)
-    told = (x_other_m, v_other_mps), (x_m, v_mps)
+    x_vut0_m = min(x_m, BEFORE_M)
+    scenario = replace(case.scenario, x_vut0_m=x_vut0_m, v_vut0_mps=v_mps, lane_m=None)
+    told = vut, (x_m, v_mps)
     return ToldCase(level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, told=told)

@@ -1,14 +1,14 @@
-"""From cases to trajectories: two drivers in the SUMO world, or by eq. (4) alone."""
+"""From cases to trajectories: two drivers in SUMO, or by eq. (4) alone."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
 from merge_sumo.drivers.following import car_met, keep_safe
 from merge_sumo.drivers.lane import Merging
@@ -22,57 +22,59 @@ from merge_sumo.sumo.world import SimulationError, World
 RING_ROWS = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
 
-
-ROUNDING_MPS2 = 1e-9
-"""An answer this little outside the limits is a rounding error, not a wish for more."""
-
 WRONGS = (Exception, SystemExit)
-"""A black box may raise anything; only the interruption by the user comes from elsewhere."""
+"""Errors of a VUT: a black box may raise anything but the interruption by the user."""
 
 OF_THE_POV = "the POV: "
-"""Begins the reason of an error that is the doing of a POV."""
+"""Prefix of the reason of an error that a POV made."""
 
 MAX_DEATHS = 2
-"""A case that ends the process of its controller this often, alone, is at fault: once may have come
-from outside."""
+"""Number of deaths of the process of a controller, with one case alone, after which the case is at
+fault: a single death may have come from outside."""
 
 END_OF_ROAD_M = 20.0
-"""No vehicle is followed up to where the road ends."""
+"""Distance from the end of the road at which a follow-up ends."""
 
 NEVER = 2**62
-"""The step at which a corridor without an episode times out."""
+"""Step at which a corridor without an episode times out."""
 
 
 @dataclass(slots=True)
 class _Running:
-    """What runs in a corridor."""
+    """The episode in a corridor.
+
+    Attributes:
+        index: index of the case in the rollout.
+        case: the case.
+        first_row: first row of its record.
+        merge_row: row in which the VUT is at M; None before, and without a follow-up.
+        clipped: number of answers that were clipped before M.
+        left: signals of the VUT, with the row of the episode at which they were left.
+    """
 
     index: int
     case: Case
     first_row: int
     merge_row: int | None = None
-    """The row in which the VUT is at M, where it goes on after M."""
     clipped: int = 0
-    """Answers that were clipped before M."""
     left: list[tuple[int, Left]] = field(default_factory=list)
-    """Signals, by the row of the episode at which the VUT left them."""
 
 
 class Rollout:
     """Cases that run in the corridors of a world.
 
-    Every corridor is refilled the moment its episode ends, so episodes do not end in order; an
-    episode does not depend on the number of corridors nor on its neighbours. What the VUT does
-    wrong ends its episode as VUT_ERROR, what the POV does wrong as SIM_ERROR. Where that ended the
-    process of the controllers, the running episodes begin again, one by one; an episode that ends
-    it twice, alone, is at fault. When SUMO fails, the episodes that were running end as
-    SIM_ERROR, SUMO is started again, and the others go on.
+    A corridor is refilled when its episode ends, so episodes do not end in order. An episode
+    depends neither on the number of corridors nor on its neighbours. An error of the VUT ends its
+    episode as VUT_ERROR, an error of the POV as SIM_ERROR. Where an error ended the process of the
+    controllers, the running episodes begin again, one by one; an episode that ends it twice, alone,
+    is at fault. When SUMO fails, the running episodes end as SIM_ERROR, and SUMO is started again
+    for the others.
 
     Example:
         trajectories = Rollout(world, pov, vut, cases).run()
 
     Attributes:
-        unexplained: places of the cases that ran again although none was at fault: something from
+        unexplained: indices of the cases that ran again although none was at fault: something from
             outside ended the process.
     """
 
@@ -97,7 +99,7 @@ class Rollout:
         self.alone = False
         """Whether a suspect runs alone."""
         self.deaths = Counter[int]()
-        """How often a process died with one case alone, by the place of the case."""
+        """How often a process died with one case alone, by the index of the case."""
         self.unexplained = set[int]()
         self.episodes: list[_Running | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
@@ -108,8 +110,7 @@ class Rollout:
         """What the VUT raised instead of its last answer."""
         self.timeout_at = np.full(corridors, NEVER)
         """Rows of the record at which episodes time out."""
-        self.next_timeout = NEVER
-        # One row per step of the world: x, v, a of every vehicle. An episode lies in one piece.
+        # One row per step of the world: x, v, a of every vehicle.
         self.follow_steps = round(world.scenario.follow_up_s / DT_S)
         has_lane = world.scenario.lane_m is not None
         self.merging = Merging(corridors, world.scenario) if has_lane else None
@@ -124,15 +125,16 @@ class Rollout:
         """Run all cases; return their trajectories in order."""
         world, everywhere = self.world, range(self.world.corridors)
         self.refill(everywhere)
-        while self.next_timeout < NEVER:  # as long as an episode runs
+        while self.active.any():
             self.now = self.record[:, self.row % self.ring]
             self.now[..., 0], self.now[..., 1] = world.x_m.T, world.v_mps.T
             self.row += 1
             try:
                 world.advance()
                 acceleration = self.ask_drivers()
-                merging = self.merging
-                merged = None if merging is None else merging.step(world.x_m, world.v_mps)
+                merged = None
+                if self.merging is not None:
+                    merged = self.merging.step(world.x_m, world.v_mps)
                 world.command(acceleration, merged)
             except VutLostError as lost:
                 self.begin_again(lost)
@@ -145,44 +147,42 @@ class Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
-            if self.merging is not None:
-                arrived = self.merging.merged & self.active
-            else:
-                arrived = world.scenario.has_ended(world.x_m) & self.active
-            # In most steps no episode ends.
-            if np.count_nonzero(arrived) or self.row >= self.next_timeout or self.errors:
-                ended = arrived | (self.row >= self.timeout_at)
-                ended[list(self.errors)] = True
-                corridors = np.flatnonzero(ended).tolist()
-                if self.follow_steps:
-                    corridors = [k for k in corridors if not self.goes_on(k, arrived=arrived[k])]
-                for corridor in corridors:
-                    if corridor in self.errors:
-                        self.finish(corridor, *self.errors.pop(corridor))
-                    else:
-                        self.finish(corridor, End.MERGED if arrived[corridor] else End.TIMEOUT)
-                self.refill(corridors)
-        return [trajectory for _, trajectory in sorted(self.ended.items())]
+            arrived = self.active & (
+                world.scenario.has_ended(world.x_m) if merged is None else merged
+            )
+            ended = arrived | (self.row >= self.timeout_at)
+            ended[list(self.errors)] = True
+            free = []
+            for corridor in np.flatnonzero(ended).tolist():
+                if corridor in self.errors:
+                    self.finish(corridor, *self.errors.pop(corridor))
+                elif not arrived[corridor]:
+                    self.finish(corridor, End.TIMEOUT)
+                elif self.follow_steps and self.follows_up(corridor):
+                    continue
+                else:
+                    self.finish(corridor, End.MERGED)
+                free.append(corridor)
+            self.refill(free)
+        return [self.ended[index] for index in sorted(self.ended)]
 
-    def goes_on(self, corridor: int, *, arrived: bool) -> bool:
-        """Return whether an episode goes on after M; note where that begins."""
+    def follows_up(self, corridor: int) -> bool:
+        """Return whether an episode continues after M; note where that begins."""
         episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
-        assert episode is not None, "only running episodes go on"  # noqa: S101
-        if corridor in self.errors or not arrived:
-            return False
+        assert episode is not None, "only running episodes continue"  # noqa: S101
         if episode.merge_row is None:
             episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
             self.timeout_at[corridor] = self.row + self.follow_steps
-            self.next_timeout = int(self.timeout_at.min())
-        on_the_road = bool(x_m.max() < self.world.road.mainline.after_m - END_OF_ROAD_M)
-        return self.row < self.timeout_at[corridor] and on_the_road
+        end_m = self.world.road.mainline.after_m - END_OF_ROAD_M
+        return bool(self.row < self.timeout_at[corridor] and x_m.max() < end_m)
 
     def begin_again(self, lost: VutLostError) -> None:
-        """Let what was running begin again, one by one; end the episode at fault, if any."""
-        episodes = enumerate(self.episodes)
-        running = [(k, e) for k, e in episodes if e is not None and self.active[k]]
-        for corridor, episode in running:
-            self.deaths[episode.index] += len(running) == 1
+        """Let the running episodes begin again, one by one; end the one at fault, if any."""
+        is_alone = np.count_nonzero(self.active) == 1
+        for corridor, episode in enumerate(self.episodes):
+            if episode is None:
+                continue
+            self.deaths[episode.index] += is_alone
             if self.deaths[episode.index] == MAX_DEATHS:
                 self.unexplained.clear()
                 if isinstance(lost, PovLostError):
@@ -208,10 +208,9 @@ class Rollout:
             self.active[corridor] = False
         for corridor in corridors:
             self.begin(corridor, *self.next_case())
-        self.next_timeout = int(self.timeout_at.min())
 
     def next_case(self) -> tuple[int, Case | None]:
-        """Return what is to run next; None where a corridor is to stay empty."""
+        """Return the next case and its index; None where a corridor is to stay empty."""
         if self.alone:
             return (-1, None) if self.active.any() else self.suspects.popleft()
         return next(self.queue, (-1, None))
@@ -247,10 +246,7 @@ class Rollout:
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, scenario = self.world.x_m, self.world.v_mps, self.world.scenario
-        # In most steps the sums of squares are enough.
-        if not math.isfinite(np.vdot(x_m, x_m) + np.vdot(v_mps, v_mps)) and not (
-            np.isfinite(x_m).all() and np.isfinite(v_mps).all()
-        ):
+        if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
             raise SimulationError("a position or a speed is not finite")
         merged = x_m[VUT] >= 0.0 if self.follow_steps else None
         if self.merging is not None:
@@ -270,7 +266,7 @@ class Rollout:
             of_vut = np.full(self.world.corridors, np.nan)
         answer = np.concatenate((cars[:VUT], of_vut[None], cars[VUT:]))
         # Before the limits of car following, which would turn an infinite answer into a number.
-        if not math.isfinite(np.vdot(answer, answer)):
+        if not np.isfinite(answer).all():
             answer = self.only_numbers(answer)
         if self.has_traffic:
             keep_safe(answer, x_m, v_mps, scenario)
@@ -279,13 +275,10 @@ class Rollout:
         acceleration: FloatArray = np.clip(answer, scenario.a_min_mps2, scenario.a_max_mps2)
         acceleration[:, ~self.active] = 0.0
         self.now[..., 2] = acceleration.T
-        off = answer - acceleration
-        # In most steps all commands are within the limits.
-        commands = self.vut.clipped()
-        if commands is not None:
-            self.clipped += commands
-        elif np.vdot(off, off) > (0.5 * ROUNDING_MPS2) ** 2:
-            self.clipped += np.abs(off[VUT]) > ROUNDING_MPS2
+        clipped = self.vut.clipped()
+        if clipped is None:
+            clipped = np.abs(answer[VUT] - acceleration[VUT]) > ROUNDING_MPS2
+        self.clipped += clipped
         return acceleration
 
     def take_signals(self, answer: FloatArray) -> None:
@@ -298,9 +291,9 @@ class Rollout:
                 episode.left.append((self.row - 1 - episode.first_row, left))
 
     def only_numbers(self, answer: FloatArray) -> FloatArray:
-        """Return answers, (A, K), with 0 where one is no number; note whose doing that was.
+        """Return answers, (A, K), with 0 for those that are not finite; note the errors.
 
-        A VUT that is driven for answers what it likes.
+        The answers of a VUT that is driven for do not count.
         """
         finite = np.isfinite(answer)
         wrong = ~finite & self.active
@@ -319,8 +312,8 @@ class Rollout:
     def finish(self, corridor: int, end: End, error: str | None = None) -> None:
         """Keep the record of a corridor's episode; after an error without the last step.
 
-        An error after M ends the follow-up alone: the VUT has merged. After a merge from an
-        acceleration lane it is one of the episode, because the time after the merge is judged.
+        An error after M ends only the follow-up, because the VUT has merged. After a merge from an
+        acceleration lane it is an error of the episode, because the time after it is judged.
 
         Args:
             corridor: index of the corridor.
@@ -330,16 +323,13 @@ class Rollout:
         episode = self.episodes[corridor]
         assert episode is not None, "only running episodes end"  # noqa: S101
         length = self.row - episode.first_row + (error is None)
-        first = episode.first_row % self.ring
-        rows = self.record[corridor]
-        motion = rows[first : first + length].copy()
-        if len(motion) < length:  # the ring closes
-            motion = np.concatenate((motion, rows[: length - len(motion)]))
+        rows = np.arange(episode.first_row, episode.first_row + length) % self.ring
+        motion = self.record[corridor, rows]
         if error is None:
             motion[-1, :, 0] = self.world.x_m[:, corridor]
             motion[-1, :, 1] = self.world.v_mps[:, corridor]
         motion[-1, :, 2] = 0.0
-        # A vehicle that comes to a stand brakes no harder than it takes: v >= 0.
+        # A vehicle that comes to a stand brakes only as hard as that takes.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
         left = series(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
         if episode.merge_row is None or (error is not None and self.merging is not None):

@@ -1,4 +1,4 @@
-"""The simulator: a VUT and the POVs in a SUMO world, in whatever process runs the cases."""
+"""The simulator: a VUT and the POVs in SUMO, in the process that runs the cases."""
 
 from __future__ import annotations
 
@@ -21,12 +21,16 @@ from merge_sumo.sumo.world import World
 
 
 class Simulator:
-    """A VUT and the POVs in a world: takes cases, gives trajectories; to be used in `with`.
+    """A VUT and the POVs in a world; to be used in `with`.
+
+    Example:
+        with Simulator(plan) as simulator:
+            trajectories = simulator.run(cases)
 
     Attributes:
-        world: that of SUMO, or of a subclass's engine.
-        in_sumo: places of the cases of the last `run` that SUMO ran.
-        ran_again: places of those that ran again, because a process was ended from outside.
+        world: the world of SUMO, or of the engine of a subclass.
+        in_sumo: indices of the cases of the last `run` that SUMO ran.
+        ran_again: indices of those that ran again, because a process was ended from outside.
     """
 
     world: World | EquationWorld
@@ -36,7 +40,7 @@ class Simulator:
     ran_again: Collection[int] = ()
 
     def __init__(self, plan: SimulationPlan) -> None:
-        """Start SUMO and the drivers, with fewer corridors where one cannot serve as many."""
+        """Start SUMO and the drivers, with as many corridors as all of these can serve."""
         own = plan.povs.own
         car_type = None if own is None else own.vut_type
         with ExitStack() as opened:
@@ -46,18 +50,20 @@ class Simulator:
                 car_type=car_type,
             )
             opened.callback(world.close)
-            self._open_drivers(plan, world, world, opened)
+            self._open_drivers(plan, world, opened)
 
     def _open_drivers(
-        self,
-        plan: SimulationPlan,
-        world: World | EquationWorld,
-        sumo: World | None,
-        opened: ExitStack,
+        self, plan: SimulationPlan, world: World | EquationWorld, opened: ExitStack
     ) -> None:
-        """Start the drivers of a world, which are told of SUMO's; `opened` closes all."""
-        self.world = world
-        scenario = plan.scenario
+        """Start the drivers.
+
+        Args:
+            plan: the plan that names them.
+            world: the world in which they drive.
+            opened: closes them and the world.
+        """
+        self.world, scenario = world, plan.scenario
+        sumo = world if isinstance(world, World) else None
         self.vut = plan.vut.open(world.corridors, sumo)
         if not scenario.sense.is_perfect:
             self.vut = SensedDriver(self.vut)
@@ -87,7 +93,7 @@ class Simulator:
 
 
 def corridors_of(plan: SimulationPlan, most: int) -> int:
-    """Return the number of corridors, that VUT and POVs of a plan can serve."""
+    """Return the number of corridors, `most` or fewer, that VUT and POVs of a plan can serve."""
     corridors = min(most, plan.vut.max_corridors or most)
     return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
 

@@ -17,7 +17,7 @@ from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.evaluate import simulate_part
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.training.best_response import beam_search, best_response
@@ -155,4 +155,4 @@ def _play(cases: list[Case], pov: str, vut: str, folder: Path) -> list[Trajector
     for case in cases:
         svo_rad = case.svo_rad if level == 2 else None
         played.append(replace(case, level=level, svo_rad=svo_rad))
-    return simulate(plan, played, attrgetter("trajectory"))
+    return simulate_part(plan, played, attrgetter("trajectory"))

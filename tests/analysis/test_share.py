@@ -15,7 +15,7 @@ from merge_sumo.analysis import share
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.analysis.share import SHARES, LevelShare, end_of, note_shares, uniform_cases
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.simulation.evaluate import evaluate, simulate
+from merge_sumo.simulation.evaluate import evaluate, simulate_part
 
 
 @pytest.mark.parametrize(
@@ -83,7 +83,7 @@ def test_of_a_controller_of_ones_own_is_measured_too():
     for level, one in enumerate(shares.levels):
         assert one.cases == 200
         cases = uniform_cases(plan.scenario, level, 200, seed=4)
-        ends = simulate(plan.for_verdicts(), cases, end_of)
+        ends = simulate_part(plan.for_verdicts(), cases, end_of)
         assert one.failures == sum(failed for failed, _ in ends)
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "

@@ -17,7 +17,7 @@ from merge_sumo.samplers.failure_probability import learn_chance
 from merge_sumo.samplers.history import bounded
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.simulation.evaluate import evaluate
+from merge_sumo.simulation.evaluate import simulate
 
 HARSH = "brake_after_mps2 > 3"
 LIMITS = [(limit_m, fail_when) for limit_m in (3.0, 12.0) for fail_when in (PAPER, HARSH)]
@@ -37,7 +37,7 @@ def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
     )
     points = np.random.default_rng(7).random((cases, 2))
     plan = resolve(settings).with_engine("kinematic")
-    ran = list(evaluate(plan, settings.pool.cases(points, 0)))
+    ran = simulate(plan, settings.pool.cases(points, 0))
     outcomes = [one.at(place, 0).outcome for place, one in enumerate(ran)]
     return (
         settings,

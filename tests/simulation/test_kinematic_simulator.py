@@ -115,7 +115,7 @@ class TestThePlan:
     def test_needs_sumo_for_a_vut_of_others(self, vut):
         plan = plan_for(vut)
         assert plan.with_engine(None).engine is Engine.SUMO
-        with pytest.raises(UserError, match=f"the VUT {vut} is none of this package"):
+        with pytest.raises(UserError, match=f"the VUT {vut} is not one of this package"):
             plan.with_engine("kinematic")
 
     def test_needs_sumo_for_a_pov_of_ones_own(self):
@@ -124,7 +124,7 @@ class TestThePlan:
         assert plan.with_engine(None).engine is Engine.SUMO
         assert plan.at_level(OWN).with_engine(None).engine is Engine.SUMO
         assert plan.at_level(1).with_engine(None).engine is Engine.KINEMATIC
-        with pytest.raises(UserError, match="the POV design1 is none of this package"):
+        with pytest.raises(UserError, match="the POV design1 is not one of this package"):
             plan.with_engine("kinematic")
 
 

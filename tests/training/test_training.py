@@ -33,7 +33,7 @@ from merge_sumo.road.scenario_file import to_toml
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.evaluate import simulate_part
 from merge_sumo.training import best_response, ddqn, helix, refine, reward
 from merge_sumo.training.check import returns_of
 from merge_sumo.training.game import Game, greedy, pool_starts
@@ -174,7 +174,8 @@ def test_the_returns_of_a_game_are_those_in_sumo(role, scenario):
     start = np.array([np.ravel(case.starts()) for case in cases])
     policy = greedy(load_network(f"{role}1"), scenario)
     expected = Game(role, None, played).play(start, np.zeros(8), policy)
-    trajectories = simulate(plan_for(vut, scenario=scenario), cases, attrgetter("trajectory"))
+    plan = plan_for(vut, scenario=scenario)
+    trajectories = simulate_part(plan, cases, attrgetter("trajectory"))
     ended = [one.end is End.MERGED for one in trajectories]
     returns = returns_of(trajectories, played).of(role, np.zeros(8))
     assert returns[ended] == pytest.approx(expected[ended], abs=1e-9)
