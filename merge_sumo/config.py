@@ -475,7 +475,7 @@ class Compare(Page):
     """Compare recorded versions of a VUT: what broke, and what was fixed.
 
     Everything is read from the records. Cases that two campaigns share are paired; where each has
-    cases of its own, regions of failures are compared, as a hint.
+    cases of its own, the shares of cases that pass are compared.
 
     Exit code 1 when a case broke, when a version passes in a smaller share of its own cases than
     the one before it, by Fisher's exact test, or when the last version was tested in no case.

@@ -1,12 +1,7 @@
 """Comparison: which cases broke and which were fixed from each version of a VUT to the next.
 
-Cases that both versions ran are paired; where each has cases of its own, their regions of failures
-are compared.
+Cases that both versions ran are paired; where each has cases of its own, shares are compared.
 """
-
-# Regions decide nothing: two searches of one version have cases on both sides of the edge of a
-# region. A version that passes less often in its search than the earlier one did decides, where
-# that is more than chance.
 
 from __future__ import annotations
 
@@ -18,15 +13,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from scipy.spatial import cKDTree
-
 from merge_sumo.campaigns.again import command
-from merge_sumo.campaigns.run import Run, failures, regions_of
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
-from merge_sumo.metrics.fmc import fmc, radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import (
@@ -37,9 +28,9 @@ from merge_sumo.metrics.summary import (
     one_per_case,
     summarise,
 )
-from merge_sumo.records import Record, to_plain
+from merge_sumo.records import to_plain
 from merge_sumo.result import Result
-from merge_sumo.scenario.case import Case, described, to_unit
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
@@ -99,24 +90,20 @@ class Version:
 
 
 class Change(StrEnum):
-    """The change of a case, or of a region of failures, in the order of tables.
+    """The change of a case, in the order of tables.
 
-    A case passes where the VUT reaches its goal and the criterion is met. `LATER_ALONE`,
-    `EARLIER_ALONE` and `NOT_SEEN` are changes of regions, `WORSE` and `ACCEPTED` of cases files,
-    `NOT_REPEATABLE` of cases that go differently when they run once more.
+    A case passes where the VUT reaches its goal and the criterion is met. `WORSE` and `ACCEPTED`
+    are changes of cases files, `NOT_REPEATABLE` of cases that go differently when they run again.
     """
 
     BROKE = "broke"
     WORSE = "worse but passing"
     ACCEPTED = "accepted"
-    LATER_ALONE = "found in the later alone"
     WITHIN_CHANCE = "within chance"
     NOT_REPEATABLE = "not repeatable"
     NEITHER = "pass with neither"
     STILL_CONTACT = "contact without failure"
     FIXED = "fixed"
-    EARLIER_ALONE = "found in the earlier alone"
-    NOT_SEEN = "not looked at"
     BOTH = "pass with both"
 
 
@@ -253,30 +240,6 @@ def in_order(cases: Iterable[ComparedCase]) -> list[ComparedCase]:
     return sorted(cases, key=lambda c: (ORDER.index(c.change), c.b.margin or 0.0, c.b.index))
 
 
-class Region(Record, frozen=True):
-    """A region of failures of one of two versions, and the other version's cases in it.
-
-    Attributes:
-        change: the change; `NOT_SEEN` where the other version has no case there.
-        version: number of the version that fails there, from 1.
-        failures: failures of that version in the region.
-        worst: index of the worst of them in its campaign.
-        where: the start of the worst failure, in words.
-        fmc: volume of the failures.
-        cases: cases in the region that the other version tested.
-        failed: how many of these failed.
-    """
-
-    change: Change
-    version: int
-    failures: int
-    worst: int
-    where: str
-    fmc: float
-    cases: int
-    failed: int
-
-
 @dataclass(frozen=True, slots=True)
 class Step:
     """The changes from a version to the next.
@@ -285,16 +248,14 @@ class Step:
         before: number of the earlier version, from 1.
         after: number of the later one.
         cases: the cases that both ran, in the order of `in_order`.
-        regions: the regions of each level at which the versions have cases of their own.
-        chance: p-value of Fisher's exact test of the shares of cases that pass, at those levels if
-            one sampler searched for both, or where cases do not repeat; else None.
+        chance: p-value of Fisher's exact test of the shares of cases that pass; None where the
+            versions ran the same cases, and where different samplers chose them.
         passes_less: whether the later version passes in a smaller share, by more than chance.
     """
 
     before: int
     after: int
     cases: list[ComparedCase]
-    regions: dict[int, list[Region]]
     chance: float | None = None
     passes_less: bool = False
 
@@ -323,7 +284,6 @@ class Step:
             "passes_less": self.passes_less,
             "transitions": transitions,
             "cases": [one.to_record() for one in self.cases if one.change is not Change.BOTH],
-            "regions": {level_name(level): to_plain(of) for level, of in self.regions.items()},
         }
 
 
@@ -406,8 +366,8 @@ def compare(runs: Sequence[Run]) -> Comparison:
         versions=tuple(versions),
         steps=tuple(_step(versions, number) for number in range(1, len(versions))),
         source=(
-            "each campaign has the cases of its own search: where they share none, regions are a "
-            "hint, and `merge-sumo rerun` pairs the cases of one with another VUT"
+            "each campaign has the cases of its own search; `merge-sumo rerun` pairs the cases of "
+            "one with another VUT"
         ),
         notes=tuple(notes),
         page_command=command("compare", *(run.folder for run in runs), out=free(PAGE)),
@@ -462,20 +422,19 @@ def _step(versions: Sequence[Version], after: int) -> Step:
     """Return the changes to the version with an index from the one before it."""
     earlier, later = versions[after - 1], versions[after]
     cases = paired(earlier.outcomes, later.outcomes, later.tolerated)
+    step = Step(after, after + 1, cases)
+    if earlier.sampler != later.sampler:
+        return step
     shared = Counter(case.a.case.level for case in cases)
     before, now = _by_level(earlier), _by_level(later)
-    step = Step(after, after + 1, cases, {})
     own_before: list[Outcome] = []
-    own_after: list[Outcome] = []
-    for level in sorted(before.keys() & now.keys()):
-        sides = before[level], now[level]
-        if shared[level] < max(map(len, sides)):
-            step.regions[level] = _regions(after, *sides)
+    own_now: list[Outcome] = []
+    for level in before.keys() & now.keys():
+        # The shares of a level decide where a version has cases of its own.
+        if shared[level] < max(len(before[level]), len(now[level])):
             own_before += before[level]
-            own_after += now[level]
-    if step.regions and earlier.sampler == later.sampler:
-        step = with_shares(step, own_before, own_after)
-    return step
+            own_now += now[level]
+    return with_shares(step, own_before, own_now) if own_now else step
 
 
 def _by_level(version: Version) -> dict[int, list[Outcome]]:
@@ -498,54 +457,3 @@ def with_shares(step: Step, earlier: Sequence[Outcome], later: Sequence[Outcome]
     chance = fisher((passed_a, len(earlier)), (passed_b, len(later)))
     is_less = passed_b * len(earlier) < passed_a * len(later)
     return replace(step, chance=chance, passes_less=is_less and chance <= SIGNIFICANT)
-
-
-def _regions(number: int, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> list[Region]:
-    """Return the regions of two versions at a level; `number` is that of the earlier one."""
-    found = _regions_of(number, earlier, later, Change.EARLIER_ALONE)
-    for region in _regions_of(number + 1, later, earlier, Change.LATER_ALONE):
-        # Where both fail the region is listed once, as one of the earlier version.
-        if not region.failed:
-            found.append(region)
-    return sorted(found, key=lambda one: (ORDER.index(one.change), -one.fmc, one.worst))
-
-
-def _regions_of(
-    number: int, outcomes: Sequence[Outcome], others: Sequence[Outcome], alone: Change
-) -> list[Region]:
-    """Return the regions of failures of a version.
-
-    Args:
-        number: number of the version.
-        outcomes: its outcomes at a level.
-        others: outcomes of the other version.
-        alone: the change of a region in which the other version's cases pass.
-    """
-    level = outcomes[0].case.level
-    regions: dict[int, list[Outcome]] = {}
-    failing = failures(outcomes)
-    region_of = regions_of(failing)
-    for outcome in failing:
-        regions.setdefault(region_of[outcome.index], []).append(outcome)
-    tested = [outcome for outcome in others if outcome.is_tested]
-    places = to_unit((outcome.case for outcome in tested), level)
-    found = []
-    for own in regions.values():
-        points = to_unit((outcome.case for outcome in own), level)
-        distances = cKDTree(points).query(places)[0] if tested else np.empty(0)
-        is_near = distances <= radius_for(points.shape[1]) + 1e-9
-        failed = [outcome.failed for outcome, near in zip(tested, is_near, strict=True) if near]
-        change = alone if failed else Change.NOT_SEEN
-        found.append(
-            Region(
-                change=Change.NEITHER if any(failed) else change,
-                version=number,
-                failures=len(own),
-                worst=own[0].index,
-                where=described(own[0].case),
-                fmc=fmc(points),
-                cases=len(failed),
-                failed=sum(failed),
-            )
-        )
-    return found

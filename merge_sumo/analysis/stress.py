@@ -1,9 +1,7 @@
-"""Which verdicts of a campaign hang by a thread: its cases run again, each time a little otherwise.
+"""Sensitivity of verdicts to small changes of the simulation.
 
-Every rung of the ladder (`RUNGS`) is a change of the plan or of the cases: one thing that the
-simulation leaves out or simplifies. The recorded cases run again with each. A failure is robust
-where it fails on every rung; a verdict flips where a case that failed passes, or the other way
-round, or has no verdict any more.
+The cases of a campaign run again on each rung of a ladder: with one change of the plan or of the
+cases. A failure is robust where it fails on every rung.
 """
 
 from __future__ import annotations
@@ -26,8 +24,6 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COORDINATES, DT_S
 from merge_sumo.simulation.plan import SimulationPlan
 
-LISTED = 10
-"""Failures that are not robust that a sentence names."""
 Index = Annotated[int, Meta(ge=0)]
 """The index of a case in its campaign."""
 
@@ -47,12 +43,12 @@ class Flips(Record, frozen=True):
 
 
 class Rung(Record, frozen=True):
-    """What became of the cases on one rung.
+    """The results of the cases on one rung.
 
     Attributes:
         name: short name, as "lag-0.2".
-        about: what is changed, in a phrase.
-        source: where its number is from; empty for none.
+        about: the change, in a phrase.
+        source: source of its number; empty for none.
         runs: the verdicts that flip, by run: several where the change is drawn at random.
         skipped: why it was not run, in a clause; empty where it was.
     """
@@ -64,10 +60,11 @@ class Rung(Record, frozen=True):
     skipped: str = ""
 
     @property
-    def counts(self) -> list[int]:
+    def counts(self) -> tuple[int, int, int]:
         """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
-        kinds = ([run.passes, run.fails, run.without_verdict] for run in self.runs)
-        return [sum(map(len, of)) for of in zip(*kinds, strict=True)]
+        passes = sum(len(run.passes) for run in self.runs)
+        fails = sum(len(run.fails) for run in self.runs)
+        return passes, fails, sum(len(run.without_verdict) for run in self.runs)
 
     @property
     def flips(self) -> int:
@@ -76,12 +73,16 @@ class Rung(Record, frozen=True):
 
 
 class StressResult(Result, Record, frozen=True):
-    """What a stress test of a campaign found.
+    """The results of a stress test of a campaign.
+
+    Example:
+        found = ms.stress("runs/latest")
+        print(found.robust)
 
     Attributes:
         cases: recorded cases with a verdict: those that ran again.
         failures: indices of those that had failed, the worst first.
-        rungs: what became of them on each rung.
+        rungs: the results on each rung.
         vut: name of the VUT.
     """
 
@@ -104,8 +105,10 @@ class StressResult(Result, Record, frozen=True):
 
     def passes_in(self, index: int) -> int:
         """Return in how many runs of all rungs a failure does not fail."""
-        runs = (run for rung in self.rungs for run in rung.runs)
-        return sum(index in (*run.passes, *run.without_verdict) for run in runs)
+        count = 0
+        for rung in self.rungs:
+            count += sum(index in (*run.passes, *run.without_verdict) for run in rung.runs)
+        return count
 
     def share(self, rung: Rung) -> float:
         """Return the share of verdicts that flip on a rung."""
@@ -123,7 +126,7 @@ ERROR_V_MPS = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
 ERRORS_BY_UNIT = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
 OF_VUT = {"v_vut0_mps", *COORDINATES}
-"""Coordinates that are no state of another car."""
+"""Coordinates that do not belong to another car."""
 CAR_LENGTH_M = 5.0
 DRAWS = 5
 """Times that all cases run where a change is drawn at random, with the seed of the case."""
@@ -135,12 +138,12 @@ class Disturbance:
 
     Attributes:
         name: short name.
-        about: what is changed, in a phrase.
-        source: where its number is from.
-        plan: returns the plan of the rung by that of the campaign; raises `UserError` where it
-            cannot be.
-        case: returns a case of the rung by one of the campaign, and what draws at random; None for
-            the same coordinates.
+        about: the change, in a phrase.
+        source: source of its number.
+        plan: returns the plan of the rung by that of the campaign; raises `UserError` where the
+            rung cannot run.
+        case: returns a case of the rung by one of the campaign and a random generator; None for the
+            same coordinates.
     """
 
     name: str
@@ -185,9 +188,10 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
     return replace(case, **values)
 
 
-NOTHING = Disturbance("nothing", "nothing is changed")
+UNCHANGED = "nothing"
+LAG_SOURCE = "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)"
 RUNGS = (
-    NOTHING,
+    Disturbance(UNCHANGED, "nothing is changed"),
     Disturbance(
         "step",
         f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
@@ -197,7 +201,7 @@ RUNGS = (
         Disturbance(
             f"lag-{lag_s:g}",
             f"the acceleration of the VUT lags by {lag_s:g} s",
-            "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)",
+            LAG_SOURCE,
             partial(_with_actuator, lag_s=lag_s),
         )
         for lag_s in LAGS_S
@@ -225,9 +229,10 @@ RUNS = sum(one.draws for one in RUNGS)
 
 
 def stress(study: RunStudy) -> StressResult:
-    """Run the cases of a campaign on every rung, and write what becomes of them into its folder.
+    """Run the cases of a campaign on every rung, and write the results into its folder.
 
-    Raises `UserError` for a campaign without a verdict, or with a net or POVs of another day.
+    Raises:
+        UserError: for a campaign without a verdict, or with another net or other POVs.
     """
     study.check_same_system()
     run = study.run
@@ -241,36 +246,40 @@ def stress(study: RunStudy) -> StressResult:
     return found
 
 
-def verdict_of(episode: Episode) -> Outcome:
+def outcome_of(episode: Episode) -> Outcome:
     """Return the outcome of a case."""
     return episode.outcome
 
 
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
-    """Run all cases with a change; one that cannot be is skipped with its reason."""
+    """Run all cases with a change; a rung that cannot run is skipped with its reason."""
     flips: list[Flips] = []
-    skipped = ""
     try:
         plan = one.plan(study.plan.for_cases(len(tested)))
         for draw in range(one.draws):
-            cases = [replace(outcome.case, scenario=plan.scenario) for outcome in tested]
-            if one.case is not None:
-                cases = [one.case(c, np.random.default_rng([draw, c.seed])) for c in cases]
-            flips.append(flips_of(tested, study.simulate(plan, cases, verdict_of)))
+            cases = []
+            for outcome in tested:
+                case = replace(outcome.case, scenario=plan.scenario)
+                if one.case is not None:
+                    case = one.case(case, np.random.default_rng([draw, case.seed]))
+                cases.append(case)
+            flips.append(flips_of(tested, study.simulate(plan, cases, outcome_of)))
     except UserError as error:
-        if one is NOTHING:
+        if one.name == UNCHANGED:
             raise
         study.on_cases((one.draws - len(flips)) * len(tested))
-        flips, skipped = [], str(error)
-    return Rung(one.name, one.about, one.source, tuple(flips), skipped)
+        return Rung(one.name, one.about, one.source, skipped=str(error))
+    return Rung(one.name, one.about, one.source, tuple(flips))
 
 
-def flips_of(tested: Sequence[Outcome], found: Sequence[Outcome]) -> Flips:
-    """Return which verdicts flip, by those of a run of the same cases."""
-    pairs = list(zip(tested, found, strict=True))
-    flipped = [o for o, now in pairs if now.is_tested and now.failed != o.failed]
-    return Flips(
-        passes=tuple(o.index for o in flipped if o.failed),
-        fails=tuple(o.index for o in flipped if not o.failed),
-        without_verdict=tuple(o.index for o, now in pairs if not now.is_tested),
-    )
+def flips_of(tested: Sequence[Outcome], again: Sequence[Outcome]) -> Flips:
+    """Return the verdicts that flip in another run of the same cases."""
+    passes, fails, without_verdict = [], [], []
+    for before, now in zip(tested, again, strict=True):
+        if not now.is_tested:
+            without_verdict.append(before.index)
+        elif before.failed and not now.failed:
+            passes.append(before.index)
+        elif now.failed and not before.failed:
+            fails.append(before.index)
+    return Flips(tuple(passes), tuple(fails), tuple(without_verdict))

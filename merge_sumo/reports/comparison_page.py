@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against, cut
+from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against
 from merge_sumo.campaigns.run import AGAINST, Run
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
@@ -19,8 +19,6 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
 SHOWN = 200
 """Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
-REGIONS = 20
-"""Regions of a level that are listed."""
 DRAWN = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
     *(Change.STILL_CONTACT, Change.FIXED),
@@ -60,8 +58,6 @@ def comparison_page(compared: Comparison) -> str:
         change_in_words=change_in_words,
         steps=steps,
         vehicles=vehicles,
-        most=REGIONS,
-        cut=cut,
     )
 
 

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -156,7 +155,7 @@ def change_in_words(case: ComparedCase) -> str:
 
 
 def step_headline(step: Step) -> str:
-    """Return the numbers of a step in a sentence: cases and regions by what changed."""
+    """Return the numbers of a step in a sentence: cases by their change."""
     parts = []
     if step.passes_less:
         by = f"by Fisher's exact test p = {step.chance:.2g}"
@@ -167,10 +166,6 @@ def step_headline(step: Step) -> str:
         parts.append(f"of {counted(len(step.cases), 'shared case')} {numbers}")
     else:
         parts.append("no case is shared")
-    if step.regions:
-        number = Counter(region.change for found in step.regions.values() for region in found)
-        shown = [f"{number[change]} {change}" for change in Change if number[change]]
-        parts.append(f"regions of failures: {', '.join(shown) or 'none'}")
     return "; ".join(parts)
 
 

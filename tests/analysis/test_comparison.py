@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 from support.handmade import drive
 
-from merge_sumo.analysis.comparison import Change, ComparedCase, Region, compare
+from merge_sumo.analysis.comparison import Change, ComparedCase, compare
 from merge_sumo.analysis.rerun import rerun
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.journal import Journal
@@ -34,7 +33,6 @@ from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
-BALL = math.pi * 0.05**2
 CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 Point = tuple[float, float, str]
 
@@ -77,13 +75,6 @@ def test_what_became_of_a_case(before, after, change, words):
     assert (one.change, change_in_words(one)) == (change, words)
 
 
-@pytest.fixture(scope="module")
-def fixed(tmp_path_factory) -> Run:
-    """Return a campaign of a VUT that does not fail at level 0: design2."""
-    settings = campaign_settings(vut="design2", cases=60, batch=20, seed=1)
-    return run_campaign(settings, tmp_path_factory.mktemp("fixed") / "run")
-
-
 def changed(folder, run, **settings) -> Run:
     """Return a copy of a run with other settings."""
     folder.mkdir()
@@ -121,7 +112,6 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
         (Change.FIXED, 1, 0),
         (Change.BOTH, 0, 2),
     ]
-    assert step.regions == {}, "no case is one campaign's alone"
     assert (found.broke, found.worse) == (1, True)
     assert sum(step.transitions.values()) == 3
     # The table of transitions stands before any list of cases.
@@ -129,51 +119,25 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
     assert lines.index("from 1 to 2: 3 cases with both") < lines.index("broke, 1:")
 
 
-class TestARegion:
-    def regions(self, *runs: Run) -> list[Region]:
-        return [one for step in compare(runs).steps for one in step.regions.get(0, [])]
-
-    def test_is_the_earlier_ones_where_the_later_one_tested_cases_and_none_failed(self, tmp_path):
-        a = write(tmp_path / "a", (0.5, 0.5, "fails"))
-        b = write(tmp_path / "b", (0.5, 0.54, "passes"))
-        (region,) = self.regions(a, b)
-        assert (region.change, region.version) == (Change.EARLIER_ALONE, 1)
-        assert (region.cases, region.failed) == (1, 0)
-        assert region.fmc == pytest.approx(BALL, rel=1e-6)
-        assert not compare([a, b]).worse
-
-    def test_of_a_version_that_passes_less_often_than_chance_explains_decides(self, call, tmp_path):
-        """The pairs are alike here: what each search found must be said first, and decide."""
-        shared = [(0.1, y / 9.0, "passes") for y in range(8)]
-        own = [(0.9, y / 9.0) for y in range(8)]
-        a = write(tmp_path / "a", *shared, *((x, y + 0.02, "passes") for x, y in own))
-        b = write(tmp_path / "b", *shared, *((x, y, "fails") for x, y in own))
-        files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
-        said = call("compare", a.folder, b.folder, *files)
-        first = said.out.splitlines()[0]
-        assert first.startswith("0 failures in 16 cases -> 8 failures (0 contacts) in 16 cases; ")
-        assert "2 passes less often than 1, by Fisher's exact test p = 0.0024" in first
-        assert "of 8 shared cases 0 broke, 8 pass with both" in first
-        assert said.code == 1
-        assert "Version 2 passes in a smaller share" in (tmp_path / "page.html").read_text()
-        assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "1"
-        found = compare([a, b]).to_record()
-        assert (found["worse"], found["steps"][0]["passes_less"]) == (True, True)
-        assert not compare([b, a]).worse, "it passes more often"
-        other = changed(tmp_path / "other", b, sampler="uniform")
-        assert not compare([a, other]).worse, "another sampler finds other shares in one version"
-
-    @pytest.mark.parametrize(
-        ("points", "change"),
-        [
-            ([(0.5, 0.54, "fails"), (0.52, 0.5, "passes")], Change.NEITHER),
-            ([(0.9, 0.9, "passes")], Change.NOT_SEEN),
-            ([(0.5, 0.54, "errs"), (0.9, 0.9, "passes")], Change.NOT_SEEN),
-        ],
-    )
-    def test_is_neither_where_a_case_fails_or_none_has_a_verdict(self, tmp_path, points, change):
-        a, b = write(tmp_path / "a", (0.5, 0.5, "fails")), write(tmp_path / "b", *points)
-        assert [region.change for region in self.regions(a, b)] == [change]
+def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tmp_path):
+    shared = [(0.1, y / 9.0, "passes") for y in range(8)]
+    own = [(0.9, y / 9.0) for y in range(8)]
+    a = write(tmp_path / "a", *shared, *((x, y + 0.02, "passes") for x, y in own))
+    b = write(tmp_path / "b", *shared, *((x, y, "fails") for x, y in own))
+    files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
+    said = call("compare", a.folder, b.folder, *files)
+    first = said.out.splitlines()[0]
+    assert first.startswith("0 failures in 16 cases -> 8 failures (0 contacts) in 16 cases; ")
+    assert "2 passes less often than 1, by Fisher's exact test p = 0.0024" in first
+    assert "of 8 shared cases 0 broke, 8 pass with both" in first
+    assert said.code == 1
+    assert "Version 2 passes in a smaller share" in (tmp_path / "page.html").read_text()
+    assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "1"
+    found = compare([a, b]).to_record()
+    assert (found["worse"], found["steps"][0]["passes_less"]) == (True, True)
+    assert not compare([b, a]).worse, "it passes more often"
+    other = changed(tmp_path / "other", b, sampler="uniform")
+    assert not compare([a, other]).worse, "another sampler finds other shares in one version"
 
 
 def test_three_versions_are_two_steps(tmp_path):
