@@ -1,14 +1,13 @@
-"""What counts as a failure: a criterion that is named, or a condition on the measures of a case.
+"""The failure criterion: a named criterion, or a condition on the measures of a case.
 
-A criterion gives every case a margin: below 0 it fails, above 0 it does not, and how far from 0
-is said in units of the thresholds (`expression.py`), or, under the criterion of the paper, in
-units of lambda.
+Every case has a margin, below 0 for a failure, in units of the thresholds (`expression.py`), or of
+lambda under the criterion of the paper.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -63,28 +62,35 @@ TEXTS = {
     "merged_first": frozenset({"VUT", "POV"}),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
-"""What may be said of measures that are texts. Errors have no verdict under any criterion."""
+"""Values of measures that are texts. Errors have no verdict under any criterion."""
 NO_TEXT = frozenset({"merged_first", "severity"})
-"""Texts that an episode may be without; they count as an empty one."""
+"""Measures that are texts, and that an episode may lack."""
 CLOSE: dict[str, Value] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
-"""What it counts as where |dx| < 6 m: no braking would do, and there was no way out at any time."""
+"""Values where |dx| < 6 m: no braking is enough, and there was no way out at any time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Criterion:
-    """What counts as a failure; `UserError` for what is no criterion.
+    """The failure criterion of a campaign.
 
     Attributes:
         fail_when: the name of a criterion, or a condition over measures, as Python writes it.
-        require: what is to hold over time instead, in signal temporal logic (`temporal.py`); the
-            margin is then its robustness.
+        require: a formula of signal temporal logic instead (`temporal.py`), which has to hold; its
+            robustness is the margin.
+
+    Raises:
+        UserError: the text is not a criterion.
+
+    Example:
+        >>> criterion = Criterion("ttc_s < 1.5")
+        >>> criterion.outcome(0, 0, trajectory).failed
     """
 
     fail_when: str = PAPER
     require: str | None = None
 
     def __post_init__(self) -> None:
-        """Check the condition; however it is spaced, it is the same."""
+        """Check the condition, and write it as Python would."""
         name = self.fail_when.strip()
         if name not in CRITERIA:
             if name.isidentifier() and (near := nearest(name, CRITERIA)):
@@ -97,16 +103,12 @@ class Criterion:
             object.__setattr__(self, "require", check_formula(self.require))
 
     def check(self, scenario: Scenario) -> None:
-        """Raise `UserError` where it speaks of what an episode of a scenario does not have.
-
-        Also where it is no formula, or what evaluates one is missing.
-        """
+        """Raise `UserError` where a scenario lacks a measure, or no formula can be evaluated."""
         if self.require is not None:
             try_formula(self.require)
             return
-        spoken = condition_of(self.words).names
         recorded = measures_in(scenario)
-        for name in sorted(spoken - recorded.keys()):
+        for name in sorted(condition_of(self.words).names - recorded.keys()):
             if MEASURES[name].only_with == FOLLOW_UP:
                 raise UserError(
                     f"`fail_when` speaks of {name}, which is measured "
@@ -172,9 +174,11 @@ class Criterion:
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
     def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
-        """Return the outcome of an episode of no campaign, for its verdict alone.
+        """Return the outcome of an episode outside of campaigns, with the measures it needs.
 
-        It takes no more measures than the criterion speaks of.
+        Args:
+            trajectory: the motion.
+            lines: centre lines of the road.
         """
         measures = Measures(trajectory, lines)
         margin = self.margin(trajectory, measures)
@@ -213,22 +217,25 @@ def condition_of(text: str) -> Condition:
 
 
 def vocabulary() -> Vocabulary:
-    """Return what a condition may speak of: None for a number, or all that a text may be."""
-    numbers = (name for name, one in known_measures().items() if one.missing is not None)
-    return {**dict.fromkeys(numbers), **TEXTS}
+    """Return the values that may be in a condition: None for a number, or the possible texts."""
+    known: dict[str, Set[str] | None] = {}
+    for name, one in known_measures().items():
+        if one.missing is not None:
+            known[name] = None
+    return known | TEXTS
 
 
 def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[str, Value]:
-    """Return what an expression may speak of, by name; the vocabulary says which are numbers."""
+    """Return the values for a condition by name; by default all of the vocabulary."""
     missing: dict[str, Value] = dict(CLOSE) if measures.is_close else {}
     if measures.end is End.MERGED:
         missing["brake_after_mps2"] = math.inf
     if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
         missing["after_drac_mps2"] = math.inf
-    values, known = dict[str, Value](), known_measures()
+    values: dict[str, Value] = {}
     for name in vocabulary() if names is None else names:
         value = measures.value(name)
         if value is None:
-            value = missing.get(name, "" if name in NO_TEXT else known[name].missing)
+            value = missing.get(name, "" if name in NO_TEXT else known_measures()[name].missing)
         values[name] = value if isinstance(value, str) else float(value or 0.0)
     return values

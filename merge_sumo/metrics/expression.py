@@ -1,11 +1,10 @@
-"""Conditions over named values: parsed without running anything, and how far from being met.
+"""Conditions over named values: parsed without running anything, with a margin.
 
-A condition is made of comparisons with `and`, `or`, `not` and brackets, as Python writes them:
-`ttc_s < 1.5 or drac_mps2 > 4 or end == "TIMEOUT"`. Its margin is the robustness of Fainekos and
-Pappas (2009), seen from the other side: below 0 where the condition is met and above where it is
-not. That of a comparison is the distance to its threshold in units of the threshold (of 1 where
-that is 0, or where two values are compared), that of two texts 1; `and` is the largest of its
-parts, `or` the smallest, and `not` turns the sign.
+A condition has comparisons with `and`, `or`, `not` and brackets, as in Python:
+`ttc_s < 1.5 or drac_mps2 > 4 or end == "TIMEOUT"`. Its margin is the negative robustness of
+Fainekos and Pappas (2009): below 0 where the condition is met. That of a comparison is the distance
+to its threshold in units of the threshold (of 1 for a threshold of 0, and for two values), that of
+two texts 1; `and` is the largest of its parts, `or` the smallest, and `not` changes the sign.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ import ast
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 from merge_sumo.errors import UserError
@@ -27,54 +26,57 @@ MOST_MARGIN = 100.0
 LEAST_MARGIN = 1e-9
 """Margins are finite and never 0, so that their sign says whether a condition is met."""
 MOST_CHARACTERS = 1000
-"""Of an expression: what a parser that is not ours may be given."""
-MOST_WRITTEN = 20 * MOST_CHARACTERS
-"""Of one as Python writes it, with its spaces, brackets and digits: records have it so."""
+"""Of an expression, as typed and as Python writes it."""
 
 Vocabulary = Mapping[str, Set[str] | None]
-"""The values that there are by name: the texts that one may have, None for a number."""
+"""The known values by name: the possible texts, or None for a number."""
 OTHER_SIGNS = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
 """Signs of other languages."""
 
 
 class Condition(NamedTuple):
-    """A condition: how far values are from meeting it, and the values that it speaks of."""
+    """A condition: its margin for values by name, and the names in it."""
 
     margin: Callable[[Mapping[str, Value]], float]
     names: frozenset[str]
 
 
 def parse_condition(
-    text: str, vocabulary: Vocabulary, what: str, named: Mapping[str, str] | None = None
+    text: str, vocabulary: Vocabulary, option: str, named: Mapping[str, str] | None = None
 ) -> tuple[Condition, str]:
-    """Return the condition that a text states, and the text as Python would write it.
+    """Return the condition of a text, and the text as Python would write it.
 
     Args:
         text: the condition as the user wrote it.
-        vocabulary: the values that it may speak of.
-        what: where it stands, which begins every complaint.
-        named: conditions that it may name, by their names.
+        vocabulary: the values that may be in it.
+        option: name of the option, for messages.
+        named: other conditions that may be in it, by name.
 
-    Raises `UserError` where it is none.
+    Raises:
+        UserError: the text is not a condition.
     """
     shown = printable(text[:80]) + ("..." if len(text) > 80 else "")
-    too_long = UserError(f"{what} has {len(text)} characters: {MOST_CHARACTERS} are the most")
-    if len(text) > MOST_WRITTEN:
-        raise too_long
+    what = f"{option} {shown!r}"
     try:
+        _check_length(text, option)
         with warnings.catch_warnings(action="ignore"):  # "1.5or" is odd, and means what it says
             tree = ast.parse(text.lstrip(), mode="eval").body
         written = ast.unparse(tree)
-        if len(text) > MOST_CHARACTERS and text != written:
-            raise too_long
-        return _Parser(vocabulary, f"{what} {shown!r}", named or {}).condition(tree), written
+        _check_length(written, option)
+        return _Parser(vocabulary, what, named or {}).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         sign = OTHER_SIGNS.search(text)
         hint = f": write and, or, not, == or < instead of {sign[0]}" if sign else ""
         raise UserError(
-            f"{what} {shown!r} is no expression over measures such as "
+            f"{what} is not an expression over measures such as "
             f"'ttc_s < 1.5 or end == \"TIMEOUT\"'{hint}"
         ) from error
+
+
+def _check_length(text: str, option: str) -> None:
+    if len(text) > MOST_CHARACTERS:
+        most = f"{MOST_CHARACTERS} are the most"
+        raise UserError(f"{option} has {len(text)} characters: {most}")
 
 
 class _Parser:
@@ -85,35 +87,38 @@ class _Parser:
         """Return the condition of a part of the tree."""
         match node:
             case ast.BoolOp(op=sign, values=parts):
-                return _joined(map(self.condition, parts), every=isinstance(sign, ast.And))
+                return _joined(list(map(self.condition, parts)), every=isinstance(sign, ast.And))
             case ast.UnaryOp(op=ast.Not(), operand=of):
                 return _negated(self.condition(of))
-            case ast.Compare(left=first, ops=signs, comparators=others):
-                pairs = zip((first, *others), signs, others, strict=False)
-                return _joined((self._comparison(*pair) for pair in pairs), every=True)
+            case ast.Compare(left=left, ops=signs, comparators=sides):
+                comparisons = []
+                for comparison, right in zip(signs, sides, strict=True):
+                    comparisons.append(self._comparison(left, comparison, right))
+                    left = right
+                return _joined(comparisons, every=True)
             case ast.Name(id=name) if name in self._named:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name in self._vocabulary:
                 raise self._error(f"{name} stands alone: compare it with something")
             case ast.Name(id=name):
                 raise self._unknown(name)
-        raise self._error(
-            f"{_shown(node)} is no condition: write comparisons, and, or, not and brackets"
-        )
+        shown = printable(ast.unparse(node)[:60])
+        raise self._error(f"{shown} is not a condition: write comparisons, and, or, not, brackets")
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
         left, right = self._side(first, second), self._side(second, first)
-        texts = [side.value for side in (left, right) if isinstance(side, ast.Constant)]
         names = [side for side in (left, right) if isinstance(side, str)]
+        texts = [side.value for side in (left, right) if isinstance(side, ast.Constant)]
         if texts or any(self._vocabulary[name] for name in names):
             return self._equality(sign, names, texts)
         if not names:
             raise self._error("a comparison of two numbers says nothing of a case")
-        if isinstance(sign, ast.Gt | ast.GtE):
-            left, right = right, left
-        elif not isinstance(sign, ast.Lt | ast.LtE):
-            raise self._error("compare numbers with <, <=, > or >=")
-        return _inequality(left, right, or_equal=isinstance(sign, ast.LtE | ast.GtE))
+        match sign:
+            case ast.Lt() | ast.LtE():
+                return _inequality(left, right, or_equal=isinstance(sign, ast.LtE))
+            case ast.Gt() | ast.GtE():
+                return _inequality(right, left, or_equal=isinstance(sign, ast.GtE))
+        raise self._error("compare numbers with <, <=, > or >=")
 
     def _equality(self, sign: ast.cmpop, names: list[str], texts: list[Any]) -> Condition:
         choices = self._vocabulary[names[0]] if len(texts) == len(names) == 1 else None
@@ -123,10 +128,9 @@ class _Parser:
         if not isinstance(sign, ast.Eq | ast.NotEq):
             raise self._error(f"{name} is a text: compare it with == or !=")
         if text not in choices:
-            raise self._error(
-                f"{name} is never {text!r}: {meant(text, sorted(choices))}it is "
-                f"{either(sorted(choices))}"
-            )
+            known = sorted(choices)
+            hint = f"{meant(text, known)}it is {either(known)}"
+            raise self._error(f"{name} is never {text!r}: {hint}")
         met = Condition(lambda values: -1.0 if values[name] == text else 1.0, frozenset({name}))
         return met if isinstance(sign, ast.Eq) else _negated(met)
 
@@ -135,29 +139,26 @@ class _Parser:
         match node:
             case ast.Name(id=name) if name in self._vocabulary:
                 return name
-            case ast.Name(id=name) if name in self._named:
-                raise self._error(
-                    f"{name} is a criterion, which is met or not: write it alone, or compare a "
-                    "measure"
-                )
             case ast.Name(id=name):
                 texts = self._vocabulary.get(other.id) if isinstance(other, ast.Name) else None
                 if near := nearest(name, sorted(texts or ())):
-                    raise self._error(f'a text is to be in quotes: {_shown(other)} == "{near[0]}"')
+                    raise self._error(
+                        f'write the text in quotes: {ast.unparse(other)} == "{near[0]}"'
+                    )
                 raise self._unknown(name)
             case ast.Constant(value=str()):
                 return node
             case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
-                return self._finite(number)
-            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as number)):
-                return self._finite(-number)
-        raise self._error(f"{_shown(node)} is neither a measure nor a number nor a text")
-
-    def _finite(self, number: float) -> float:
-        # An integer may be too large for a float.
-        if abs(number) > sys.float_info.max:
-            raise self._error("a number is to be finite")
-        return float(number)
+                # An integer may be too large for a float.
+                if number > sys.float_info.max:
+                    raise self._error("a number is to be finite")
+                return float(number)
+            case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as constant):
+                number = self._side(constant, other)
+                if isinstance(number, float):
+                    return -number
+        shown = printable(ast.unparse(node)[:60])
+        raise self._error(f"{shown} is neither a measure nor a number nor a text")
 
     def _unknown(self, name: str) -> UserError:
         hint = meant(name, (*self._vocabulary, *self._named))
@@ -170,34 +171,30 @@ class _Parser:
 
 def _inequality(left: str | float, right: str | float, *, or_equal: bool) -> Condition:
     """Return whether one side is below the other, or as large where `or_equal`."""
-    fixed = [abs(side) for side in (left, right) if not isinstance(side, str)]
-    unit = (fixed and fixed[0]) or 1.0
+    unit, names = 1.0, set[str]()
+    for side in (left, right):
+        if isinstance(side, str):
+            names.add(side)
+        else:
+            unit = abs(side) or 1.0
 
     def margin(values: Mapping[str, Value]) -> float:
-        low, high = (
-            float(values[side]) if isinstance(side, str) else side for side in (left, right)
-        )
-        met = low <= high if or_equal else low < high
+        low = float(values[left]) if isinstance(left, str) else left
+        high = float(values[right]) if isinstance(right, str) else right
+        is_met = low <= high if or_equal else low < high
         away = 0.0 if low == high else (low - high) / unit
         size = min(max(abs(away), LEAST_MARGIN), MOST_MARGIN)
-        return -size if met else size
+        return -size if is_met else size
 
-    return Condition(margin, frozenset(side for side in (left, right) if isinstance(side, str)))
+    return Condition(margin, frozenset(names))
 
 
 def _negated(condition: Condition) -> Condition:
     return Condition(lambda values: -condition.margin(values), condition.names)
 
 
-def _joined(conditions: Iterable[Condition], *, every: bool) -> Condition:
+def _joined(parts: Sequence[Condition], *, every: bool) -> Condition:
     """Return whether every one of some conditions is met, or any."""
-    parts = list(conditions)
     worst = max if every else min
-    return Condition(
-        lambda values: worst(part.margin(values) for part in parts),
-        frozenset().union(*(part.names for part in parts)),
-    )
-
-
-def _shown(node: ast.expr) -> str:
-    return printable(ast.unparse(node)[:60])
+    names = frozenset[str]().union(*(part.names for part in parts))
+    return Condition(lambda values: worst(part.margin(values) for part in parts), names)

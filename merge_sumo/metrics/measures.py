@@ -1,7 +1,7 @@
-"""Measures of an episode. Each is one decorated function of `Measures`, or of an installed package.
+"""Measures of an episode: decorated functions of `Measures`, or of installed packages.
 
-The name of the function is that in records and conditions, with the unit at its end; its docstring
-says what it is. Records, `--fail-when`, listings, reports, exports and documentation follow.
+The function has the name of the measure in records and conditions, with the unit at its end, and
+its docstring is the definition. Records, `--fail-when`, reports, exports and documentation follow.
 
     from merge_sumo.metrics.measures import Measures, measure
 
@@ -62,10 +62,9 @@ class Measure(Generic[T]):
         label: name in the listing of an episode; empty where that leaves it out.
         column: name in the table of the report; empty where that leaves it out.
         digits: decimals in tables.
-        missing: what a condition takes where an episode has no value; None for a measure that is
-            no number.
+        missing: value in conditions where an episode has none; None for a text.
         worse: at which end of its values an episode is worse, if at one.
-        only_with: what a scenario has where the measure is recorded; empty for every scenario.
+        only_with: part of a scenario that the measure needs; empty for every scenario.
         default: value where nothing is recorded.
     """
 
@@ -97,20 +96,25 @@ class Measure(Generic[T]):
         return self  # type: ignore[return-value]
 
     def compute(self, episode: Measures) -> Any:
-        """Return the value in an episode; `UserError` where the function fails."""
-        is_own = self.name in OURS
-        if not is_own and episode.end.is_error:
-            return None
-        try:
+        """Return the value in an episode; None for an infinite one.
+
+        Raises:
+            UserError: the function of another package fails.
+        """
+        if self.name in OURS:
             value: Any = self.of(episode)
-            if not is_own and value is not None:
-                value = float(value)
-        except Exception as error:
-            last = extract_tb(error.__traceback__)[-1]
-            raise UserError(
-                f"the measure {self.name!r} failed in {last.filename}, line {last.lineno}: "
-                f"{type(error).__name__}: {error}"
-            ) from error
+        elif episode.end.is_error:
+            return None
+        else:
+            try:
+                value = self.of(episode)
+                value = None if value is None else float(value)
+            except Exception as error:
+                last = extract_tb(error.__traceback__)[-1]
+                raise UserError(
+                    f"the measure {self.name!r} failed in {last.filename}, line {last.lineno}: "
+                    f"{type(error).__name__}: {error}"
+                ) from error
         return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
@@ -133,22 +137,26 @@ def measure(
 
 
 class Measures:
-    """Named measures of one episode, with the verdict first.
+    """Named measures of one episode.
 
     dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, and
-    are None when the VUT never arrived. In traffic they are those of the car of the mainline that
-    is nearest to the VUT at the end: it takes the POV's place. What bodies do (severity, clearance,
-    bumper gap, braking after M, impact speed) is that of all cars.
+    are None when the VUT never arrived. In traffic they are of the car of the mainline that is
+    nearest to the VUT at the end. Severity, clearance, bumper gap, braking after M, and impact
+    speed are of all cars.
 
-    A measure is computed when it is read first, or by `compute_all`. Recorded ones have no
+    A measure is computed when it is first read, or by `compute_all`. Recorded measures have no
     trajectory.
 
     Attributes:
-        trajectory: what happened.
-        lines: centre lines of the road; without them bodies are looked at from M on.
+        trajectory: the motion of the episode.
+        lines: centre lines of the road; None for no clearance before M.
+        values: the values that are known, by name.
+
+    Example:
+        >>> measures = Measures.of(trajectory)
+        >>> measures.severity, measures.ttc_s
     """
 
-    __hash__ = None  # type: ignore[assignment]
     __slots__ = ("lines", "trajectory", "values")
 
     def __init__(
@@ -187,10 +195,7 @@ class Measures:
             return NotImplemented
         return all(self.value(name) == other.value(name) for name in known_measures())
 
-    def __repr__(self) -> str:
-        """Return the values that there are."""
-        known = {name: value for name, value in self.values.items() if value is not None}
-        return f"Measures({', '.join(f'{name}={value!r}' for name, value in known.items())})"
+    __hash__ = None  # type: ignore[assignment]
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the values: the episode goes on its own."""
@@ -544,7 +549,7 @@ class Measures:
 
 OURS = {name: one for name, one in vars(Measures).items() if isinstance(one, Measure)}
 RESERVED = frozenset({"index", "batch", "level", "draw", "margin", "foretold"})
-"""Names of a record that are no measures."""
+"""Other names of a record."""
 
 
 def _is_measure(item: object) -> bool:
@@ -575,29 +580,30 @@ def known_measures() -> dict[str, Measure[Any]]:
 
 def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
     """Return the measures that are recorded in a scenario, by name."""
-    there = {
-        "": True,
-        FOLLOW_UP: scenario.follow_up_s > 0.0,
-        LANE: scenario.lane_m is not None,
-        TRAFFIC: scenario.vehicles > 2,
-    }
-    return {name: one for name, one in known_measures().items() if there[one.only_with]}
+    parts = {""}
+    if scenario.follow_up_s > 0.0:
+        parts.add(FOLLOW_UP)
+    if scenario.lane_m is not None:
+        parts.add(LANE)
+    if scenario.vehicles > 2:
+        parts.add(TRAFFIC)
+    return {name: one for name, one in known_measures().items() if one.only_with in parts}
 
 
 def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
     """Return the measures of episodes of one scenario; those of bodies are computed together.
 
     Args:
-        trajectories: what happened.
-        lines: centre lines of the road; without them bodies are looked at from M on.
+        trajectories: the motions.
+        lines: centre lines of the road; None for no clearance before M.
     """
     measures = [Measures(trajectory, lines) for trajectory in trajectories]
     if lines is not None:
         closest_m = closest_before_m(trajectories, lines)
-        for of_episode, clearance_m in zip(measures, closest_m, strict=True):
-            if not of_episode.end.is_error:
+        for one, clearance_m in zip(measures, closest_m, strict=True):
+            if not one.end.is_error:
                 is_near = math.isfinite(clearance_m)
-                of_episode.values["before_clearance_m"] = clearance_m if is_near else None
+                one.values["before_clearance_m"] = clearance_m if is_near else None
     return measures
 
 
@@ -621,19 +627,15 @@ def _crossing_time_s(x_m: FloatArray, v_mps: FloatArray) -> float | None:
 
 def _post_encroachment_time(trajectory: Trajectory) -> float | None:
     """Return PET at M, or at the place of a merge from a lane, where the VUT may have stood."""
-    x_m, v_mps = (
-        trajectory.motion[:, trajectory.nearest, 0],
-        trajectory.motion[:, trajectory.nearest, 1],
-    )
-    x_m = x_m - place_of_merge_m(trajectory)
+    x_m, v_mps = trajectory.motion[:, trajectory.nearest, :2].T
+    t_pov = _crossing_time_s(x_m - place_of_merge_m(trajectory), v_mps)
+    if t_pov is None:
+        if v_mps[-1] <= 0.0:
+            return None
+        left_m = place_of_merge_m(trajectory) - float(x_m[-1])
+        t_pov = trajectory.t_end_s + left_m / float(v_mps[-1])
     t_vut: float | None = trajectory.t_end_s
     if trajectory.case.scenario.lane_m is None:
         t_vut = _crossing_time_s(trajectory.x_vut_m, trajectory.v_vut_mps)
-    t_pov = _crossing_time_s(x_m, v_mps)
-    if t_pov is None:
-        v_end = float(v_mps[-1])
-        if v_end <= 0.0:
-            return None
-        t_pov = trajectory.t_end_s - float(x_m[-1]) / v_end
     assert t_vut is not None, "only called once the VUT has arrived"  # noqa: S101
     return abs(t_pov - t_vut)

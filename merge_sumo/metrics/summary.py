@@ -1,13 +1,7 @@
-"""A campaign in numbers: its failures by level, what ran without a result, and its gates.
+"""Counts of a campaign: failures by level, cases without a verdict, and gates.
 
-A case is tested when the VUT reaches the merge point: there it fails or not. An error (of the
-VUT or of the simulation) and a timeout say nothing about merging, so they come first wherever a
-campaign is shown, and a campaign in which no case was tested has passed nothing.
-
-A controller that draws random numbers, or that is driven through noise, fails with a probability.
-Each run of a case is a case of its own with another draw (`Case.draw`), and an outcome of its own.
-A case fails where more than a tolerated share of its runs fail; with none tolerated, where any run
-does.
+A case is tested when the VUT reaches the merge point. Runs of a case with other draws are outcomes
+of their own; the case fails where more than a tolerated share of its runs fail.
 """
 
 from __future__ import annotations
@@ -18,7 +12,6 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from operator import itemgetter
 from typing import Any
 
 from scipy.special import betainc
@@ -33,10 +26,9 @@ from merge_sumo.scenario.scenario import US23, level_name
 from merge_sumo.scenario.trajectory import End
 
 CONFIDENCE = 0.95
-"""That the interval of a case holds its failure probability."""
+"""Of the interval of the failure probability of a case."""
 DOUBT = 0.05
-"""A case is decided where it fails in more than the tolerated share of its runs, or does not, with
-at most this posterior probability of the contrary."""
+"""Largest posterior probability of the contrary at which a failing case is decided."""
 MOST_RUNS = 20
 """Runs of a case after which it counts as decided."""
 
@@ -79,21 +71,13 @@ class RunsOfCase:
         return f"{self.failures} of {counted(self.runs, 'run')} fail{'s' * (self.failures == 1)}"
 
     def deciding(self, tolerated: float = 0.0) -> Outcome:
-        """Return the run that decides whether more than a tolerated share of the runs failed.
+        """Return the run that decides the case: it fails exactly where the case does.
 
-        Of the runs from the worst to the best it is the first one behind those that are tolerated:
-        it fails exactly where the case does.
+        Of the runs from the worst to the best it is the first one after the tolerated ones.
         """
         spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
         ordered = sorted(self.outcomes, key=lambda run: (run.margin or 0.0, run.index))
         return ordered[spared]
-
-    def interval(self, confidence: float = CONFIDENCE) -> tuple[float, float]:
-        """Return where the failure probability is with a confidence (Clopper and Pearson, 1934).
-
-        It holds for a number of runs that outcomes do not decide.
-        """
-        return clopper_pearson(self.failures, self.runs, confidence)
 
 
 def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
@@ -127,66 +111,45 @@ def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Ou
     known = list(outcomes)
     if not any(outcome.case.draw for outcome in known):
         return known
-    shown = [(one.outcomes[0].index, one.deciding(tolerated)) for one in by_case(known)]
-    errors = [(outcome.index, outcome) for outcome in known if outcome.margin is None]
-    return [outcome for _, outcome in sorted(shown + errors, key=itemgetter(0))]
+    shown = {case.outcomes[0].index: case.deciding(tolerated) for case in by_case(known)}
+    shown |= {outcome.index: outcome for outcome in known if outcome.margin is None}
+    return [shown[index] for index in sorted(shown)]
 
 
 def undecided(outcomes: Iterable[Outcome], tolerated: float) -> set[int]:
-    """Return the deciding runs, by index, of failing cases that ran too seldom to tell.
+    """Return the deciding runs, by index, of failing cases with too few runs to decide.
 
-    None where cases ran more than once and no two runs of one differ: chance decides on nothing.
+    None where cases ran more than once and no two runs of one differ: then there is no chance.
     """
     cases = by_case(outcomes) if tolerated else []
-    again = [one for one in cases if one.runs > 1]
-    if again and not any(one.varies for one in again):
+    repeated = [case for case in cases if case.runs > 1]
+    if repeated and not any(case.varies for case in repeated):
         return set()
-    return {
-        one.deciding(tolerated).index
-        for one in cases
-        if one.share > tolerated and runs_needed(one.failures, one.runs, tolerated)
-    }
+    found = set()
+    for case in cases:
+        if case.share > tolerated and not is_decided(case.failures, case.runs, tolerated):
+            found.add(case.deciding(tolerated).index)
+    return found
 
 
 @cache
 def is_decided(failures: int, runs: int, tolerated: float) -> bool:
-    """Return whether runs show if a case fails in more than a tolerated share of its runs.
+    """Return whether the runs of a failing case show that more than a share of all runs fail.
 
     By the posterior of Jeffreys' prior. The first failure is left out: by it the case was noticed.
-    With none tolerated a failure decides, and nothing else.
 
     Args:
-        failures: number of failing runs.
+        failures: number of failing runs, 1 or more.
         runs: number of runs.
-        tolerated: share of its runs in which a case may fail.
+        tolerated: share of its runs in which a case may fail, above 0.
     """
-    if not tolerated:
-        return failures > 0
-    further = max(failures - 1, 0)
-    below = float(betainc(further + 0.5, runs - failures + 0.5, tolerated))
-    return not DOUBT < below < 1.0 - DOUBT
-
-
-@cache
-def runs_needed(failures: int, runs: int, tolerated: float) -> int:
-    """Return how many further runs of a case decide at least; 0 from `MOST_RUNS` on.
-
-    Args:
-        failures: number of failing runs.
-        runs: number of runs.
-        tolerated: share of its runs in which a case may fail.
-    """
-    further = 0
-    while runs + further < MOST_RUNS:
-        ends = failures, failures + further
-        if any(is_decided(end, runs + further, tolerated) for end in ends):
-            break
-        further += 1
-    return further
+    if runs >= MOST_RUNS:
+        return True
+    return float(betainc(failures - 0.5, runs - failures + 0.5, tolerated)) <= DOUBT
 
 
 def check_tolerated(tolerated: float) -> None:
-    """Raise `UserError` for what is no share of runs that may fail."""
+    """Raise `UserError` where a tolerated share of failing runs is not from 0 to below 1."""
     if not 0.0 <= tolerated < 1.0:
         raise UserError(
             f"`tolerated` is {tolerated}: choose the share of its runs in which a case may fail, "
@@ -224,7 +187,7 @@ class LevelSummary:
         fmc: failure mode coverage of failing cases, undecided or not, in the level's unit cube;
             M(s, 0.05, -500) under the paper's criterion and in up to three coordinates.
         regions: groups of these that are linked at the radius of FMC.
-        undecided: failing cases that ran too seldom to tell: see `chance.undecided`.
+        undecided: failing cases with too few runs to decide.
     """
 
     cases: int
@@ -251,25 +214,25 @@ class Summary:
 def summarise(
     outcomes: Sequence[Outcome], levels: Sequence[int], tolerated: float = 0.0
 ) -> Summary:
-    """Return the summary of outcomes, at the given levels and where else there are any.
-
-    A case counts once, by the run that stands for it where a share of its runs is `tolerated`.
+    """Return the summary of outcomes; a case counts once, by its deciding run.
 
     Args:
         outcomes: outcomes of a campaign.
-        levels: levels to report, also without cases.
+        levels: levels to report, also without cases; others are added where they have cases.
         tolerated: share of its runs in which a case may fail.
     """
-    every = sorted({*levels, *(outcome.case.level for outcome in outcomes)})
     unsure = undecided(outcomes, tolerated)
-    outcomes = one_per_case(outcomes, tolerated)
-    ends = Counter(outcome.measures.end for outcome in outcomes)
+    cases = one_per_case(outcomes, tolerated)
+    ends = Counter(outcome.measures.end for outcome in cases)
+    by_level: dict[int, list[Outcome]] = {level: [] for level in levels}
+    for outcome in cases:
+        by_level.setdefault(outcome.case.level, []).append(outcome)
     return Summary(
-        cases=len(outcomes),
-        failures=sum(outcome.failed for outcome in outcomes) - len(unsure),
+        cases=len(cases),
+        failures=sum(outcome.failed for outcome in cases) - len(unsure),
         ends={end.value: ends[end] for end in End if ends[end]},
-        severities=_severities(outcomes),
-        levels={level: _level(outcomes, level, unsure) for level in every},
+        severities=_severities(cases),
+        levels={level: _level(by_level[level], level, unsure) for level in sorted(by_level)},
         undecided=len(unsure),
     )
 
@@ -281,17 +244,16 @@ def _severities(outcomes: Sequence[Outcome]) -> dict[str, int]:
 
 
 def _level(outcomes: Sequence[Outcome], level: int, unsure: set[int]) -> LevelSummary:
-    at_level = [outcome for outcome in outcomes if outcome.case.level == level]
-    unsure_here = sum(outcome.index in unsure for outcome in at_level)
-    points = to_unit((outcome.case for outcome in at_level if outcome.failed), level)
+    points = to_unit((outcome.case for outcome in outcomes if outcome.failed), level)
+    undecided_here = sum(outcome.index in unsure for outcome in outcomes)
     return LevelSummary(
-        cases=len(at_level),
-        tested=sum(outcome.is_tested for outcome in at_level),
-        failures=len(points) - unsure_here,
-        severities=_severities(at_level),
+        cases=len(outcomes),
+        tested=sum(outcome.is_tested for outcome in outcomes),
+        failures=len(points) - undecided_here,
+        severities=_severities(outcomes),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
-        undecided=unsure_here,
+        undecided=undecided_here,
     )
 
 
@@ -300,7 +262,7 @@ MESSAGE_CHARACTERS = 300
 MOST_MESSAGES = 5
 """Messages of errors and timeouts that are printed; the report has the others."""
 _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
-"""Measured values and addresses: messages that differ in them alone are one."""
+"""Measured values and addresses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,7 +292,7 @@ class Verdict:
     Attributes:
         cases: cases that ran.
         failures: cases that fail under the criterion, but for those that are undecided.
-        undecided: failing cases that ran too seldom to tell: see `chance.undecided`.
+        undecided: failing cases with too few runs to decide.
         contacts: failures in which bodies touch at or after the merge point.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
@@ -360,14 +322,19 @@ class Verdict:
 
     @property
     def found(self) -> list[str]:
-        """The numbers in words: errors and timeouts, where there are any, then failures."""
+        """The numbers in words: errors and timeouts, if there are any, then failures."""
         return self._found("")
 
-    def _found(self, of_failures: str) -> list[str]:
-        wrong = ((self.errors, "error"), (self.timeouts, "timeout"))
-        failures = counted(self.failures, "failure") + of_failures
-        unsure = [f"{self.undecided} undecided"] if self.undecided else []
-        return [*(counted(n, what) for n, what in wrong if n), failures, *unsure]
+    def _found(self, contacts: str) -> list[str]:
+        parts = []
+        if self.errors:
+            parts.append(counted(self.errors, "error"))
+        if self.timeouts:
+            parts.append(counted(self.timeouts, "timeout"))
+        parts.append(counted(self.failures, "failure") + contacts)
+        if self.undecided:
+            parts.append(f"{self.undecided} undecided")
+        return parts
 
     @property
     def counts(self) -> str:
@@ -379,53 +346,55 @@ class Verdict:
 
     def trouble_lines(self) -> list[str]:
         """Return lines on errors and timeouts by message; none where there are none."""
-        said = [
-            f"  {trouble.count} {trouble.end}, the first in case {trouble.cases[0]}: "
-            f"{trouble.message}"
-            for trouble in self.troubles[:MOST_MESSAGES]
-        ]
+        lines = []
+        for one in self.troubles[:MOST_MESSAGES]:
+            first = f"the first in case {one.cases[0]}: {one.message}"
+            lines.append(f"  {one.count} {one.end}, {first}")
         others = self.troubles[MOST_MESSAGES:]
         if others:
-            number = sum(trouble.count for trouble in others)
-            said.append(f"  {number} with {len(others)} other messages")
-        return said
+            number = sum(one.count for one in others)
+            lines.append(f"  {number} with {len(others)} other messages")
+        return lines
 
     def to_record(self) -> dict[str, Any]:
         """Return contacts, errors and timeouts as JSON has them."""
-        return {
-            "contacts": self.contacts,
-            "errors": self.errors,
-            "timeouts": self.timeouts,
-            "troubles": [
-                {"end": t.end, "message": t.message, "cases": t.count, "example": t.cases[0]}
-                for t in self.troubles
-            ],
-        }
+        troubles = []
+        for one in self.troubles:
+            example = {"end": one.end, "message": one.message, "cases": one.count}
+            troubles.append(example | {"example": one.cases[0]})
+        counts = {"contacts": self.contacts, "errors": self.errors, "timeouts": self.timeouts}
+        return counts | {"troubles": troubles}
 
 
 def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
     """Return the verdict on outcomes; a case counts once, as in `summarise`."""
-    ran, unsure = one_per_case(outcomes, tolerated), undecided(outcomes, tolerated)
-    failed = [o for o in ran if o.failed and o.index not in unsure]
-    wrong = [o for o in ran if not o.is_tested]
-    errors = sum(o.measures.end.is_error for o in wrong)
+    cases, unsure = one_per_case(outcomes, tolerated), undecided(outcomes, tolerated)
+    failed = [one for one in cases if one.failed and one.index not in unsure]
     groups: dict[tuple[End, str], list[Outcome]] = {}
-    for outcome in wrong:
-        key = outcome.measures.end, _VARYING.sub("#", message_of(outcome))
-        groups.setdefault(key, []).append(outcome)
-    troubles = [
-        Trouble(end, message_of(same[0]), tuple(o.index for o in same))
-        for (end, _), same in groups.items()
-    ]
+    errors = timeouts = 0
+    for outcome in cases:
+        if outcome.is_tested:
+            continue
+        end = outcome.measures.end
+        errors += end.is_error
+        timeouts += not end.is_error
+        # Messages that differ in numbers and addresses alone are one.
+        pattern = _VARYING.sub("#", message_of(outcome))
+        groups.setdefault((end, pattern), []).append(outcome)
+    troubles = []
+    for (end, _), same in groups.items():
+        indices = tuple(outcome.index for outcome in same)
+        troubles.append(Trouble(end, message_of(same[0]), indices))
+    troubles.sort(key=lambda one: (not one.end.is_error, -one.count, one.cases[0]))
     return Verdict(
-        cases=len(ran),
+        cases=len(cases),
         failures=len(failed),
         undecided=len(unsure),
-        contacts=sum(o.measures.severity == Severity.CONTACT for o in failed),
+        contacts=sum(one.measures.severity == Severity.CONTACT for one in failed),
         errors=errors,
-        timeouts=len(wrong) - errors,
-        troubles=tuple(sorted(troubles, key=lambda t: (not t.end.is_error, -t.count, t.cases[0]))),
-        goal=ran[0].case.scenario.goal if ran else US23.goal,
+        timeouts=timeouts,
+        troubles=tuple(troubles),
+        goal=cases[0].case.scenario.goal if cases else US23.goal,
     )
 
 
@@ -469,10 +438,7 @@ class Gate:
         return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
 
     def check(self, verdict: Verdict, summary: Summary, regressions: int = 0) -> GateResult:
-        """Return whether a campaign meets the gate, and what it shows.
-
-        `regressions` are the cases that fail and pass with the version that the campaign is
-        against.
+        """Return whether a campaign meets the gate, and the number that decides.
 
         Args:
             verdict: verdict on the campaign.
@@ -480,17 +446,19 @@ class Gate:
             regressions: number of cases that fail now and pass with the earlier version.
         """
         if self.what == "fmc":
-            by_level = {level: found.fmc for level, found in summary.levels.items()}
-            level = max(by_level, key=lambda level: by_level[level], default=0)
-            most = by_level.get(level, 0.0)
-            said = f"FMC {most:.4f} at level {level_name(level)}"
-            return GateResult(self.name, most > self.above, said)
-        if self.what == "failures":  # one that is undecided may be a failure
-            met = verdict.failures + verdict.undecided > 0
-            unsure = f" and {verdict.undecided} undecided" if verdict.undecided else ""
-            return GateResult(self.name, met, counted(verdict.failures, "failure") + unsure)
+            most, level = 0.0, min(summary.levels, default=0)
+            for one, found in summary.levels.items():
+                if found.fmc > most:
+                    most, level = found.fmc, one
+            text = f"FMC {most:.4f} at level {level_name(level)}"
+            return GateResult(self.name, most > self.above, text)
         number = regressions if self.what == REGRESSIONS else getattr(verdict, self.what)
-        return GateResult(self.name, number > 0, counted(number, self.what.removesuffix("s")))
+        text = counted(number, self.what.removesuffix("s"))
+        if self.what == "failures" and verdict.undecided:
+            # One that is undecided may be a failure.
+            number += verdict.undecided
+            text += f" and {verdict.undecided} undecided"
+        return GateResult(self.name, number > 0, text)
 
 
 @dataclass(frozen=True, slots=True)
@@ -508,9 +476,11 @@ class GateResult:
 
 
 def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
-    """Return gates by their names, each once; `UserError` for what is none.
+    """Return gates by their names, each once; `UserError` for a text that names none.
 
-    `against` is whether the campaign is against an earlier version of the VUT.
+    Args:
+        texts: names of gates, such as "errors" or "fmc>0.1".
+        against: whether the campaign is against an earlier version of the VUT.
     """
     gates: dict[str, Gate] = {}
     for text in texts:
@@ -530,8 +500,8 @@ def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
             above = math.nan
         if not 0.0 <= above < 1.0:
             raise UserError(
-                f'the gate {printable(text)!r} can never be told: X of "fmc>X" is a number from 0 '
-                "to below 1"
+                f'the gate {printable(text)!r} cannot be decided: X of "fmc>X" is a number from '
+                "0 to below 1"
             )
         gate = Gate(what, above)
         gates[gate.name] = gate

@@ -14,7 +14,7 @@ from merge_sumo.metrics.fmc import fmc_growth, radius_for
 from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import shortened
+from merge_sumo.metrics.summary import CONFIDENCE, clopper_pearson, shortened
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
@@ -118,7 +118,7 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     if model.repeated:
         row["runs"] = None
         if runs := model.repeated.get(index):
-            low, high = runs.interval()
+            low, high = clopper_pearson(runs.failures, runs.runs, CONFIDENCE)
             each = [(run.index, run.failed) for run in runs.outcomes]
             row["runs"] = {"failed": runs.failures, "number": runs.runs, "each": each}
             row["runs"] |= {"low": low, "high": high}

@@ -58,7 +58,7 @@ def assert_sentence(error: pytest.ExceptionInfo[UserError], *parts: str) -> None
 class TestARecord:
     def test_survives_to_the_last_bit(self, run):
         # repr tells floats apart that == does not: -0.0 and 0.0.
-        odd = {"ttc_s": -0.0, "dx_m": 5e-324, "score": -1e300, "error": "é\n\u2028\""}
+        odd = {"ttc_s": -0.0, "dx_m": 5e-324, "score": -1e300, "error": 'é\n\u2028"'}
         record = {**run.outcomes[0].to_record(), **odd}
         text = json.dumps(record) + "\n"
         assert to_line(Outcome.from_json(text, scenario=US23)) == text

@@ -31,7 +31,7 @@ class TestNearestNames:
     ("text", "said"),
     [
         ("ttc_s < 2 or TTC_S < 1", "there is no measure 'TTC_S': did you mean ttc_s"),
-        ("merged_first == VUT", 'a text is to be in quotes: merged_first == "VUT"'),
+        ("merged_first == VUT", 'write the text in quotes: merged_first == "VUT"'),
         ("merged_first == level0", "there is no measure 'level0'"),
         ("end == 'timeout'", "end is never 'timeout': did you mean TIMEOUT?"),
         ("ttc_s = 2", "instead of ="),

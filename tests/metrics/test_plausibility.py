@@ -15,7 +15,7 @@ from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.scenario.scenario import DT_S
 
 
-class TestAfterTheRun:
+class TestDoubts:
     def test_a_threshold_in_km_h_is_doubted(self, run):
         criterion = Criterion("dv_mps > 34")
         (said,) = under(run, criterion)
@@ -25,20 +25,17 @@ class TestAfterTheRun:
         (said,) = under(run, Criterion("dv_mps < -8"))
         assert "(the other sign)" in said
 
-    def test_a_verdict_that_differs_between_cases_is_not(self, run):
-        assert under(run, Criterion("dx_m < 0")) == []
-        assert under(run, Criterion("paper")) == []
-
-    def test_one_verdict_without_a_neighbour_is_not(self, run):
-        assert under(run, Criterion("t_end_s < 0.2")) == []
+    def test_other_criteria_are_not(self, run):
+        for text in ("dx_m < 0", "paper", "t_end_s < 0.2"):
+            assert under(run, Criterion(text)) == []
 
     @pytest.mark.parametrize(("share", "is_headline"), [(0.25, False), (1.0, True)])
-    def test_accelerations_that_are_clipped_are_told(self, run, share, is_headline):
+    def test_clipped_accelerations_are_reported(self, run, share, is_headline):
         rows = [round(o.measures.t_end_s / DT_S) for o in run.outcomes]
-        at_limit = [
-            replace(o, measures=Measures(**o.measures.values | {"clipped_steps": int(share * n)}))
-            for o, n in zip(run.outcomes, rows, strict=True)
-        ]
+        at_limit = []
+        for outcome, steps in zip(run.outcomes, rows, strict=True):
+            values = outcome.measures.values | {"clipped_steps": int(share * steps)}
+            at_limit.append(replace(outcome, measures=Measures(**values)))
         clipped = sum(o.measures.clipped_steps for o in at_limit)
         headline, notes = mostly_clipped(at_limit), doubts(at_limit, Criterion(), {})
         said = f"in {clipped} of {sum(rows)} steps the VUT asks for an acceleration"
@@ -46,12 +43,12 @@ class TestAfterTheRun:
         assert len(notes) == (not is_headline)
         assert said in (headline or notes[0])
 
-    def test_errors_behind_m_are_told(self, run):
+    def test_errors_after_m_are_reported(self, run):
         first, second, *others = run.outcomes
-        wrong = [
-            replace(o, measures=Measures(**o.measures.values | {"error": "answered nan"}))
-            for o in (first, second)
-        ]
+        wrong = []
+        for outcome in (first, second):
+            measures = Measures(**outcome.measures.values | {"error": "answered nan"})
+            wrong.append(replace(outcome, measures=measures))
         assert doubts([*wrong, *others], Criterion(), {}) == [
             f"in 2 cases an error ends the follow-up, the first in case {first.index}: answered nan"
         ]
