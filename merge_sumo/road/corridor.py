@@ -225,7 +225,7 @@ class Corridor:
     @property
     def is_one_path(self) -> bool:
         """Whether both vehicles drive on one lane all the way."""
-        return self.mainline == self.ramp
+        return self.mainline_edges == self.ramp_edges
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
         """Return the place of a lane coordinate of one of the paths."""

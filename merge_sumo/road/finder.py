@@ -127,18 +127,20 @@ def find_corridor(
     ramp: Sequence[str],
     *,
     room_after_m: float = ROOM_AFTER_M,
+    edge_at_m: str | None = None,
     lane_m: Bounds | None = None,
 ) -> Corridor:
     """Find the merge of two sequences of edges in a net.
 
-    Both name the edge on which the paths become one, and may continue after it. Where the mainline
-    begins with all edges of the ramp both are one path, and M is where the last of these begins.
+    Both name the edge on which the paths become one, and may continue after it. Equal sequences are
+    one path.
 
     Args:
         road_net: the net.
         mainline: edges of the mainline.
         ramp: edges of the ramp.
         room_after_m: where the file ends nearer after M, the last lane is continued straight on.
+        edge_at_m: the edge of a single path that begins at M, by default its last one.
         lane_m: where a scenario has its acceleration lane: that of the road ends with it, and may
             begin before it.
 
@@ -151,7 +153,7 @@ def find_corridor(
     """
     edges = tuple(mainline), tuple(ramp)
     try:
-        return _corridor(road_net, edges, room_after_m, lane_m)
+        return _corridor(road_net, edges, edge_at_m, room_after_m, lane_m)
     except UserError as error:
         raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
 
@@ -188,13 +190,17 @@ class _Meeting(NamedTuple):
 
 
 def _corridor(
-    road_net: RoadNet, edges: tuple[_Edges, _Edges], room_after_m: float, lane_m: Bounds | None
+    road_net: RoadNet,
+    edges: tuple[_Edges, _Edges],
+    edge_at_m: str | None,
+    room_after_m: float,
+    lane_m: Bounds | None,
 ) -> Corridor:
     """Return the corridor of two sequences of edges."""
     net = road_net.net
     for name in chain(*edges):
         _check_edge(road_net, name)
-    own, tail = _split(*edges)
+    own, tail = _split(*edges, edge_at_m)
     main_layers = _layers(net, own[MAINLINE] + tail, len(own[MAINLINE]))
     ramp_layers = _layers(net, own[RAMP] + tail, len(own[RAMP]))
     on_main, on_ramp = len(own[MAINLINE]), len(own[RAMP])
@@ -413,10 +419,13 @@ def _check_window(lane: AccelerationLane, lane_m: Bounds) -> None:
         )
 
 
-def _split(mainline: _Edges, ramp: _Edges) -> tuple[tuple[_Edges, _Edges], _Edges]:
+def _split(
+    mainline: _Edges, ramp: _Edges, edge_at_m: str | None
+) -> tuple[tuple[_Edges, _Edges], _Edges]:
     """Return the edges that each path has for itself, and those that follow on both."""
-    if len(ramp) > 1 and mainline[: len(ramp)] == ramp:
-        return (ramp[:-1], ramp[:-1]), mainline[len(ramp) - 1 :]
+    if mainline == ramp and len(ramp) > 1:
+        before = ramp.index(edge_at_m or ramp[-1])
+        return (ramp[:before], ramp[:before]), ramp[before:]
     common = next((edge for edge in ramp if edge in mainline), None)
     if common is None:
         raise UserError(

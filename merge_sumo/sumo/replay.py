@@ -1,8 +1,7 @@
-"""Plays a replay folder in headless SUMO and tells whether what it shows is what was recorded.
+"""Plays a replay folder in headless SUMO and compares it with what was recorded.
 
-Of the folder the case, the record and the net are read, as data. What SUMO runs is written from
-them into a temporary folder, in the same way as an export: whoever sent the folder decides on
-numbers, and on nothing else.
+Of the folder the case, the record and the net are read, as data. SUMO runs on files that are
+written from them into a temporary folder, as in an export.
 """
 
 from __future__ import annotations
@@ -11,19 +10,17 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from msgspec import Meta
 
 from merge_sumo.errors import UserError, notice
 from merge_sumo.interrupt import stopping_in_order
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.records import Record, convert, read_record, to_json
+from merge_sumo.records import convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import FARTHEST_M
@@ -61,6 +58,11 @@ REPLAYED = "replayed.fcd.xml"
 TOLERANCE = 1e-6
 """Metres and m/s; the record is written with nine digits."""
 MAX_TIMESTEPS = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
+COLUMNS = ("x", "y", "speed", "pos")
+"""Numbers of a vehicle in floating car data."""
+SPEED, POSITION = 2, 3
+COMPARED = 3
+"""The first columns: the position is that of a lane."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -68,10 +70,14 @@ class Replay(Result):
     """A headless replay, compared with its record.
 
     Attributes:
-        rows: rows that were compared.
+        rows: number of rows that were compared.
         diverged_at_s: time of the first row that differs; None where none does.
-        detail: in what it differs.
+        detail: the difference.
         words: the case and its cause, and when a later begin is.
+
+    Example:
+        >>> ms.replay("scenarios/pov-yields").identical
+        True
     """
 
     computed = ("identical",)
@@ -107,8 +113,11 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
 
     Args:
         folder: the replay folder, which may have been received.
-        from_s: SUMO begins so long before the first conflict, in the state that it has there in
-            the whole replay.
+        from_s: SUMO begins at this time before the first conflict, in s, below 0, in the state that
+            it has there in the whole replay.
+
+    Returns:
+        The comparison.
 
     Raises:
         UserError: the folder is not a replay folder, or SUMO cannot run it.
@@ -118,16 +127,32 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
     with _staged(episode, first) as (stage, arguments):
         arguments += ["--fcd-output", REPLAYED, "--device.fcd.begin", f"{first * DT_S:.1f}"]
         arguments += ["--precision", "9", "--no-step-log", "true"]
-        ended = run_program("sumo", arguments, stage)
-        if ended.code != 0:
-            raise UserError(f"SUMO cannot replay {folder}: {ended.reason}")
-        replayed = _record(stage / REPLAYED, f"SUMO's replay of {folder}")
-    recorded = {at: row for at, row in episode.rows.items() if at[0] >= first}
-    fault = _difference(recorded, replayed) or _broken_motion(episode.trajectory)
-    diverged_at_s, detail = fault or (None, "")
+        if reason := run_program("sumo", arguments, stage):
+            raise UserError(f"SUMO cannot replay {folder}: {reason}")
+        rows, _ = _record(stage / REPLAYED, f"SUMO's replay of {folder}")
+    recorded = episode.record[first:, :, :COMPARED]
+    count, cars, _ = recorded.shape
+    replayed = rows[first : first + count, :cars, :COMPARED]
+    motion = episode.trajectory.whole
+    off_m = np.diff(motion[:, :, 0], axis=0) - motion[:-1, :, 1] * DT_S
+    diverged_at_s, detail = None, ""
+    if place := _first(replayed - recorded):
+        row, car, column = place
+        diverged_at_s = (first + row) * DT_S
+        detail = f"{COLUMNS[column]} of {VEHICLES[car]} is {replayed[place]}, recorded "
+        detail += f"{recorded[place]}"
+    elif place := _first(off_m):
+        diverged_at_s = place[0] * DT_S
+        detail = f"{VEHICLES[place[1]]} is recorded as not moving at its speed"
     outcome = episode.outcome
     words = case_line(outcome.case, outcome.index), cause(outcome, episode.trajectory), *begins
-    return Replay(len(recorded), diverged_at_s, detail, words)
+    return Replay(count * cars, diverged_at_s, detail, words)
+
+
+def _first(difference: FloatArray) -> tuple[int, ...]:
+    """Return the place of the first difference above the tolerance; empty without one."""
+    places = np.argwhere(~(np.abs(difference) <= TOLERANCE)).tolist()
+    return tuple(places[0]) if places else ()
 
 
 def check_display() -> None:
@@ -139,12 +164,15 @@ def check_display() -> None:
 
 
 def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False) -> int:
-    """Open a replay folder in sumo-gui, wait until it is closed, and return its exit code.
+    """Open a replay folder in sumo-gui and wait until it is closed.
 
     Args:
         folder: the replay folder, which may have been received.
         from_s: as in `replay`.
         silent: whether no notice says when it begins.
+
+    Returns:
+        1 where sumo-gui failed, else 0.
 
     Raises:
         UserError: there is no display, or the folder is not a replay folder.
@@ -155,41 +183,21 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
     for sentence in [] if silent else begins:
         notice(sentence)
     with stopping_in_order(), _staged(episode, first) as (stage, arguments):
-        return run_program("sumo-gui", arguments, stage, limit_s=None).code
-
-
-Place = Annotated[float, Meta(ge=-FARTHEST_M, le=FARTHEST_M)]
-
-
-class RecordedTime(Record, frozen=True, forbid_unknown_fields=False):
-    """A step of a record."""
-
-    time: Annotated[float, Meta(ge=0.0, le=MAX_TIMESTEPS * DT_S)]
-
-
-class RecordedMotion(Record, frozen=True, forbid_unknown_fields=False):
-    """The motion of a vehicle at a step, as SUMO's floating car data has it."""
-
-    id: Literal["pov", "vut", "ahead", "behind"]
-    x: Place
-    y: Place
-    pos: Place
-    speed: Annotated[float, Meta(ge=0.0, le=1000.0)]
-    lane: str
-
-
-Rows = dict[tuple[int, str], RecordedMotion]
-"""The motion of each vehicle at each step."""
+        return int(run_program("sumo-gui", arguments, stage, limit_s=None) != "")
 
 
 @dataclass(frozen=True, slots=True)
 class _Episode:
-    """The content of a replay folder."""
+    """The content of a replay folder.
+
+    Attributes:
+        record: `COLUMNS` of each vehicle at each step, (T, A, 4).
+    """
 
     road: Road
     outcome: Outcome
     trajectory: Trajectory
-    rows: Rows
+    record: FloatArray
 
 
 def _read(folder: Path) -> _Episode:
@@ -204,8 +212,15 @@ def _read(folder: Path) -> _Episode:
             raise UserError(f"{folder} is not a replay folder: it has no {name}")
     outcome = _outcome(folder / CASE)
     road = _road(folder / net, outcome)
-    rows = _record(folder / RECORD, f"the record {folder / RECORD}")
-    motion = _motion(rows, road.corridor, outcome, f"the record {folder / RECORD}")
+    name, cars = f"the record {folder / RECORD}", outcome.case.scenario.vehicles
+    record, lanes = _record(folder / RECORD, name)
+    record = record[: len(lanes) // cars, :cars]
+    if len(record) <= HOLD_STEPS or np.isnan(record).any():
+        raise UserError(
+            f"{name} must have {', '.join(VEHICLES[:cars])} every {DT_S:g} s, in {1 + HOLD_STEPS} "
+            "or more rows"
+        )
+    motion = _motion(record, lanes, road.corridor, name)
     measures = outcome.measures
     end = round(measures.t_end_s / DT_S)
     if not 0 <= end < len(motion):
@@ -214,7 +229,7 @@ def _read(folder: Path) -> _Episode:
     trajectory = Trajectory(
         outcome.case, until_merge, measures.end, measures.error, measures.clipped_steps, after
     )
-    return _Episode(road, outcome, trajectory, rows)
+    return _Episode(road, outcome, trajectory, record)
 
 
 def _outcome(path: Path) -> Outcome:
@@ -238,50 +253,55 @@ def _road(path: Path, outcome: Outcome) -> Road:
     return Road(hosted_net(corridor, 1, lane_goes_on=True), corridor, HOSTED_NET)
 
 
-def _motion(rows: Rows, road: Corridor, outcome: Outcome, name: str) -> FloatArray:
-    """Return the motion of a record without the rows that hold its end, (steps, vehicles, 3).
+def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:
+    """Return floating car data, and the lane of each vehicle by (step, row).
+
+    The data are `COLUMNS` of each vehicle at each step, (T, A, 4); NaN where it is missing.
+    """
+    root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
+    record = np.full((MAX_TIMESTEPS, len(VEHICLES), len(COLUMNS)), np.nan)
+    lanes: dict[tuple[int, int], str] = {}
+    for car in root.iterfind("timestep/vehicle"):
+        above, values = car.getparent(), {str(key): str(value) for key, value in car.items()}
+        assert above is not None, "a timestep"  # noqa: S101
+        try:
+            step = float(above.attrib["time"]) / DT_S
+            place = round(step), VEHICLES.index(values["id"])
+            numbers = [float(values[column]) for column in COLUMNS]
+            in_range = all(abs(number) <= FARTHEST_M for number in numbers)
+            if step < 0.0 or abs(step - place[0]) > TOLERANCE or place in lanes or not in_range:
+                raise ValueError("it is out of range, between steps, or repeats one")
+            record[place] = numbers
+            lanes[place] = values["lane"]
+        except (IndexError, KeyError, OverflowError, ValueError) as error:
+            raise UserError(
+                f"{name} has a missing or wrong value in line {car.sourceline} ({error!r:.100})"
+            ) from error
+    return record, lanes
+
+
+def _motion(
+    record: FloatArray, lanes: dict[tuple[int, int], str], road: Corridor, name: str
+) -> FloatArray:
+    """Return the motion of a record without the rows that hold its end, (T, A, 3).
 
     The VUT has the lanes of the ramp, and that of the mainline next to an acceleration lane.
     """
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
-    steps = len(rows) // len(cars) - HOLD_STEPS
-    if steps < 1 or rows.keys() != {*product(range(steps + HOLD_STEPS), cars)}:
-        raise UserError(
-            f"{name} must have {', '.join(cars)} every {DT_S:g} s, in {1 + HOLD_STEPS} or more rows"
-        )
+    starts_m = np.zeros(record.shape[:2])
     main = {piece.lane: piece.start_m for piece in road.mainline.pieces}
     ramp = {piece.lane: piece.start_m for piece in road.ramp.pieces}
-    motion = np.zeros((steps, len(cars), 3))
-    for (step, who), row in rows.items():
-        lanes = main | ramp if who == VEHICLES[VUT] else main
-        if row.lane not in lanes:
-            raise UserError(f"{name} has {who} on lane {row.lane:.40}, which is not on its path")
-        if step < steps:
-            motion[step, cars.index(who), :2] = lanes[row.lane] + row.pos, row.speed
-    motion[:-1, :, 2] = np.diff(motion[:, :, 1], axis=0) / DT_S
+    for (step, car), lane in lanes.items():
+        own = main | ramp if car == VUT else main
+        if lane not in own:
+            raise UserError(
+                f"{name} has {VEHICLES[car]} on lane {lane:.40}, which is not on its path"
+            )
+        starts_m[step, car] = own[lane]
+    x_m, v_mps = starts_m + record[:, :, POSITION], record[:, :, SPEED]
+    a_mps2 = np.diff(v_mps, axis=0, append=v_mps[-1:]) / DT_S
+    motion = np.stack((x_m, v_mps, a_mps2), axis=2)[:-HOLD_STEPS]
+    motion[-1, :, 2] = 0.0
     return motion
-
-
-def _record(path: Path, name: str) -> Rows:
-    """Return the rows of floating car data; `UserError` where one has a wrong value."""
-    root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
-    if len(root) > MAX_TIMESTEPS:
-        raise UserError(f"{name} has {len(root)} timesteps, and at most {MAX_TIMESTEPS} are read")
-    rows: Rows = {}
-    for timestep in root:
-        try:
-            time = convert(dict(timestep.items()), RecordedTime, strict=False).time
-            moved = [convert(dict(car.items()), RecordedMotion, strict=False) for car in timestep]
-        except UserError as error:
-            raise UserError(f"{name}: {error}") from error
-        step = round(time / DT_S)
-        if abs(time - step * DT_S) > TOLERANCE:
-            raise UserError(f"{name} has a timestep at {time:g} s: there is one every {DT_S:g} s")
-        for row in moved:
-            if (step, row.id) in rows:
-                raise UserError(f"{name} has two rows of {row.id} at {time:g} s")
-            rows[step, row.id] = row
-    return rows
 
 
 @contextmanager
@@ -304,26 +324,3 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
         for name, content in files.items():
             (stage / name).write_bytes(content)
         yield stage, ["-c", CONFIG, "--begin", f"{row * DT_S:.1f}"]
-
-
-def _difference(recorded: Rows, replayed: Rows) -> tuple[float, str] | None:
-    """Return when and in what a replay first differs from the record, or None."""
-    for (step, who), row in recorded.items():
-        shown = replayed.get((step, who))
-        if shown is None:
-            return step * DT_S, f"{who} is not there"
-        for name in ("x", "y", "speed"):
-            was, now = getattr(row, name), getattr(shown, name)
-            if abs(now - was) > TOLERANCE:
-                return step * DT_S, f"{name} of {who} is {now}, recorded {was}"
-    return None
-
-
-def _broken_motion(trajectory: Trajectory) -> tuple[float, str] | None:
-    """Return when a vehicle of the record does not move by eq. (4), or None."""
-    x_m, v_mps = trajectory.whole[:, :, 0], trajectory.whole[:, :, 1]
-    away_m = np.abs(np.diff(x_m, axis=0) - v_mps[:-1] * DT_S)
-    for step, car in np.argwhere(away_m > TOLERANCE).tolist():
-        speed = v_mps[step, car]
-        return step * DT_S, f"{VEHICLES[car]} is recorded as not moving at its speed of {speed}"
-    return None

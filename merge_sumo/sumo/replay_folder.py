@@ -1,11 +1,11 @@
-"""An episode as a folder that sumo and sumo-gui play with nothing else running: what is in it.
+"""An episode as a folder that sumo and sumo-gui play by themselves.
 
 On the shipped road it is played in the shipped net. Of any other road the folder has the net that
 hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
 reader can check, and where the road continues after the end of the file, so does that net. A VUT on
-an acceleration lane is on the lane of the mainline from the row in which it has merged. Labels
-stand at fixed places above the road, as points of interest with a text: names at the cars would lie
-on each other at M, where a reader looks.
+an acceleration lane is on the lane of the mainline from the row in which it has merged. Labels are
+at fixed places above the road, as points of interest with a text: names at the cars would cover
+each other at M.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 from lxml import etree
 
 from merge_sumo.files import write_folder
@@ -26,7 +27,7 @@ from merge_sumo.road.corridor import Corridor, LanePath
 from merge_sumo.road.finder import find_corridor, read_net
 from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
 from merge_sumo.road.xml_input import to_bytes
-from merge_sumo.scenario.case import Case, described
+from merge_sumo.scenario.case import Case, FloatArray, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
@@ -50,7 +51,7 @@ SHAPE = 614.0 / 1270.0
 REAL_TIME_MS = "1000"
 """Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
 HOLD_STEPS = 10
-"""Steps for which the last picture stays, so that one sees how it ended."""
+"""Steps for which the last picture stays."""
 NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
 TEXT = "text"
 """Parameter of a point of interest that is shown."""
@@ -60,17 +61,16 @@ INK = "0.1,0.1,0.1"
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The picture of sumo-gui: its zoom, its middle, and its size on the road.
-
-    With `borders` there are lines between lanes.
-    """
+    """The picture of sumo-gui: its zoom, its middle, and its width on the road."""
 
     zoom: str
     x_m: float
     y_m: float
     width_m: float
-    height_m: float
-    borders: bool
+
+    def place(self, right: float, up: float) -> tuple[float, float]:
+        """Return the place at shares of width and height from the middle."""
+        return self.x_m + right * self.width_m, self.y_m + up * self.width_m * SHAPE
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +130,9 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
         path: its file, for messages.
         lane_m: begin and end of the acceleration lane of its scenario.
 
+    Returns:
+        The corridor.
+
     Raises:
         UserError: the net has no such corridor.
     """
@@ -139,14 +142,15 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
         if found := re.fullmatch(r"(main|ramp|out)([0-9]{1,4})[.]0", name):
             numbered[found[1]][int(found[2])] = name
     main, ramp, out = ([names[n] for n in sorted(names)] for names in numbered.values())
-    # Without a ramp both vehicles drive on one path, and the net has nothing else.
+    # Without a ramp both vehicles drive on one path.
     is_one_path = len(main) + len(out) == len(net.edges)
     lane = [] if lane_m is None else [LANE_EDGE]
     return find_corridor(
         net,
         main + lane + out,
-        main + out[:1] if is_one_path else ramp + lane + out,
+        (main if is_one_path else ramp) + lane + out,
         room_after_m=0.0,
+        edge_at_m=out[0] if out else None,
         lane_m=lane_m and (lane_m[1], lane_m[1]),
     )
 
@@ -154,15 +158,18 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
 def files_of(
     road: Road, outcome: Outcome, trajectory: Trajectory, record: etree._Element
 ) -> dict[str, bytes]:
-    """Return what SUMO reads of an episode by the names of the files, the configuration last.
+    """Return the files that SUMO reads of an episode, the configuration last.
 
     Args:
         road: the road of the folder.
         outcome: the outcome of the case.
         trajectory: its motion.
-        record: what SUMO plays of that (`motion_record`).
+        record: the part of the motion that SUMO plays (`motion_record`).
+
+    Returns:
+        The contents by name.
     """
-    picture = _picture(road, record)
+    picture = _picture(road.corridor, record)
     roots = {
         TYPES: _types(trajectory),
         LABELS: _labels(outcome, trajectory, picture),
@@ -170,10 +177,7 @@ def files_of(
         VIEW: view_settings(picture),
         CONFIG: _config(road, len(record)),
     }
-    files = {road.file: road.net}
-    for name, root in roots.items():
-        files[name] = to_bytes(root)
-    return files
+    return {road.file: road.net} | {name: to_bytes(root) for name, root in roots.items()}
 
 
 def _types(trajectory: Trajectory) -> etree._Element:
@@ -189,8 +193,7 @@ def _types(trajectory: Trajectory) -> etree._Element:
             guiShape="passenger/sedan",
             length=f"{length_m:g}",
             minGap="0",
-            # The replay inserts a vehicle at the highest speed it may drive, so make that the
-            # first speed of the record; all later speeds come from the record itself.
+            # The replay inserts a vehicle at the highest speed it may drive: its first one here.
             maxSpeed=f"{max(first_mps, 1e-9):.9f}",
             speedFactor="2",
             # Nor does SUMO then slow it down for the junction.
@@ -208,20 +211,15 @@ def motion_record(road: Corridor, trajectory: Trajectory) -> etree._Element:
     for step, (vehicles, merged) in enumerate(rows):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
         for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
-            on_ramp = who == VEHICLES[VUT] and not merged
-            lane, position, x, y, angle = road.lane_point(x_m, on_ramp=on_ramp)
-            etree.SubElement(
-                timestep,
-                "vehicle",
-                id=who,
-                x=f"{x:.9f}",
-                y=f"{y:.9f}",
-                angle=f"{angle:.9f}",
-                type=who,
-                speed=f"{v_mps:.9f}",
-                pos=f"{position:.9f}",
-                lane=lane,
-            )
+            at = road.lane_point(x_m, on_ramp=who == VEHICLES[VUT] and not merged)
+            car = etree.SubElement(timestep, "vehicle", id=who)
+            car.set("x", f"{at.x_m:.9f}")
+            car.set("y", f"{at.y_m:.9f}")
+            car.set("angle", f"{at.angle_deg:.9f}")
+            car.set("type", who)
+            car.set("speed", f"{v_mps:.9f}")
+            car.set("pos", f"{at.position_m:.9f}")
+            car.set("lane", at.lane)
     return root
 
 
@@ -229,8 +227,7 @@ def view_settings(picture: Picture) -> etree._Element:
     """Return the settings of a view."""
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    if picture.borders:
-        etree.SubElement(scheme, "edges", laneShowBorders="1")
+    etree.SubElement(scheme, "edges", laneShowBorders="1")
     etree.SubElement(scheme, "vehicles", vehicleQuality="3", vehicle_exaggeration="1")
     etree.SubElement(
         scheme,
@@ -254,29 +251,23 @@ def _colour(vehicle: str) -> str:
     return ",".join(f"{part / 255.0:.2f}" for part in rgb(vehicle))
 
 
-def _picture(shown: Road, record: etree._Element) -> Picture:
+def _picture(road: Corridor, record: etree._Element) -> Picture:
     """Return a picture of the way of the VUT; at a zoom of 100 it has the whole net."""
-    road = shown.corridor
-    net: list[tuple[float, ...]] = []
-    for piece in (*road.mainline.pieces, *road.ramp.pieces):
-        net += [point[:2] for point in piece.shape]
-    driven: list[tuple[float, ...]] = []
-    for car in record.iter("vehicle"):
-        if car.get("id") == VEHICLES[VUT]:
-            driven.append((float(car.get("x", "0")), float(car.get("y", "0"))))
-    whole_m, _, _ = _box(net)
-    driven_m, x_m, y_m = _box(driven)
+    net = [(x, y) for path in (road.mainline, road.ramp) for _, x, y in path.corners()]
+    driven = []
+    for car in record.iterfind(f"timestep/vehicle[@id='{VEHICLES[VUT]}']"):
+        driven.append((float(car.get("x", "")), float(car.get("y", ""))))
+    whole_m, _ = _box(net)
+    driven_m, (x_m, y_m) = _box(driven)
     width_m = 1.3 * max(driven_m, 100.0)
-    zoom = f"{100.0 * whole_m / width_m:.0f}"
-    is_lane = road.lane_m is not None
-    return Picture(zoom, round(x_m), round(y_m), width_m, width_m * SHAPE, is_lane)
+    return Picture(f"{100.0 * whole_m / width_m:.0f}", round(x_m), round(y_m), width_m)
 
 
-def _box(points: Sequence[tuple[float, ...]]) -> tuple[float, float, float]:
-    """Return the width of a picture of points below the labels, and its centre."""
-    xs, ys = zip(*points, strict=True)
-    width_m = max(max(xs) - min(xs), (max(ys) - min(ys)) / (0.8 * SHAPE))
-    return width_m, (min(xs) + max(xs)) / 2.0, (min(ys) + max(ys)) / 2.0
+def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
+    """Return the width of a picture of points below the labels, and its middle."""
+    low, high = np.min(points, axis=0), np.max(points, axis=0)
+    width_m, height_m = (high - low).tolist()
+    return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
 
 
 def _config(road: Road, timesteps: int) -> etree._Element:
@@ -296,7 +287,7 @@ def _config(road: Road, timesteps: int) -> etree._Element:
             "gui-settings-file": VIEW,
             "start": "true",
             "delay": REAL_TIME_MS,
-            # It halts there, with no dialog over the last picture as where it ends.
+            # It halts there: at its end it would show a dialog over the last picture.
             "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
             "window-size": "1280,800",
         },
@@ -317,12 +308,10 @@ def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree
     lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
     root = etree.Element("additional")
     for number, line in enumerate(lines[:4]):
-        y_m = picture.y_m + (0.465 - 0.035 * number) * picture.height_m
-        _label(root, f"line{number}", (picture.x_m, y_m), line)
+        _label(root, f"line{number}", picture.place(0.0, 0.465 - 0.035 * number), line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
     for number, name in enumerate(cars):
-        x_m = picture.x_m + 0.13 * (number - 0.5 * (len(cars) - 1)) * picture.width_m
-        at = x_m, picture.y_m + 0.315 * picture.height_m
+        at = picture.place(0.13 * (number - 0.5 * (len(cars) - 1)), 0.315)
         _label(root, name, at, NAMES[name], _colour(name), 0.012 * picture.width_m)
     return root
 
@@ -342,15 +331,7 @@ def _label(
     size_m: float = 0.1,
 ) -> None:
     """Add a dot with a text, which is drawn above it."""
-    poi = etree.SubElement(
-        root,
-        "poi",
-        id=name,
-        x=f"{at[0]:.2f}",
-        y=f"{at[1]:.2f}",
-        color=colour,
-        layer="200",
-        width=f"{size_m:.2f}",
-        height=f"{size_m:.2f}",
-    )
+    place = {"x": f"{at[0]:.2f}", "y": f"{at[1]:.2f}"}
+    size = {"width": f"{size_m:.2f}", "height": f"{size_m:.2f}"}
+    poi = etree.SubElement(root, "poi", {"id": name, **place, "color": colour, **size}, layer="200")
     etree.SubElement(poi, "param", key=TEXT, value=text)

@@ -7,8 +7,8 @@ step, so eq. (4),
 
 is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1). Positions are read
 back from SUMO after every step, and must be those of eq. (4). Speeds are read back where an episode
-begins; from then on they are what SUMO was told, for to ask it again would give the same number,
-and a vehicle that did not drive at it would show in its next position.
+begins, and then are those that SUMO was told: a vehicle that did not drive at its speed would show
+in its next position.
 
 Where SUMO itself drives a vehicle, its car-following model and its junction logic decide v(t+1)
 from the state at t. SUMO then moves by v(t+1) instead of v(t), so the vehicle is put where eq. (4)
@@ -21,10 +21,8 @@ import bisect
 import math
 import os
 import sys
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import compress
 from pathlib import Path
 from typing import Any, Self
 
@@ -51,16 +49,9 @@ PARKING_M = 182.0
 EXACT_M = 1e-9
 """Largest difference of SUMO from eq. (4) in a step; more is a position on another lane."""
 MAX_SPEED_MPS = 200.0
-"""Above what a POV can reach by the timeout, so that SUMO never caps a commanded speed."""
-
-CAR = "car"
-COMMANDED_VUT = "commanded"
-VUT_TYPE = "vut"
-OWN_CAR = "own"
-"""Ids of the vTypes of the cars of the mainline and of VUTs that hold the speed that they are told,
-and of VUTs and of cars of the mainline that SUMO drives."""
+"""Above the speed that a POV can reach by the timeout, so that SUMO never caps a speed."""
 SLOWEST_MPS = 0.1
-"""SUMO has no driver who wants to stand."""
+"""Least speed that a driver of SUMO can want."""
 
 
 class SimulationError(Exception):
@@ -68,13 +59,19 @@ class SimulationError(Exception):
 
 
 class World:
-    """A libsumo simulation with `corridors` independent corridors.
+    """A libsumo simulation with independent corridors; a process can have one at a time.
 
-    State arrays have shape (A, corridors), a row for each vehicle of an episode (`POV`, `VUT` and,
-    in traffic, `AHEAD` and `BEHIND`): `x_m`, lane coordinates with M = 0, read from SUMO, and
-    `v_mps`, what SUMO holds as their speeds. Every step has new arrays.
+    Attributes:
+        x_m: lane coordinates with M = 0, (A, corridors), read from SUMO: a row for each vehicle of
+            an episode (`POV`, `VUT` and, in traffic, `AHEAD` and `BEHIND`). Every step has a new
+            array.
+        v_mps: speeds, (A, corridors).
 
-    libsumo holds one simulation per process, so one world may be open at a time.
+    Example:
+        >>> with World(1, scenario=US23) as world:
+        ...     world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        ...     world.advance()
+        ...     world.command(np.zeros((2, 1)))
     """
 
     _open = False
@@ -88,14 +85,19 @@ class World:
         scenario: Scenario,
         car_type: Mapping[str, str] | None = None,
     ) -> None:
-        """Start SUMO; raises `UserError` when it cannot start, or when a world is open already.
+        """Start SUMO.
 
-        `road` is where the merge is, by default the shipped net.
-        `scenario` says how many vehicles there are, and how long.
-        `vut_type` are attributes of a SUMO vType: with them SUMO's own models decide on the speed
-        of the VUTs, and `wanted_v_mps` tells what they want.
-        `car_type` are those of cars of the mainline in the episodes in which they are the tester's
-        own; without a `maxSpeed` they want the speed with which they start.
+        Args:
+            corridors: number of corridors, K.
+            road: where the merge is, by default the shipped net.
+            vut_type: attributes of a SUMO vType: with them SUMO's own models decide on the speed
+                of the VUTs (`wanted_v_mps`).
+            scenario: gives the number of vehicles and their lengths.
+            car_type: as `vut_type`, for the cars of the mainline in the episodes in which they are
+                the tester's own; without a `maxSpeed` they want the speed with which they start.
+
+        Raises:
+            UserError: SUMO cannot start, or a world is open already.
         """
         if World._open:
             raise UserError("libsumo holds one simulation per process: close the other World first")
@@ -105,36 +107,38 @@ class World:
         self.scenario = scenario
         self.vehicles = scenario.vehicles
         self._libsumo = load_libsumo()
-        self.x_m: FloatArray = np.empty((self.vehicles, corridors))
-        self.v_mps: FloatArray = np.empty((self.vehicles, corridors))
+        shape = self.vehicles, corridors
+        self.x_m: FloatArray = np.empty(shape)
+        self.v_mps: FloatArray = np.empty(shape)
         mainline, ramp = hosted_paths(self.road)
         self._paths = [ramp if row == VUT else mainline for row in range(self.vehicles)]
-        self._parking_m = [max(-PARKING_M, path.starts_m[0]) for path in self._paths]
         self._lanes = [[path.lanes(k) for k in range(corridors)] for path in self._paths]
-        self._mainline_lanes = [frozenset(lanes) for lanes in self._lanes[POV]]
-        self._start_m_of_lane = {
-            lane: start_m
-            for path in self._paths
-            for k in range(corridors)
-            for lane, start_m in zip(path.lanes(k), path.starts_m, strict=True)
-        }
+        self._start_m_of_lane: dict[str, float] = {}
+        for path, lanes in zip(self._paths, self._lanes, strict=True):
+            for names in lanes:
+                self._start_m_of_lane |= zip(names, path.starts_m, strict=True)
+        self._ids = [f"{who}.{k}" for who in VEHICLES[: self.vehicles] for k in range(corridors)]
         self._merged: NDArray[np.bool_] = np.zeros(corridors, dtype=np.bool_)
         """Whether SUMO has the VUT on the mainline's lane of a road with an acceleration lane."""
-        self._start_m: FloatArray = np.zeros((self.vehicles, corridors))
+        self._start_m: FloatArray = np.zeros(shape)
         """Lane coordinates at which the lanes begin on which the vehicles are."""
+        self._by_sumo: NDArray[np.bool_] = np.zeros(shape, dtype=np.bool_)
+        """Whether SUMO drives a vehicle; the others hold the speed that they are told."""
+        self._lane_changes = vut_type is not None and self.road.lane_m is not None
+        """Whether SUMO's lane-change model decides when VUTs merge."""
         self._start()
 
     def restart(self) -> None:
-        """Start SUMO afresh, with parked vehicles; what ran is gone."""
+        """Start SUMO again, with vehicles at a stand."""
         self.close()
         self._start()
 
     def _start(self) -> None:
-        libsumo = self._libsumo
+        libsumo, vehicle = self._libsumo, self._libsumo.vehicle
+        self._by_sumo[:] = self._merged[:] = False
         with scratch_folder() as folder:
-            net_file = folder / "corridors.net.xml"
+            net_file, types_file = folder / "corridors.net.xml", folder / "types.add.xml"
             net_file.write_bytes(hosted_net(self.road, self.corridors))
-            types_file = folder / "types.add.xml"
             types_file.write_bytes(_types(self.vut_type, self.car_type, self.scenario))
             messages = folder / "messages"
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
@@ -142,52 +146,38 @@ class World:
                 with _standard_error_into(messages):
                     libsumo.start(["sumo", *files, *SUMO_OPTIONS, *NO_COLLISIONS])
             except libsumo.TraCIException as error:
-                said = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
-                reason = said.removeprefix("Error: ") or error
+                message = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
+                reason = message.removeprefix("Error: ") or error
                 raise UserError(
                     f"SUMO cannot load the net {self.road.path} and its vehicle types: {reason}"
                 ) from error
-        vehicle = libsumo.vehicle
-        self._add, self._remove = vehicle.add, vehicle.remove
-        names = VEHICLES[: self.vehicles]
-        self._ids = [f"{who}.{k}" for who in names for k in range(self.corridors)]
+        # Bound once: attribute look-ups cost as much as the calls themselves.
+        self._add, self._remove, self._move_to = vehicle.add, vehicle.remove, vehicle.moveTo
+        self._step_simulation, self._get_lane = libsumo.simulation.step, vehicle.getLaneID
+        self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
+        self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
         try:
             for index, name in enumerate(self._ids):
                 row, k = divmod(index, self.corridors)
                 libsumo.route.add(f"route.{name}", self._paths[row].route(k))
-                self._enter(name, COMMANDED_VUT if row == VUT else CAR)
+                self._enter(name, row, by_sumo=False)
             libsumo.simulation.step()
             for name in self._ids:
-                vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
-                vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, 0.0)
         except libsumo.TraCIException as error:
             libsumo.close()
             raise UserError(f"SUMO cannot use the net {self.road.path}: {error}") from error
-        # Bound once: attribute look-ups cost as much as the calls themselves.
-        self._step_simulation = libsumo.simulation.step
-        self._move_to, self._set_lane_change_mode = vehicle.moveTo, vehicle.setLaneChangeMode
-        self._set_speed_mode, self._set_max_speed = vehicle.setSpeedMode, vehicle.setMaxSpeed
-        self._set_speed, self._set_previous_speed = _raw(libsumo, "setSpeed", "setPreviousSpeed")
-        self._get_position, self._get_speed = _raw(libsumo, "getLanePosition", "getSpeed")
-        self._get_lane = vehicle.getLaneID
-        self._obeys = np.ones(self.x_m.shape, dtype=bool)
-        """Who holds the speed that it is told, (A, corridors); SUMO drives the others."""
-        self._obeys[VUT] = self.vut_type is None
-        self._lane_changes = self.vut_type is not None and self.road.lane_m is not None
-        """Whether SUMO's lane-change model decides when VUTs merge."""
         World._open = True
         self.read()
 
-    def _enter(self, name: str, vtype: str) -> None:
-        self._add(
-            name,
-            f"route.{name}",
-            typeID=vtype,
-            departLane="0",
-            departPos="0",
-            departSpeed="0",
-        )
+    def _enter(self, name: str, row: int, *, by_sumo: bool) -> None:
+        """Add a vehicle of a row to the simulation."""
+        at_start = {"departLane": "0", "departPos": "0", "departSpeed": "0"}
+        self._add(name, f"route.{name}", typeID=_type_id(row, by_sumo=by_sumo), **at_start)
+        if not (row == VUT and self._lane_changes):
+            self._libsumo.vehicle.setLaneChangeMode(name, 0)
+        if not by_sumo:
+            self._libsumo.vehicle.setSpeedMode(name, SPEED_MODE_COMMANDED)
 
     def place(
         self, corridor: int, starts: Sequence[tuple[float, float]], *, own: bool = False
@@ -203,31 +193,26 @@ class World:
         for row, (x, v) in enumerate(starts):
             name = self._ids[row * self.corridors + corridor]
             lane, start_m = self._lane_at(row, corridor, x)
-            by_sumo = self.vut_type is not None if row == VUT else own and self.car_type is not None
-            renewed = by_sumo or not self._obeys[row, corridor] or self._lane_changes
-            if renewed:
-                # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
-                # model what it told the cars next to it.
-                self._remove(name)
-                self._enter(name, (VUT_TYPE if row == VUT else OWN_CAR) if by_sumo else CAR)
-                self._obeys[row, corridor] = not by_sumo
+            own_type = self.vut_type if row == VUT else self.car_type
+            by_sumo = own_type is not None and (row == VUT or own)
+            # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
+            # model remembers messages to the cars next to it.
+            self._remove(name)
+            self._enter(name, row, by_sumo=by_sumo)
+            self._by_sumo[row, corridor] = by_sumo
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
-            if renewed and not (row == VUT and self._lane_changes):
-                self._set_lane_change_mode(name, 0)
             if not by_sumo:
-                if renewed:
-                    self._set_speed_mode(name, SPEED_MODE_COMMANDED)
                 self._set_speed(name, v)
-            elif row != VUT and self.car_type is not None and "maxSpeed" not in self.car_type:
-                self._set_max_speed(name, max(v, SLOWEST_MPS))
+            elif own_type is not None and row != VUT and "maxSpeed" not in own_type:
+                self._libsumo.vehicle.setMaxSpeed(name, max(v, SLOWEST_MPS))
             self._start_m[row, corridor] = start_m
             self.x_m[row, corridor] = self._get_position(name) + start_m
             self.v_mps[row, corridor] = self._get_speed(name)
 
     def park(self, corridor: int) -> None:
         """Put the vehicles of a corridor aside, at a stand before M."""
-        self.place(corridor, [(x_m, 0.0) for x_m in self._parking_m])
+        self.place(corridor, [(max(-PARKING_M, path.starts_m[0]), 0.0) for path in self._paths])
 
     def _lane_at(self, row: int, corridor: int, x_m: float) -> tuple[str, float]:
         """Return the lane at a coordinate of a vehicle's path, and where that lane begins.
@@ -248,7 +233,8 @@ class World:
     def advance(self) -> None:
         """Let SUMO make its step; `x_m` and `v_mps` stay those before it until `command`.
 
-        Raises `SimulationError`.
+        Raises:
+            SimulationError: SUMO gave up.
         """
         try:
             self._step_simulation()
@@ -266,34 +252,41 @@ class World:
 
     def wants_to_merge(self) -> NDArray[np.bool_]:
         """Return which VUTs SUMO's own lane-change models put on the mainline in its step, (K,)."""
-        names = self._ids[VUT * self.corridors : (VUT + 1) * self.corridors]
-        lanes = map(self._get_lane, names)
-        return np.array([lane in of for lane, of in zip(lanes, self._mainline_lanes, strict=True)])
+        wants = np.zeros(self.corridors, dtype=np.bool_)
+        for k, lanes in enumerate(self._lanes[POV]):
+            wants[k] = self._get_lane(self._ids[VUT * self.corridors + k]) in lanes
+        return wants
 
     def command(self, a_mps2: FloatArray, merged: NDArray[np.bool_] | None = None) -> None:
-        """Set the speeds that follow from accelerations, (A, corridors), and read the state.
+        """Set the speeds that follow from accelerations, and read the state.
 
-        `merged` says which VUTs are on the mainline after the step, (corridors,), where the road
-        has an acceleration lane. Comes after `advance`; the two are one step. Raises
-        `SimulationError`.
+        Comes after `advance`; the two are one step.
+
+        Args:
+            a_mps2: accelerations, (A, corridors).
+            merged: where the road has an acceleration lane, which VUTs are on the mainline after
+                the step, (corridors,).
+
+        Raises:
+            SimulationError: SUMO gave up, or a vehicle is not where eq. (4) has it.
         """
         v_mps: FloatArray = np.maximum(self.v_mps + a_mps2 * DT_S, 0.0)
         expected_m = self.x_m + self.v_mps * DT_S
+        speeds, accelerations = v_mps.ravel().tolist(), a_mps2.ravel().tolist()
         try:
             if merged is not None:
                 self._change_lanes(merged, expected_m[VUT], v_mps[VUT])
-            driven_by_sumo = self.vut_type is not None or self.car_type is not None
-            for row, k in np.argwhere(~self._obeys).tolist() if driven_by_sumo else ():
-                name, x = self._ids[row * self.corridors + k], float(expected_m[row, k])
+            for index in np.flatnonzero(self._by_sumo).tolist():
+                row, k = divmod(index, self.corridors)
+                name, x = self._ids[index], float(expected_m[row, k])
                 lane, start_m = self._lane_at(row, k, x)
                 self._move_to(name, lane, x - start_m)
-                self._set_previous_speed(name, float(v_mps[row, k]), float(a_mps2[row, k]))
+                self._set_previous_speed(name, speeds[index], accelerations[index])
             # A vehicle that keeps its speed needs no command: SUMO holds the last one.
-            told = (v_mps != self.v_mps) & self._obeys
-            names, speeds = [*compress(self._ids, told.ravel().tolist())], v_mps[told].tolist()
-            # The quickest loops that there are: C all the way down into SUMO.
-            deque(map(self._set_previous_speed, names, speeds, a_mps2[told].tolist()), maxlen=0)
-            deque(map(self._set_speed, names, speeds), maxlen=0)
+            for index in np.flatnonzero((v_mps != self.v_mps) & ~self._by_sumo).tolist():
+                name = self._ids[index]
+                self._set_previous_speed(name, speeds[index], accelerations[index])
+                self._set_speed(name, speeds[index])
             self.x_m, self.v_mps = self._read_x_m(expected_m), v_mps
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
@@ -314,22 +307,16 @@ class World:
     def read(self) -> None:
         """Read positions and speeds of all vehicles from SUMO, wherever it has driven them."""
         self.v_mps = self._of_all(self._get_speed)
-        position_m = self._of_all(self._get_position)
-        for index, name in enumerate(self._ids):
-            self._start_m.flat[index] = self._lane_begins_m(name)
-        self.x_m = position_m + self._start_m
+        self._start_m = self._of_all(self._lane_begins_m)
+        self.x_m = self._of_all(self._get_position) + self._start_m
 
     def _read_x_m(self, expected_m: FloatArray) -> FloatArray:
         """Read positions from SUMO, (A, corridors), and check that they are as expected."""
         position_m = self._of_all(self._get_position)
         # In most steps every vehicle is on the lane on which it was.
-        x_m = position_m + self._start_m
-        off_m = x_m - expected_m
-        if np.vdot(off_m, off_m) <= EXACT_M**2:
-            return x_m
-        # The others are asked for their lanes.
-        for row, k in np.argwhere(~(np.abs(off_m) <= EXACT_M / off_m.size)).tolist():
-            self._start_m[row, k] = self._lane_begins_m(self._ids[row * self.corridors + k])
+        off_m = position_m + self._start_m - expected_m
+        if not np.vdot(off_m, off_m) <= EXACT_M**2:
+            self._start_m = self._of_all(self._lane_begins_m)
         x_m = position_m + self._start_m
         off = np.abs(x_m - expected_m).max()
         if not off <= EXACT_M:
@@ -357,28 +344,32 @@ class World:
         self.close()
 
 
+def _type_id(row: int, *, by_sumo: bool) -> str:
+    """Return the id of the vType of the vehicles of a row."""
+    who = "vut" if row == VUT else "car"
+    return f"{who}.sumo" if by_sumo else who
+
+
 def _types(
     vut_type: Mapping[str, str] | None, car_type: Mapping[str, str] | None, scenario: Scenario
 ) -> bytes:
     """Return the additional file with the vTypes."""
     root = etree.Element("additional")
-    told = {"minGap": "0", "maxSpeed": repr(MAX_SPEED_MPS)}
-    for name, length_m in ((CAR, scenario.pov_length_m), (COMMANDED_VUT, scenario.vut_length_m)):
-        etree.SubElement(root, "vType", {"id": name, "length": repr(length_m), **told})
-    for name, length_m, model in (
-        (VUT_TYPE, scenario.vut_length_m, vut_type),
-        (OWN_CAR, scenario.pov_length_m, car_type),
-    ):
-        if model is not None:
+    for row, own_type in ((POV, car_type), (VUT, vut_type)):
+        length_m = repr(scenario.vut_length_m if row == VUT else scenario.pov_length_m)
+        told = {"id": _type_id(row, by_sumo=False), "minGap": "0", "maxSpeed": repr(MAX_SPEED_MPS)}
+        etree.SubElement(root, "vType", told, length=length_m)
+        if own_type is not None:
             # A driver who knows the limits and wants the level-0 speed.
             careful = {
-                "length": repr(length_m),
+                "id": _type_id(row, by_sumo=True),
+                "length": length_m,
                 "maxSpeed": repr(scenario.level0_v_mps),
                 "accel": repr(scenario.a_max_mps2),
                 "decel": repr(-scenario.a_min_mps2),
                 "emergencyDecel": repr(-scenario.a_min_mps2),
             }
-            etree.SubElement(root, "vType", {"id": name, **careful, **model})
+            etree.SubElement(root, "vType", {**careful, **own_type})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
 
 

@@ -142,7 +142,7 @@ ATTACKS = {
     "elements": (NET, first('<edge id="e"/>' * 5001), host, "has more than 5000 elements"),
     "depth": (NET, first("<a>" * 1000), host, "is not readable XML"),
     "UTF-16": (RECORD, in_utf_16, play, "save it as UTF-8"),
-    "far time": (RECORD, instead('time="0.10"', 'time="9e99"'), play, "time is '9e99'"),
+    "far time": (RECORD, instead('time="0.10"', 'time="9e99"'), play, "missing or wrong value"),
     # Not the file that it seems.
     "pipe of settings": (SETTINGS, pipe, export, "it is not a file"),
     "pipe of outcomes": (OUTCOMES, pipe, export, "it is not a file"),

@@ -30,7 +30,6 @@ from merge_sumo.sumo import mirror
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.world import World
 
-LANE_WIDTH_M = 3.2
 STEPS = 300
 RANDOM = np.random.default_rng(0).uniform(US23.a_min_mps2, US23.a_max_mps2 + 1.5, (STEPS, 2))
 STANDS_THEN_GOES = np.array([(2.0, -4.0 if step < 120 else 2.0) for step in range(STEPS)])
@@ -97,8 +96,6 @@ class TestAnExport:
         tree = etree.parse(write_openscenario(made, 0, tmp_path / "case", road))
         road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
         segments = lane_centres(tmp_path / "case" / road_file)
-        # Where a lane ends, OpenDRIVE has no way from it to the next lane.
-        crossing_m = road.ramp.pieces[-2].length_m if road.lane_drop else 0.0
         compared = 0
         for who, column in (("pov", 0), ("vut", 1)):
             vertices = tree.findall(f".//Trajectory[@name='{who} recorded']//Vertex")
@@ -106,9 +103,12 @@ class TestAnExport:
             for vertex, x_m in zip(vertices, motion, strict=True):
                 place = vertex.find("Position/WorldPosition")
                 off_m = distance(segments, float(place.get("x")), float(place.get("y")))
-                changes = who == "vut" and -crossing_m <= x_m < 0.0
-                assert off_m < (LANE_WIDTH_M if changes else 0.03), x_m
-                compared += not changes
+                path = road.ramp if who == "vut" else road.mainline
+                if not path.piece(x_m).is_internal:
+                    assert off_m < 0.03, x_m
+                    compared += 1
+                elif not road.lane_drop or who == "pov":
+                    assert off_m < 1.0, "netconvert draws its own ways over junctions"
         assert compared > 150
 
     @pytest.mark.parametrize("name", LANES)
@@ -120,7 +120,8 @@ class TestAnExport:
         for on_ramp in (False, True):
             for x_m in np.arange(max(begin_m, -200.0), end_m + 100.0, 1.7):
                 at = road.lane_point(float(x_m), on_ramp=on_ramp)
-                assert distance(segments, at.x_m, at.y_m) < 0.03, x_m
+                if not at.lane.startswith(":"):
+                    assert distance(segments, at.x_m, at.y_m) < 0.03, x_m
         entries = etree.parse(tmp_path / "road.xodr").findall(".//lane[@type='entry']")
         assert len(entries) == len(road.acceleration_lane.lanes)
 
