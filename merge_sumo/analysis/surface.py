@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.samplers.failure_probability import JUDGED_FROM, learn_chance
+from merge_sumo.samplers.surrogate import JUDGED_FROM, learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.workers import workers_or_cores

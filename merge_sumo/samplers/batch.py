@@ -17,26 +17,26 @@ from merge_sumo.samplers.candidates import (
     surrogate_candidates,
 )
 from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.failure_probability import FailureProbability, nearness
 from merge_sumo.samplers.history import LevelHistory
-from merge_sumo.samplers.predictor import disagreement, failure_probability
+from merge_sumo.samplers.predictions import chance_by_gaps, disagreement
+from merge_sumo.samplers.surrogate import Surrogate, nearness
 from merge_sumo.scenario.case import FloatArray
 
 # Fewest failures to aim at failures alone; otherwise the nearest cases stand in for them, after
 # PATIENCE cases.
 NEAREST = 3
 PATIENCE = 40
-# Least covered share of the ball of a pick for the later picks of the batch, and covered share of
-# the ball of a pending case.
+# Covered share of the ball of a pending case, and least covered share of the ball of a pick.
 PICKED = 0.8
 # Value of a covered ball: likely failures are still preferred.
 EVEN_IF_COVERED = 1e-3
 
 
 def near_miss_limit(history: LevelHistory) -> float | None:
-    """Return the gap (or margin) that the search counts as a failure; None for the true limit.
+    """Return the gap (or margin) up to which a case is treated as a failure.
 
-    With few failures, the nearest misses guide the search, as in subset simulation.
+    None is the limit of the criterion. With few failures the nearest misses guide the search, as
+    in subset simulation.
     """
     if (history.failures > 0).sum() >= NEAREST or len(history.points) < PATIENCE:
         return None
@@ -117,8 +117,10 @@ def greedy(
 class LevelSearch:
     """Search for the batch of a level: candidates with P(fail), and a greedy choice among them.
 
-    The model of the controller rolls the candidates of all levels out together: the sampler calls
-    it and passes its predictions to the searches.
+    The model of the controller predicts the gaps of the candidates of all levels together, so the
+    sampler calls it between the steps of the searches: `screening_candidates` for one member of the
+    model, `shortlist` and rounds of `refinement_candidates` for all members, each of these followed
+    by `add`, and at last `batch`. Without the model, `surrogate_batch` does all.
 
     Attributes:
         history: outcomes of the level.
@@ -141,7 +143,7 @@ class LevelSearch:
             rng: generator of the candidates.
         """
         self.history, self.pending = history, pending
-        self.surrogate = FailureProbability(history) if len(history.points) >= 2 else None
+        self.surrogate = Surrogate(history) if len(history.points) >= 2 else None
         self._weight, self._rng = weight, rng
         self._grid = covered_grid(history, pending)
         self.points: FloatArray = np.empty((0, history.dims))
@@ -155,13 +157,13 @@ class LevelSearch:
             points: cases, (n, d).
             gaps: their predicted gaps, (M, n).
         """
-        by_model = by_surrogate = failure_probability(gaps)
+        by_model = by_surrogate = chance_by_gaps(gaps)
         if self.surrogate is not None:
             by_surrogate = self.surrogate.predict(points)
         by_both = self._weight * by_model + (1.0 - self._weight) * by_surrogate
         return np.array([by_model, by_surrogate, by_both])
 
-    def screened(self) -> FloatArray:
+    def screening_candidates(self) -> FloatArray:
         """Return candidates, (m, d), for one member of the model."""
         history, rng = self.history, self._rng
         # With more than three coordinates failures leave many gaps, so more candidates are uniform.
@@ -176,7 +178,7 @@ class LevelSearch:
             screened.append(around(failing, 300, LOCAL_REACH * radius_for(history.dims), rng))
         return np.concatenate(screened)
 
-    def first(self, screened: FloatArray, gaps: FloatArray, n: int) -> FloatArray:
+    def shortlist(self, screened: FloatArray, gaps: FloatArray, n: int) -> FloatArray:
         """Return the first candidates, (m, d), for all members.
 
         Args:
@@ -185,7 +187,7 @@ class LevelSearch:
             n: size of the batch.
         """
         # 20 uniform ones, the best 80 of the member, and the best 40 of the surrogate.
-        best = self._ranked(screened, failure_probability(gaps), 80)
+        best = self._ranked(screened, chance_by_gaps(gaps), 80)
         chosen = [screened[:20], screened[best]]
         if self.surrogate is not None:
             own = self._rng.permutation(surrogate_candidates(self.surrogate, n, self._rng))[:1500]
@@ -201,7 +203,7 @@ class LevelSearch:
             chance = np.concatenate([self.chance, chance])
         self.points, self.gaps, self.chance = points, gaps, chance
 
-    def refined(self, n: int) -> FloatArray:
+    def refinement_candidates(self, n: int) -> FloatArray:
         """Return candidates, (m, d), around the best ones and around a batch of `n`."""
         picks, _ = greedy(self._grid.copy(), self.points, self.chance, self.chance, n)
         best = self._ranked(self.points, self.chance, n)
@@ -231,7 +233,7 @@ class LevelSearch:
         limit = near_miss_limit(history)
         aimed = surrogate
         if limit is not None:
-            aimed = FailureProbability(history, limit)
+            aimed = Surrogate(history, limit)
         points = surrogate_candidates(aimed, n, self._rng)
         aim = aimed.predict(points)
         best = points[self._ranked(points, aim, 150)]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.metrics.fmc import IntArray, radius_for
-from merge_sumo.samplers.failure_probability import FailureProbability
+from merge_sumo.samplers.surrogate import Surrogate
 from merge_sumo.scenario.case import FloatArray
 
 # Reach of candidates around a failure, and around the best candidates, in radii of the FMC.
@@ -14,9 +14,7 @@ LOCAL_REACH = 2.0
 REFINED_REACH = 0.6
 
 
-def surrogate_candidates(
-    surrogate: FailureProbability, n: int, rng: np.random.Generator
-) -> FloatArray:
+def surrogate_candidates(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArray:
     """Return more than `n` candidates, (m, d), of the surrogate alone.
 
     Args:
@@ -31,7 +29,7 @@ def surrogate_candidates(
         centres = history.points[np.argsort(history.margin, kind="stable")[:20]]
     # 40 lines of 120 points across the cube along the mean slope of the learned values.
     steps = np.linspace(-1.0, 1.0, 120) + rng.uniform(-0.01, 0.01, (40, 120))
-    lines = rng.random((40, 1, history.dims)) + steps[..., None] * surrogate.slope
+    lines = rng.random((40, 1, history.dims)) + steps[..., None] * surrogate.gap_axis
     lines = lines.reshape(-1, history.dims)
     uniform = rng.random((1500 + n, history.dims))
     near = around(centres, 600, LOCAL_REACH * radius_for(history.dims), rng)
@@ -57,7 +55,7 @@ def around(points: FloatArray, n: int, reach: float, rng: np.random.Generator) -
     return np.clip(centres + reach * np.sqrt(rng.random((n, 1))) * direction, 0.0, 1.0)
 
 
-def between(surrogate: FailureProbability, n: int, rng: np.random.Generator) -> FloatArray:
+def between(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArray:
     """Draw points between safe cases of the two merging orders, most in narrow brackets.
 
     Args:

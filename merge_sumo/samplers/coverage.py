@@ -16,7 +16,7 @@ from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import LevelSearch, Proposal
 from merge_sumo.samplers.candidates import spread_out
 from merge_sumo.samplers.controller_model import ControllerModelPair
-from merge_sumo.samplers.predictor import gain_factor, model_weight
+from merge_sumo.samplers.predictions import gain_factor, model_weight
 from merge_sumo.scenario.case import Case, FloatArray
 
 
@@ -111,17 +111,17 @@ class CoverageSampler(Sampler):
         """Give searches their candidates, rolled out by the model at all levels together."""
         if not searches or self.predictor is None:
             return
-        points = {level: search.screened() for level, search in searches.items()}
+        points = {level: search.screening_candidates() for level, search in searches.items()}
         gaps = self.predictor.predict(points, self.proposed() % self.predictor.members)
         for level, search in searches.items():
-            points[level] = search.first(points[level], gaps[level], n)
-        # Three rounds of candidates around the best ones follow.
+            points[level] = search.shortlist(points[level], gaps[level], n)
+        # Predict the shortlist, then three refinements of it.
         for rounds_left in (3, 2, 1, 0):
             gaps = self.predictor.predict(points)
             for level, search in searches.items():
                 search.add(points[level], gaps[level])
                 if rounds_left:
-                    points[level] = search.refined(n)
+                    points[level] = search.refinement_candidates(n)
 
     def _is_modelled(self, level: int) -> bool:
         return self.predictor is not None and self.predictor.can_predict(level)

@@ -27,12 +27,12 @@ from merge_sumo.samplers.batch import (
     near_miss_limit,
 )
 from merge_sumo.samplers.coverage_grid import CoverageGrid
-from merge_sumo.samplers.failure_probability import (
-    FailureProbability,
+from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.surrogate import (
+    Surrogate,
     fit_logistic,
     learned_values,
 )
-from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -120,7 +120,7 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
     history = history_of(points, np.full(30, 0.99), failed=np.abs(gap) < 1.0, gap=missing)
     values, _, _ = learned_values(history)
     assert values[np.isnan(missing)] == pytest.approx(np.arcsinh(100.0 / 3.0) / np.arcsinh(1.0))
-    sure = FailureProbability(history).predict(np.array([[0.5, 0.5], [0.97, 0.5]]))
+    sure = Surrogate(history).predict(np.array([[0.5, 0.5], [0.97, 0.5]]))
     assert sure[0] > 0.5 > sure[1]
 
 

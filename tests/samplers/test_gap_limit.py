@@ -13,9 +13,9 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.controller_model import ControllerModelPair
-from merge_sumo.samplers.failure_probability import learn_chance
 from merge_sumo.samplers.history import bounded
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.surrogate import learn_chance
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import simulate
 

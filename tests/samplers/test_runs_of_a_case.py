@@ -11,9 +11,9 @@ import pytest
 
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.samplers.failure_probability import FailureProbability
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
+from merge_sumo.samplers.surrogate import Surrogate
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -86,7 +86,7 @@ class TestFailureProbability:
 
     def test_is_the_share_of_runs_that_fail(self):
         history, _ = self.history(0.1)
-        model = FailureProbability(history)
+        model = Surrogate(history)
         strip = np.column_stack([np.full(50, 0.5), np.linspace(0.05, 0.95, 50)])
         assert model.predict(strip).mean() == pytest.approx(0.3, abs=0.15)
         assert model.predict(np.array([[0.1, 0.5], [0.9, 0.5]])).max() < 0.05

@@ -9,9 +9,9 @@ import pytest
 
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome, Prediction
-from merge_sumo.samplers.predictor import (
+from merge_sumo.samplers.predictions import (
+    chance_by_gaps,
     disagreement,
-    failure_probability,
     gain_factor,
     model_weight,
 )
@@ -36,12 +36,12 @@ def test_p_fail_is_the_share_of_members_that_predict_a_failure():
     anywhere = 0.05 * 2.0 * 0.881374 / 9.0
     all_members = 0.7 + 0.25 * 0.98821 + anywhere
     expected = [all_members, (all_members + anywhere) / 2.0, anywhere]
-    assert failure_probability(gaps) == pytest.approx(expected, abs=1e-4)
+    assert chance_by_gaps(gaps) == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_member_that_predicts_the_limit_itself_counts_half():
     anywhere = 0.05 * 2.0 * 0.881374 / 9.0
-    assert failure_probability(np.array([[1.0]])) == pytest.approx([0.475 + anywhere], abs=1e-4)
+    assert chance_by_gaps(np.array([[1.0]])) == pytest.approx([0.475 + anywhere], abs=1e-4)
 
 
 def test_disagreement_is_the_spread_of_members_less_where_the_gap_is_large():

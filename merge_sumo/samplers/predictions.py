@@ -11,8 +11,8 @@ from scipy.special import expit, ndtr
 from merge_sumo.metrics.outcome import NO_GAP, Outcome
 from merge_sumo.scenario.case import FloatArray
 
-# Standard deviations of a predicted gap on the scale of `compressed`, with their shares; with the
-# other 5 % the gap may be anywhere on that scale.
+# The error of a predicted gap is a mixture on the scale of `compressed`: normal components, as
+# (standard deviation, weight), and a uniform one with the remaining weight of 5 %.
 WIDTHS = ((0.01, 0.35), (0.1, 0.35), (0.35, 0.25))
 
 
@@ -21,7 +21,7 @@ def compressed(gaps: FloatArray) -> FloatArray:
     return np.arcsinh(np.nan_to_num(gaps, nan=NO_GAP))
 
 
-def failure_probability(gaps: FloatArray) -> FloatArray:
+def chance_by_gaps(gaps: FloatArray) -> FloatArray:
     """Return P(fail), (n,), by the gaps, (M, n), that the members of an ensemble predict."""
     predicted, limit = compressed(gaps), np.arcsinh(1.0)
     # The scale is 9 long: -45 to 45 times the limit.

@@ -19,8 +19,9 @@ from merge_sumo.samplers.gaussian_process import GaussianProcess
 from merge_sumo.samplers.history import LevelHistory, most_informative
 from merge_sumo.scenario.case import FloatArray
 
-# Prior mean and standard deviation of the weights of the log odds, of 1, and of the log distances
-# to the nearest failure and to the curve where the merging order changes.
+# Prior mean and standard deviation of the four weights of the logistic regression: of the log odds,
+# the intercept, and the log distances to the nearest failure and to the curve where the merging
+# order changes.
 PRIOR_WEIGHTS = (np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.5, 1.0, 0.3, 0.3]))
 # Candidate widths w of failing intervals.
 WIDTHS = np.geomspace(0.001, 0.5, 25)
@@ -30,7 +31,7 @@ SURE = 1e-3
 JUDGED_FROM = 3
 
 
-class FailureProbability:
+class Surrogate:
     """P(fail) of the cases of a level.
 
     Failures lie where the gap changes its sign, that is, where the merging order changes. There the
@@ -53,7 +54,7 @@ class FailureProbability:
     Attributes:
         history: the outcomes.
         groups: which cases failed, and which safe ones are of either merging order, each (N,).
-        slope: mean slope of the gap, or of the margin, (d,), of length 1.
+        gap_axis: mean slope of the gap, or of the margin, (d,), of length 1.
     """
 
     def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
@@ -78,23 +79,25 @@ class FailureProbability:
         posteriors = []
         for rough in (False, True):
             process = GaussianProcess(learned.points, values, rough=rough, noisy=history.varies)
-            lowered = _lowered(self._within(*process.leave_one_out()), distances, WIDTHS[:, None])
-            evidence = _evidence(lowered, distances, history.dims)
+            lowered = _bracketed(self._within(*process.leave_one_out()), distances, WIDTHS[:, None])
+            evidence = _regression_inputs(lowered, distances, history.dims)
             weights, posterior = fit_logistic(evidence, learned.failures, learned.runs)
             best = int((posterior + log_prior).argmax())
             self._fitted.append((process, float(WIDTHS[best]), weights[best]))
             posteriors.append((posterior + log_prior)[best])
-        self._weights = np.exp(np.array(posteriors) - max(posteriors))
-        self.slope = process.rotation[:, 0]
+        self._process_weights = np.exp(np.array(posteriors) - max(posteriors))
+        self.gap_axis = process.rotation[:, 0]
 
     def predict(self, points: FloatArray) -> FloatArray:
         """Return P(fail) of a run of cases, (m, d), as (m,)."""
         distances = [nearest(points, self.history.points[group]) for group in self.groups]
         chances = []
         for process, width, weights in self._fitted:
-            chance = _lowered(self._within(*process.predict(points)), distances, width)
-            chances.append(expit(_evidence(chance, distances, self.history.dims) @ weights))
-        return np.average(chances, axis=0, weights=self._weights)
+            chance = _bracketed(self._within(*process.predict(points)), distances, width)
+            chances.append(
+                expit(_regression_inputs(chance, distances, self.history.dims) @ weights)
+            )
+        return np.average(chances, axis=0, weights=self._process_weights)
 
     def _within(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
         """Return the probability that a normal value is in the failing interval, (m,)."""
@@ -111,7 +114,7 @@ def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | 
     """
     if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
         return None
-    return FailureProbability(history).predict
+    return Surrogate(history).predict
 
 
 def learned_values(
@@ -165,7 +168,7 @@ def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
     return np.minimum(distance, 1.0)
 
 
-def _lowered(
+def _bracketed(
     chance: FloatArray, distances: list[FloatArray], width: float | FloatArray
 ) -> FloatArray:
     """Return P(fail), lowered in a closed bracket of safe cases; (m,), or (W, m) for W widths."""
@@ -175,7 +178,7 @@ def _lowered(
     return np.where(closed, chance * bracket / (bracket + width), chance)
 
 
-def _evidence(chance: FloatArray, distances: list[FloatArray], dims: int) -> FloatArray:
+def _regression_inputs(chance: FloatArray, distances: list[FloatArray], dims: int) -> FloatArray:
     """Return the inputs of the regression, (..., m, 4), by P(fail), (..., m)."""
     to_failing, before, behind = distances
     radius = radius_for(dims)
@@ -216,9 +219,11 @@ def fit_logistic(
     for _ in range(6):
         inputs, now = evidence[active], weights[active]
         chance = expit((inputs @ now[..., None])[..., 0])
-        slope = ((failures - runs * chance)[:, None] @ inputs)[:, 0] - (now - mean) / deviation**2
-        spread = (inputs * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ inputs
-        step = np.linalg.solve(spread + np.diag(deviation**-2.0), slope[..., None])[..., 0]
+        gradient = ((failures - runs * chance)[:, None] @ inputs)[:, 0] - (
+            now - mean
+        ) / deviation**2
+        hessian = (inputs * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ inputs
+        step = np.linalg.solve(hessian + np.diag(deviation**-2.0), gradient[..., None])[..., 0]
         reached = posterior(inputs, now + step)
         while True:
             worse = (reached < best[active]) & (np.abs(step).max(axis=1) > SURE)
