@@ -1,15 +1,10 @@
-"""A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others.
-
-A case is a test case in the suite of its POV level; other suites have the gates, and the cases that
-two versions ran.
-"""
+"""A campaign as JUnit XML, which CI systems read: Jenkins, GitLab, GitHub actions and others."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-
-from lxml import etree
 
 from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
 from merge_sumo.analysis.counterfactuals import causes
@@ -19,6 +14,7 @@ from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
+from merge_sumo.reports.pages import environment
 from merge_sumo.reports.text import change_in_words, step_headline
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
@@ -27,6 +23,27 @@ JUNIT = (".xml",)
 """Endings of the name of such a file."""
 REGRESSION = "regression"
 """Type of a case that fails and passes with an earlier version."""
+
+
+@dataclass(slots=True)
+class TestCase:
+    """A test case of JUnit.
+
+    Attributes:
+        name: its name.
+        group: last part of its class name.
+        time_s: simulated time up to M.
+        tag: failure, error or skipped; "" where it passed.
+        kind: type of the failure or error.
+        message: reason of the tag.
+    """
+
+    name: str
+    group: str
+    time_s: float = 0.0
+    tag: str = ""
+    kind: str = ""
+    message: str = ""
 
 
 def check_junit(path: Path, folder: Path) -> None:
@@ -41,9 +58,9 @@ def write_junit(
 ) -> None:
     """Write the JUnit file of a campaign.
 
-    A failure and a timeout are a `failure`, whose type is the severity; an error of the VUT or of
-    the simulation is an `error`; an undecided case is `skipped`. The facts are properties. Times
-    are simulated seconds up to M.
+    There is a suite of gates, one of the cases that an earlier version also ran, and one of each
+    POV level. A failure and a timeout are a `failure`, whose type is the severity; an error of the
+    VUT or of the simulation is an `error`; an undecided case is `skipped`.
 
     Args:
         path: new file to write.
@@ -55,103 +72,82 @@ def write_junit(
     Raises:
         UserError: the file exists or cannot be written.
     """
-    root = etree.Element("testsuites", name=f"merge-sumo {run.vut}")
-    _gates(root, facts, verdict, gates)
+    tested = TestCase(f"the VUT reaches {verdict.goal}", "gates")
+    if not verdict.tested:
+        tested.tag, tested.kind = "failure", "NOTHING_TESTED"
+        tested.message = verdict.nothing_tested
+    suites = {"gates": [tested]}
+    for gate in gates:
+        test = TestCase(gate.name, "gates", kind="GATE", message=gate.sentence)
+        test.tag = "failure" if gate.met else ""
+        suites["gates"].append(test)
     compared = compare_against(run)
     if compared is not None:
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
-        _step(root, f"against {earlier}", compared.steps[0])
+        suites[f"against {earlier}"] = _step(compared.steps[0])
+    for level in by_level(facts):
+        suites[f"POV level {level_name(level)}"] = []
+    for test in _cases(run):
+        suites[f"POV {test.group}"].append(test)
+    _write(path, f"merge-sumo {run.vut}", suites, facts)
 
+
+def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
+    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
+    suites = {}
+    for step in compared.steps:
+        before, after = compared.versions[step.before - 1], compared.versions[step.after - 1]
+        name = printable(f"{before.folder} to {after.folder or after.vut}")
+        suites[name] = _step(step, every=compared.text is not None)
+    _write(path, "merge-sumo compare", suites)
+
+
+def _write(
+    path: Path, name: str, suites: dict[str, list[TestCase]], facts: Sequence[Fact] = ()
+) -> None:
+    template = environment().get_template("junit.xml.jinja")
+    text = template.render(name=name, suites=suites, facts=facts)
+    write_new(path, text.strip().encode(), "`junit`")
+
+
+def _cases(run: Run) -> list[TestCase]:
     runs = {}
     for case in by_case(run.outcomes):
         if case.runs > 1:
             runs[case.deciding(run.tolerated).index] = f", {case.in_words}"
     unsure = undecided(run.outcomes, run.tolerated)
     cause_of = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
-    suites = {}
-    for level in by_level(facts):
-        suites[level] = etree.SubElement(root, "testsuite", name=f"POV level {level_name(level)}")
+    tests = []
     for outcome in run.cases:
-        index, level_of_case = outcome.index, level_name(outcome.case.level)
+        index, measures = outcome.index, outcome.measures
         name = f"case {index}: {described(outcome.case)}{runs.get(index, '')}"
-        suite, time_s = suites[outcome.case.level], outcome.measures.t_end_s
-        test = _test(suite, name, f"level{level_of_case}", time_s)
+        test = TestCase(name, f"level {level_name(outcome.case.level)}", measures.t_end_s)
         if index in unsure:
-            etree.SubElement(test, "skipped", message=f"undecided: {cause_of[index]}")
+            test.tag, test.message = "skipped", f"undecided: {cause_of[index]}"
         elif index in cause_of:
-            tag = "error" if outcome.measures.end.is_error else "failure"
+            test.tag = "error" if measures.end.is_error else "failure"
             # A criterion may call a case a failure in which the VUT never reached M.
-            kind = outcome.measures.severity or "failed"
-            if not outcome.is_tested:
-                kind = outcome.measures.end
-            _wrong(test, tag, kind, cause_of[index])
-    _write(path, root)
+            test.kind = (measures.severity or "failed") if outcome.is_tested else measures.end
+            test.message = cause_of[index]
+        tests.append(test)
+    return tests
 
 
-def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
-    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
-    root = etree.Element("testsuites", name="merge-sumo compare")
-    for step in compared.steps:
-        before, after = compared.versions[step.before - 1], compared.versions[step.after - 1]
-        name = printable(f"{before.folder} to {after.folder or after.vut}")
-        _step(root, name, step, every=compared.text is not None)
-    _write(path, root)
-
-
-def _write(path: Path, root: etree._Element) -> None:
-    """Count the test cases of all suites, and write them."""
-    for part in (*root.findall("testsuite"), root):
-        tests = list(part.iter("testcase"))
-        part.set("tests", str(len(tests)))
-        if part is not root and (skipped := len(list(part.iter("skipped")))):
-            part.set("skipped", str(skipped))
-        part.set("failures", str(len(list(part.iter("failure")))))
-        part.set("errors", str(len(list(part.iter("error")))))
-        part.set("time", f"{sum(float(test.get('time', '0')) for test in tests):.1f}")
-    text = etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
-    write_new(path, text, "`junit`")
-
-
-def _gates(
-    root: etree._Element, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
-) -> None:
-    suite = etree.SubElement(root, "testsuite", name="gates")
-    properties = etree.SubElement(suite, "properties")
-    for fact in facts:
-        level = "" if fact.level is None else f"level {level_name(fact.level)}: "
-        etree.SubElement(properties, "property", name=f"{level}{fact.name}", value=fact.shown)
-    tested = _test(suite, f"the VUT reaches {verdict.goal}", "gates")
-    if not verdict.tested:
-        _wrong(tested, "failure", "NOTHING_TESTED", verdict.nothing_tested)
-    for gate in gates:
-        test = _test(suite, gate.name, "gates")
-        if gate.met:
-            _wrong(test, "failure", "GATE", gate.sentence)
-
-
-def _step(root: etree._Element, name: str, step: Step, *, every: bool = False) -> None:
-    """Add a suite of the cases that changed, or of all that two versions ran."""
-    suite = etree.SubElement(root, "testsuite", name=name)
+def _step(step: Step, *, every: bool = False) -> list[TestCase]:
+    """Return the cases that changed, or all that two versions ran."""
+    tests = []
     if step.passes_less:
-        test = _test(suite, "share of cases that pass", "against")
-        _wrong(test, "failure", REGRESSION, step_headline(step))
+        test = TestCase("share of cases that pass", "against", 0.0, "failure", REGRESSION)
+        test.message = step_headline(step)
+        tests.append(test)
     for one in step.cases:
         if one.change is Change.BOTH and not every:
             continue
-        case = f"case {one.b.index}: {described(one.b.case)}"
-        test = _test(suite, case, "against", one.b.measures.t_end_s)
+        name = f"case {one.b.index}: {described(one.b.case)}"
+        test = TestCase(name, "against", one.b.measures.t_end_s)
         if one.change in GOT_WORSE:
-            _wrong(test, "failure", REGRESSION, change_in_words(one))
+            test.tag, test.kind, test.message = "failure", REGRESSION, change_in_words(one)
         elif one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
-            etree.SubElement(test, "skipped", message=f"{one.change}: {change_in_words(one)}")
-
-
-def _test(suite: etree._Element, name: str, group: str, time_s: float = 0.0) -> etree._Element:
-    return etree.SubElement(
-        suite, "testcase", name=name, classname=f"merge-sumo.{group}", time=f"{time_s:.1f}"
-    )
-
-
-def _wrong(test: etree._Element, tag: str, kind: str, message: str) -> None:
-    # Jenkins shows the message, GitLab the text.
-    etree.SubElement(test, tag, type=kind, message=message).text = message
+            test.tag, test.message = "skipped", f"{one.change}: {change_in_words(one)}"
+        tests.append(test)
+    return tests
