@@ -1,8 +1,8 @@
-"""How often cases occur: a stated distribution of each coordinate, or a measured traffic.
+"""The distribution of cases: a distribution of each coordinate, or a measured traffic.
 
-A traffic states how dense the mainline is, and how fast its cars are, with a source:
+A traffic states the density and the speeds of the mainline, with a source:
 
-    density_veh_per_km = 8.7     # of the lane beside the ramp, before the ramp meets it
+    density_veh_per_km = 8.7     # of the lane next to the ramp, before the ramp meets it
     source = "who has measured it, and where it is published"
 
     [speeds]                     # m/s
@@ -35,7 +35,7 @@ Weights = Annotated[
 ]
 ByLevel = Annotated[dict[str, Weight], Meta(description="weights, numbers of 0 or more, by level")]
 LEAST_INSIDE = 1e-9
-"""Share of a distribution that the pool has at least, or its quantiles are no numbers."""
+"""Minimum share of a distribution within the pool: with less its quantiles are not numbers."""
 
 
 class _Shape(Record, frozen=True):
@@ -46,11 +46,12 @@ class _Shape(Record, frozen=True):
 
     @abstractmethod
     def law(self, low: float, high: float) -> Any:
-        """Return it as scipy has it, before it is cut off at bounds."""
+        """Return the distribution of scipy, before it is cut off at bounds."""
 
-    def ends(self, low: float, high: float) -> FloatArray:
-        """Return the chances to be below each of two bounds, (2,)."""
-        return np.asarray(self.law(low, high).cdf([low, high]), dtype=np.float64)
+    def ends(self, low: float, high: float) -> tuple[float, float]:
+        """Return the probabilities to be below each of two bounds."""
+        below, up_to = self.law(low, high).cdf([low, high]).tolist()
+        return below, up_to
 
     def quantiles(self, d: Dimension, chances: FloatArray) -> FloatArray:
         """Return the values, (n,), at chances, (n,), in the unit of a coordinate."""
@@ -60,11 +61,11 @@ class _Shape(Record, frozen=True):
         return np.clip(np.asarray(values, dtype=np.float64), low, high)
 
     def bounds(self, d: Dimension) -> tuple[float, float]:
-        """Return where it is cut off."""
+        """Return the bounds at which it is cut off."""
         return d.low if self.low is None else self.low, d.high if self.high is None else self.high
 
     def check(self, d: Dimension) -> None:
-        """Raise `UserError` where it reaches out of the pool, or never comes to it."""
+        """Raise `UserError` where it is not within the pool, or has no probability there."""
         low, high = self.bounds(d)
         if not d.low <= low < high <= d.high:
             raise UserError(
@@ -73,14 +74,14 @@ class _Shape(Record, frozen=True):
             )
         below, up_to = self.ends(low, high)
         if not up_to - below > LEAST_INSIDE:
-            raise UserError(f"{d.field}: such a distribution never comes to the pool")
+            raise UserError(f"{d.field}: such a distribution has no values within the pool")
 
 
 class Uniform(_Shape, frozen=True, tag_field="kind", tag="uniform"):
-    """All values alike."""
+    """A uniform distribution."""
 
     def law(self, low: float, high: float) -> Any:
-        """Return it as scipy has it."""
+        """Return the distribution of scipy."""
         from scipy.stats import uniform
 
         return uniform(low, high - low)
@@ -93,7 +94,7 @@ class Normal(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="normal"):
     sd: Annotated[float, Meta(ge=1e-3, le=1e3)]
 
     def law(self, low: float, high: float) -> Any:
-        """Return it as scipy has it."""
+        """Return the distribution of scipy."""
         from scipy.stats import norm
 
         return norm(self.mean, self.sd)
@@ -106,7 +107,7 @@ class Histogram(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="histog
     weights: Weights
 
     def law(self, low: float, high: float) -> Any:
-        """Return it as scipy has it; `UserError` where edges and weights make no distribution."""
+        """Return the distribution of scipy; `UserError` for wrong edges or weights."""
         from scipy.stats import rv_histogram
 
         edges, weights = np.array(self.edges), self.weights
@@ -127,10 +128,14 @@ Marginal = Uniform | Normal | Histogram
 class Distribution:
     """The probabilities of cases: weights of levels, and independent coordinates.
 
+    Example:
+        distribution = read_distribution(Path("cases.json"), levels=(0, 1), scenario=US23)
+        points = distribution.points(0, rng.random((100, 2)))
+
     Attributes:
         levels: probability of each level; they add up to 1.
         marginals: by the name of the coordinate, the same at all levels.
-        scenario: whose pool it is over.
+        scenario: the scenario of the pool.
     """
 
     levels: dict[int, float]
@@ -146,39 +151,41 @@ class Distribution:
         return np.column_stack(columns)
 
     def record(self) -> dict[str, Any]:
-        """Return the distribution as a file says it."""
+        """Return the distribution as a file has it."""
         levels = {str(level): weight for level, weight in self.levels.items()}
         return {"levels": levels, **to_plain(self.marginals)}
 
 
 def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenario) -> Distribution:
-    """Return the distribution that a JSON file states; without a file, uniform over the pool.
+    """Return the distribution in a JSON file, cut off at the pool's bounds.
 
-    The file has weights of levels and one entry for each coordinate; what is left out is uniform:
+    The file has weights of levels and one entry for each coordinate; missing ones are uniform:
 
         {"levels": {"1": 3, "2": 1},
          "x_pov0_m": {"kind": "uniform", "low": -300, "high": -200},
          "v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 2},
          "svo_rad": {"kind": "histogram", "edges": [0, 0.5, 1.5], "weights": [2, 1]}}
 
-    It is cut off at the pool's bounds. Raises `UserError` with the place in the file where it is no
-    distribution over the cases of `levels`.
-
     Args:
         path: the JSON file; None for the uniform distribution.
         levels: levels of the cases.
         scenario: scenario of the cases.
+
+    Raises:
+        UserError: where the file is not a distribution over the cases of `levels`.
     """
     coordinates = scenario.dimensions(2)
     fields = [(d.field, Marginal, Uniform()) for d in coordinates]
     even = dict.fromkeys(map(str, levels), 1.0)
-    kind = record_type("distribution", [("levels", ByLevel | None, None), *fields])
+    kind = record_type("distribution", [("levels", ByLevel, {}), *fields])
+    marginals = {}
     try:
-        stated = kind() if path is None else decode(path.read_bytes(), kind)
+        content = kind() if path is None else decode(path.read_bytes(), kind)
         for d in coordinates:
-            getattr(stated, d.field).check(d)
-        weights = even if stated.levels is None else stated.levels
-        if not weights or not weights.keys() <= even.keys():
+            marginals[d.field] = getattr(content, d.field)
+            marginals[d.field].check(d)
+        weights = content.levels or even
+        if not weights.keys() <= even.keys():
             known = ", ".join(sorted(even))
             raise UserError(f"levels must give weights to levels of the campaign: {known}")
         total = sum(weights.values())
@@ -188,25 +195,30 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
-    marginals = {d.field: getattr(stated, d.field) for d in coordinates}
+    shares = {}
+    for level, weight in weights.items():
+        if weight > 0.0:
+            shares[int(level)] = weight / total
     return Distribution(shares, marginals, scenario)
 
 
 FOLDER = Path(__file__).resolve().parent / "traffics"
 SUFFIX = ".toml"
 LEAST_SPEEDS = 0.01
-"""Share of the speeds of a traffic that a pool has at least, or nothing is estimated."""
+"""Minimum share of the speeds of a traffic within a pool."""
 
 
 class Traffic(Record, frozen=True):
-    """A traffic as its file states it.
+    """A traffic of the mainline.
+
+    Example:
+        cars_per_merge = named_traffic("exid-5").cars_in_pool(US23)
 
     Attributes:
-        source: where the figures are from.
-        speeds: of the cars of the lane beside the ramp, in m/s.
+        source: source of the figures.
+        speeds: distribution of the speeds of cars on the lane next to the ramp, m/s.
         density_veh_per_km: cars per kilometre of that lane, before the ramp meets it; 1,000 would
-            be cars of a metre, one behind the other.
+            be cars of a metre without gaps.
         name: name of its file.
     """
 
@@ -219,53 +231,54 @@ class Traffic(Record, frozen=True):
         """Return the share of the speeds within the pool of a scenario.
 
         Raises:
-            UserError: where the scenario has no coordinates of a single car of the mainline, or
-                the pool next to no speeds of this traffic.
+            UserError: where the scenario has several cars on the mainline, or the pool hardly any
+                speeds of this traffic.
         """
-        merge = scenario
-        if merge.vehicles > 2:
+        if scenario.vehicles > 2:
             raise UserError(
-                f"{merge.name} has cars ahead of the POV and behind it, at headways of its own: a "
-                "traffic needs a scenario without them"
+                f"{scenario.name} has cars ahead of the POV and behind it, at headways of its own: "
+                "a traffic needs a scenario without them"
             )
-        low, high = merge.v_pov0_mps
-        below, up_to = self.speeds.ends(low, high).tolist()
+        low, high = scenario.v_pov0_mps
+        below, up_to = self.speeds.ends(low, high)
         if up_to - below < LEAST_SPEEDS:
             raise UserError(
                 f"less than {LEAST_SPEEDS:.0%} of the speeds of {self.name} lie in the pool, "
                 f"{low:g} to {high:g} m/s: run the campaign on a scenario with other v_pov0_mps"
             )
-        return float(up_to - below)
+        return up_to - below
 
     def in_pool(self, scenario: Scenario, levels: Sequence[int]) -> Distribution:
-        """Return how often the cases of a scenario occur, levels alike.
+        """Return the distribution of the cases of a scenario: positions and psi are uniform.
 
-        Where cars start is uniform, and so is psi. Raises `UserError` as `share_in_pool`.
+        Raises:
+            UserError: as `share_in_pool`.
         """
         self.share_in_pool(scenario)
         uniform = read_distribution(None, levels, scenario)
         return replace(uniform, marginals={**uniform.marginals, "v_pov0_mps": self.speeds})
 
     def cars_in_pool(self, scenario: Scenario) -> float:
-        """Return how many cars of the mainline, per merge, start in the pool of a scenario."""
+        """Return the number of cars of the mainline per merge that start in the pool."""
         low_m, high_m = scenario.x_pov0_m
         return self.density_veh_per_km / 1000.0 * (high_m - low_m) * self.share_in_pool(scenario)
 
 
 def shipped_traffics() -> list[str]:
-    """Return the names of the traffics that the package brings."""
+    """Return the names of the traffics of the package."""
     return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
 
 
 def named_traffic(name: str) -> Traffic:
     """Return the traffic of a name or of a TOML file; `UserError` where there is none."""
-    known = shipped_traffics()
-    if name not in known and not name.endswith(SUFFIX):
+    known, path = shipped_traffics(), Path(name)
+    if name in known:
+        path = FOLDER / f"{name}{SUFFIX}"
+    elif path.suffix != SUFFIX:
         raise UserError(
             f"there is no traffic {name!r}: {meant(name, known)}choose {', '.join(known)}, or a "
             f"file NAME{SUFFIX}"
         )
-    path = FOLDER / f"{name}{SUFFIX}" if name in known else Path(name)
     _, record = read_toml(path, "traffic")
     try:
         traffic = convert({"name": path.stem, **record}, Traffic)

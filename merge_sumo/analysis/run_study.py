@@ -1,4 +1,4 @@
-"""What every study of a recorded campaign begins with: the campaign, and how its cases run now."""
+"""A recorded campaign as studies of it need it, and the files that they leave in its folder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from merge_sumo.campaigns.run import FILES, Run
+from merge_sumo.campaigns.run import Run
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import check_ours, files_now, replace_own
@@ -37,11 +37,11 @@ class StudyFile(Generic[R]):
 
     @property
     def _mark(self) -> bytes:
-        """The name of the first field, which every file of the kind has in it."""
+        """The name of the first field, which is in every file of the kind."""
         return f'"{self.kind.__struct_fields__[0]}"'.encode()
 
     def check(self, folder: Path) -> None:
-        """Raise `UserError` where a file of this name is not ours to replace."""
+        """Raise `UserError` where a file of this name was not created by merge-sumo."""
         check_ours(folder / self.name, self._mark)
 
     def read(self, folder: Path) -> R | None:
@@ -65,15 +65,15 @@ class StudyFile(Generic[R]):
 T = TypeVar("T")
 
 OnPart = Callable[[str, int, int, str, str], None]
-"""Told how far a part of a study is: title, things done, things in all, what a thing is, a note."""
+"""Called with the progress of a part of a study: title, items done, all items, unit, note."""
 
 
 def check_least(asked: object, **least: int) -> None:
-    """Raise `UserError` for a number of what is asked, by its name, that is less than the least."""
+    """Raise `UserError` for an option, by its name, that is less than the least."""
     for name, number in least.items():
-        given = getattr(asked, name)
-        if given is not None and given < number:
-            raise UserError(f"`{name}` is {given}: it must be {number} or more")
+        value = getattr(asked, name)
+        if value is not None and value < number:
+            raise UserError(f"`{name}` is {value}: it must be {number} or more")
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,24 +116,21 @@ class RunStudy:
         return results
 
     def record(self) -> dict[str, Any]:
-        """Return what a study keeps of the system that it tested, as `campaign.json` does."""
+        """Return the settings, versions and hashes of the study, as in `campaign.json`."""
         return record_of(self.settings, self.plan)
 
-    def check_same_system(
-        self, levels: Iterable[int] | None = None, *, may_change: bool = False
-    ) -> None:
-        """Raise `UserError` where the campaign had another net, or other POVs at some levels.
+    def check_same_system(self, *, may_change: bool = False) -> None:
+        """Raise `UserError` where the campaign had another net or other POVs.
 
-        By default they are all levels. A controller that has changed is a `Notice`, unless that is
-        what the study is of.
+        A controller that has changed is a `Notice`, unless it `may_change`.
         """
-        run, road, today = self.run, self.plan.road, self.record()
+        run, road, now = self.run, self.plan.road, self.record()
         if run.settings.net_sha256 not in (None, road.sha256):
             raise UserError(
                 f"{run.folder} was run on another net than {road.path} is now: put that back"
             )
-        for level in self.settings.levels if levels is None else levels:
-            if not same_pov(run.record, today, level):
+        for level in self.settings.levels:
+            if not same_pov(run.record, now, level):
                 raise UserError(
                     f"{run.folder} was run against another POV of level {level_name(level)} than "
                     "today's: give its `policies`, or the same `pov`"
@@ -143,17 +140,17 @@ class RunStudy:
 
 
 def notice_changes(run: Run, plan: SimulationPlan) -> None:
-    """Warn with a `Notice` where a controller that a campaign ran is not as it was then."""
-    pov = plan.povs.own
-    specs = str(plan.vut.spec), None if pov is None else str(pov.spec)
-    loaded = plan.vut.files or {}, plan.povs.files or {}
-    for name, setting, spec, files in zip(FILES, ("vut", "pov"), specs, loaded, strict=True):
-        known = getattr(run.settings, name)
-        if spec is None or spec != getattr(run.settings, setting) or known is None:
+    """Warn with a `Notice` where the files of a controller have changed since a campaign."""
+    controllers = [(plan.vut, run.settings.vut, run.settings.vut_files)]
+    if plan.povs.own is not None:
+        controllers.append((plan.povs.own, run.settings.pov or "", run.settings.pov_files))
+    for controller, recorded, known in controllers:
+        if str(controller.spec) != recorded or known is None:
             continue
-        now = files_now(known, files)
-        if differing := [file for file, sha256 in known.items() if now[file] != sha256]:
+        now = files_now({**known}, controller.files or {})
+        changed = [file for file, sha256 in known.items() if now[file] != sha256]
+        if changed:
             notice(
-                f"{printable(differing[0])} is not as it was in {run.folder}: {spec} may "
+                f"{printable(changed[0])} is not as it was in {run.folder}: {controller.spec} may "
                 "drive otherwise than it did there"
             )

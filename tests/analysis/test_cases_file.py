@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import tomllib
 from dataclasses import replace
@@ -42,10 +41,6 @@ class Own:
 class Late(Own):
     AHEAD_M = 60.0
 
-class Blind(Own):
-    def act(self, seen):
-        return 1.0
-
 class Lost(Own):
     def act(self, seen):
         return 1.0 / 0.0 if seen.x_vut_m > -50.0 else super().act(seen)
@@ -53,21 +48,16 @@ class Lost(Own):
 WORSE = "design2?kp=0.7"
 
 
-@pytest.fixture(scope="module", params=["us23", "us23-lane"])
-def run(request, tmp_path_factory):
-    scenario = named_scenario(request.param)
-    judged = {"scenario": scenario, "fail_when": scenario.criterion, "cases": 120}
-    settings = campaign_settings(vut="design2", levels=(0, 1, 2), seed=2, **judged)
-    return run_campaign(settings, tmp_path_factory.mktemp("campaigns") / request.param)
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    settings = campaign_settings(vut="design2", levels=(0, 1, 2), seed=2, cases=120)
+    return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")
 
 
 @pytest.fixture
 def file(run, tmp_path):
     """Return the path of a file of 40 cases."""
     return write_cases(run, [], tmp_path / "kept")
-
-
-on_us23 = pytest.mark.parametrize("run", ["us23"], indirect=True)
 
 
 def edit(path, old, new, count=1):
@@ -107,7 +97,7 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert len(tolerant.lines()) > 2, "what changed is shown all the same"
 
 
-def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path, monkeypatch):
+def test_a_controller_of_the_user_is_run_by_its_host(command_line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(CONTROLLER)
     run_campaign(campaign_settings(vut="own.py:Own", cases=60), tmp_path / "run")
@@ -123,7 +113,6 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
     )
     for name, words in (
         ("Late", ", worse but passing: Safe: "),
-        ("Blind", ", broke: "),
         ("Lost", ", broke: VUT_ERROR at "),
     ):
         said = command_line("rerun", "c.toml", "--vut", f"own.py:{name}")
@@ -133,7 +122,6 @@ def test_a_controller_of_a_persons_own_is_run_by_its_host(command_line, tmp_path
     assert ms.rerun("c.toml", vut="own.py:Lost").broke == 40, "no error is accepted"
 
 
-@on_us23
 def test_a_new_error_or_contact_is_worse(file):
     record = CasesFile(file)
     safe = next(o for o in record.outcomes if passes(o) and o.measures.severity == "safe")
@@ -156,8 +144,7 @@ NOISY = (
     CONTROLLER
     + """
 from collections import Counter
-from random import Random
-TIMES, NUMBERS = Counter(), Random(3)
+TIMES = Counter()
 
 class Drawing(Own):
     def reset(self, seen):
@@ -173,17 +160,6 @@ class Failing(Drawing):
         if self.far and seen.x_vut_m > -20.0 * self.times:
             raise ValueError(self.times)
         return Own.act(self, seen)
-
-class Stopping(Drawing):
-    def act(self, seen):
-        return -4.0 + 0.1 * self.times if self.far else Own.act(self, seen)
-
-class Rough(Own):
-    def reset(self, seen):
-        self.bias = NUMBERS.uniform(-2.5, 1.0)
-
-    def act(self, seen):
-        return Own.act(self, seen) + self.bias
 
 class Once(Drawing):
     def act(self, seen):
@@ -234,21 +210,13 @@ class TestAControllerThatDoesNotRepeat:
         assert re.search(r"\d+ of \d+ cases that ran twice .* of them with another verdict", out)
 
     @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
-    def test_does_not_break_where_random_numbers_decide(self, rerun, of):
-        code, out, _ = rerun(of, "Rough")
-        assert code == 0
-        assert re.search(r" 0 broke, [1-9]\d* not repeatable", out)
-
-    @pytest.mark.parametrize("of", [0, 1], ids=["run", "file"])
-    @pytest.mark.parametrize("name", ["Stopping", "Failing"])
-    def test_is_worse_where_it_passes_neither_time(self, rerun, of, name):
-        code, out, _ = rerun(of, name)
+    def test_is_worse_where_it_passes_neither_time(self, rerun, of):
+        code, out, _ = rerun(of, "Failing")
         assert code == 1
         assert re.search(r" [1-9]\d* broke", out)
         assert "Not repeatable: " in out
 
 
-@on_us23
 def test_the_diff_has_the_lines_of_the_file_that_change(file, command_line, tmp_path):
     new, junit = tmp_path / "new.toml", tmp_path / "j.xml"
     said = command_line("rerun", file, "--vut", WORSE, "--out", new, "--junit", junit)
@@ -268,7 +236,6 @@ def test_the_diff_has_the_lines_of_the_file_that_change(file, command_line, tmp_
     assert any(", margin " in failure.get("message") for failure in root.iter("failure"))
 
 
-@on_us23
 def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, tmp_path):
     now = ms.rerun(file, vut=WORSE)
     index = next(one.b.index for one in now.steps[0].cases if one.change == "broke")
@@ -288,8 +255,6 @@ def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, 
     assert (
         f"case {index} is accepted (it waits\\x1b) and passes now: take the mark away" in said.out
     )
-    told = json.loads(command_line("run", "--case", file, index, "--json").out)
-    assert told["score"] == pytest.approx(CasesFile(file).outcome(index).measures.score, rel=1e-5)
     assert_refused(command_line("rerun", file, 999), f"{file} has no case 999")
 
 
@@ -306,7 +271,7 @@ def test_scenarios_errors_and_timeouts_are_what_they_were(tmp_path):
         assert kept.outcome(3).measures.error == 'said "no"'
 
 
-def test_a_pov_of_a_persons_own_must_be_the_same(tmp_path, monkeypatch):
+def test_a_pov_of_the_user_must_be_the_same(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "pov.py").write_text("def Pov(seen):\n    return 0.0\n")
     settings = campaign_settings(vut="design2", pov="pov.py:Pov", levels=(OWN,), cases=10)
@@ -317,7 +282,7 @@ def test_a_pov_of_a_persons_own_must_be_the_same(tmp_path, monkeypatch):
         ms.rerun(path, pov="pov.py:Pov")
 
 
-def test_a_net_of_ones_own_is_found_from_the_file(tmp_path):
+def test_a_net_of_the_user_is_found_from_the_file(tmp_path):
     for name in ("nets", "checks", "elsewhere"):
         (tmp_path / name).mkdir()
     scenario = replace(US23, net=str(tmp_path / "nets" / "mine.net.xml"))
@@ -328,29 +293,22 @@ def test_a_net_of_ones_own_is_found_from_the_file(tmp_path):
     assert CasesFile(moved).scenario.net == str(net)
 
 
-@on_us23
 @pytest.mark.parametrize(
     ("old", "new", "part"),
     [
         ('vut = "design2"', "vut = 2", "vut is 2: it must be a text"),
-        ('vut = "design2"', "", "it has no vut"),
         ("tolerance = 0.01", "tolerance = nan", "tolerance is nan"),
         ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': did you mean tolerance?"),
         ('scenario = {name = "us23"}', 'scenario = "us99"', "scenario is 'us99': it must be a"),
-        ('name = "us23"', 'kind = "us99"', "has no 'kind'"),
         ('fail_when = "paper"', 'fail_when = "scores < 3"', "there is no measure 'scores'"),
-        ("level = 0", "level = 0, was = 1", "has no 'was'"),
-        ("x_pov0_m = -", "x_pov0_m = -9", "choose between -900 and 0"),
         ("x_pov0_m = -", "x_pov0_m = -500.5, dx_m = -", "is outside of the pool, -340 to -180 m"),
-        ("x_pov0_m = -", "dx_m = -", "x_pov0_m is None: it must be a number"),
         ("v_pov0_mps = ", "v_pov0_mps = nan, dx_m = ", "it has a number that is not finite"),
         ('"pass"', '"fail"', "verdict is 'fail', but by margin and end it is pass"),
         ("},", ', accepted = " "},', "accepted is ' ': it must be a reason"),
-        ("net_sha256 = ", "net_sha256 = 1 #", "net_sha256 is 1: it must be a text"),
         ('net_sha256 = "', 'net_sha256 = "0', "was run on another net than"),
         ('pov1 = "', 'pov1 = "0', "was run against another POV of level 1 than today's"),
     ],
 )
-def test_what_is_no_cases_file_is_refused_in_a_sentence(file, command_line, old, new, part):
+def test_a_wrong_cases_file_is_refused_in_a_sentence(file, command_line, old, new, part):
     edit(file, old, new)
     assert_refused(command_line("rerun", file), str(file), part)

@@ -169,11 +169,6 @@ def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run):
         lines = [line.get("points") for line in picture.xpath(".//polyline")]
         assert lines[::2] == lines[1::2], "the earlier motion of a car, then the later one"
         assert len(lines) == 8, "speeds and positions of two cars in two motions"
-        places = [tuple(map(float, p.split(","))) for line in lines for p in line.split()]
-        _, top, width, height = map(float, picture.xpath(".//svg/svg/@viewbox")[0].split())
-        assert max(x for x, _ in places) == width
-        speeds = [y for _, y in places[: len(places) // 2]]
-        assert (min(speeds), max(speeds)) == pytest.approx((top, top + height), abs=0.01)
     assert root.xpath("//script | //@src | //@href | //@style | //img") == []
     (policy,) = root.xpath("//meta[@http-equiv='Content-Security-Policy']/@content")
     assert policy.startswith("default-src 'none'; style-src 'sha256-")
@@ -181,15 +176,6 @@ def test_the_page_draws_both_motions_over_the_same_axes_and_loads_nothing(run):
     for version in lost.versions:
         object.__setattr__(version, "motions", lambda _: {})
     assert "No motion is recorded." in pages.comparison_page(lost)
-
-
-def test_a_rerun_of_the_same_vut_gives_every_measure_again(run):
-    found = rerun(
-        RunStudy(run, today := settings_of(run.folder, run.record), resolve(today)), run.outcomes
-    )
-    assert [o.measures for o in found.versions[1].outcomes] == [o.measures for o in run.outcomes]
-    assert found.steps[0].count(Change.BROKE) == found.steps[0].count(Change.FIXED) == 0
-    assert not found.worse
 
 
 def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
@@ -236,7 +222,6 @@ def runs(failing: int, count: int) -> list[Outcome]:
     ("before", "after", "tolerated", "change"),
     [
         ((3, 10), (5, 10), 0.4, Change.WITHIN_CHANCE),  # p = 0.65
-        ((3, 10), (5, 10), 0.0, Change.NEITHER),
         ((0, 10), (6, 10), 0.4, Change.BROKE),
         ((6, 10), (0, 10), 0.4, Change.FIXED),
     ],

@@ -130,7 +130,7 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
     assert len(set(map(tuple, passing))) > 1
 
 
-def test_a_pov_of_ones_own_drives_again_in_sumo(run, found, tmp_path):
+def test_a_pov_of_the_user_drives_again_in_sumo(run, found, tmp_path):
     path = tmp_path / "keeps.py"
     path.write_text("def keeps(seen):\n    return 0.0\n", encoding="utf-8")
     povs = Povs(
@@ -153,20 +153,9 @@ class TestTheFile:
 
     @pytest.mark.parametrize(
         "change",
-        [
-            {"index": 10_000},
-            {"index": True},
-            {"avoided_by": ["nobody"]},
-            {"avoided_by": "careful"},
-            {"latest_takeover_s": "<b>"},
-            {"latest_takeover_s": 1e9},
-            {"pov_careful": 1},
-            {"more": 1},
-        ],
+        [{"index": 10_000}, {"avoided_by": ["nobody"]}, {"latest_takeover_s": "<b>"}, {"more": 1}],
     )
-    def test_of_somebody_else_is_refused_where_it_is_not_as_it_is_written(
-        self, folder, found, change
-    ):
+    def test_with_other_content_is_refused(self, folder, found, change):
         AVOIDANCE.write_lines(folder, found)
         path = folder / AVOIDANCE.name
         lines = path.read_text().splitlines()

@@ -24,7 +24,6 @@ from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.parameters import Range, values_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.reports.text import changes
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import simulate
@@ -78,7 +77,7 @@ class TestACampaign:
         assert found.parameters == ()
         assert check_axes(found, worst.case, plan_for("design2"))
 
-    def test_of_ones_own_controller_explains_none_by_itself(self, tmp_path):
+    def test_of_a_controller_of_the_user_explains_nothing_by_itself(self, tmp_path):
         (tmp_path / "mine.py").write_text("def drive(seen):\n    return 1.0\n")
         own = uniform(f"{tmp_path / 'mine.py'}:drive", tmp_path / "run", 60, level=0)
         assert own.failures
@@ -93,25 +92,17 @@ class TestACampaign:
             ms.explain(run)
 
 
-@pytest.mark.parametrize(
-    ("vut", "scenario", "level", "fail_when"),
-    [
-        ("design1", "us23-traffic", 0, "paper"),
-        ("level0", "us23-lane", 2, "dx_m < 12 and dx_m > -12"),
-        pytest.param("sumo:Krauss", "us23", 0, "contact", marks=pytest.mark.slow),
-    ],
-)
-def test_what_is_said_is_true_in_sumo(tmp_path, vut, scenario, level, fail_when):
-    keywords: dict[str, Any] = {"scenario": scenario, "level": level, "fail_when": fail_when}
-    run = uniform(vut, tmp_path / "run", 60, **keywords).run
+def test_values_that_pass_do_so_in_sumo(tmp_path):
+    rule = "dx_m < 12 and dx_m > -12"
+    lane: dict[str, Any] = {"scenario": "us23-lane", "level": 2, "fail_when": rule}
+    run = uniform("level0", tmp_path / "run", 60, **lane).run
     case = failures(run.cases)[0].case
     found = ms.explain(run.folder).found
-    plan = plan_for(vut, scenario=named_scenario(scenario), criterion=Criterion(fail_when))
+    plan = plan_for("level0", scenario=named_scenario("us23-lane"), criterion=Criterion(rule))
     assert check_axes(found, case, plan)
-    assert ("svo_rad" in [axis.name for axis in found.start]) == (level == 2)
+    assert found.start[-1].name == "svo_rad"
     for name, passed in found.levels.items():
-        psi = 0.0 if name == "2" else None
-        assert passes(plan, replace(case, level=int(name), svo_rad=psi)) == passed
+        assert passes(plan, replace(case, level=int(name), svo_rad=None)) == passed
 
 
 def test_the_smallest_change_by_hand(tmp_path):
@@ -172,7 +163,7 @@ class TestParameters:
         assert "the VUT's gap_m is 16.20; passes at" in page
         assert "with design2?kp=1.3: the VUT's kp is 1.3000" in page
 
-    def test_of_ones_own_controller_by_hand(self, tmp_path):
+    def test_of_a_controller_of_the_user_by_hand(self, tmp_path):
         mine = tmp_path / "mine.py"
         mine.write_text(
             "class Brakes:\n"
@@ -197,10 +188,8 @@ class TestParameters:
     [
         (None, ["gap=1..2"], "has no such parameter: did you mean gap_m"),
         (None, ["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
-        (None, ["gap_m=8..32", "gap_m=8..32"], "`params` gap_m is given twice"),
         (None, ["gap_m=8"], "write NAME=LOW..HIGH"),
         ("passed", [], "did not fail: name a failure, such as"),
-        (10**6, [], "no case 1000000"),
     ],
 )
 def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, words):
@@ -229,19 +218,3 @@ def test_a_controller_that_is_another_now_or_decides_by_chance_is_refused(tmp_pa
     mine.write_text(f"{turns}def drive(seen):\n    {now}\n")
     with pytest.raises(UserError, match="nothing can be said of its changes"):
         ms.explain(own, vut=f"{mine}:drive")
-
-
-def test_words_by_hand(made):
-    outcome = next(o for o in made.outcomes if o.failed and o.case.level == 1)
-    x = Axis("x_pov0_m", -200.04, -340.0, -180.0, 1.0, 1, below=-203.1, above=-199.0)
-    v = Axis("v_pov0_mps", 30.0, 25.0, 35.0, 0.06, 2)
-    found = Explanation(outcome.index, (x, v), {"0": True, "2": False})
-    assert list(changes(found, outcome.case)) == [
-        "x_POV0 is -200.0 m; passes at -199.0 m or -203.1 m (tried from -340.0 m to -180.0 m, "
-        "every 1.0 m)",
-        "v_POV0 is 30.00 m/s; passes at no other value (tried from 25.00 m/s to 35.00 m/s, "
-        "every 0.06 m/s)",
-        "the same start passes at level 0",
-        "the same start does not pass at level 2, psi 0",
-    ]
-    assert found.nearest_start == ("x_pov0_m", -199.0)

@@ -15,9 +15,7 @@ from merge_sumo import config
 from merge_sumo.analysis.exposure import (
     Normal,
     Traffic,
-    named_traffic,
     read_distribution,
-    shipped_traffics,
 )
 from merge_sumo.analysis.probability import (
     EXPECTED_LEAST,
@@ -95,11 +93,10 @@ class TestTheInterval:
         ("expects", "held", "width"),
         [
             (expecting(0.7, 0.06), 190, 0.6),
-            (expecting(0.7, 0.03), 190, 1.1),
             (expecting(0.2, 0.05), 190, 1.4),
             (np.zeros(math.prod(SHAPE), dtype=bool), 184, 1.01),
         ],
-        ids=["known", "half known", "wrong place", "unknown"],
+        ids=["known", "wrong place", "unknown"],
     )
     def test_holds_whatever_the_surrogate_expects(self, expects, held, width):
         """A band of area .125, 600 cases, 200 seeds; the width beside that of plain cases."""
@@ -130,12 +127,6 @@ class TestADistribution:
         path.write_text(text if isinstance(text, str) else json.dumps(text))
         return read_distribution(path, LEVELS, scenario=US23)
 
-    def sample(self, distribution, level=2, n=4000):
-        chances = np.random.default_rng(0).random((n, len(US23.dimensions(level))))
-        low = np.array([d.low for d in US23.dimensions(level)])
-        high = np.array([d.high for d in US23.dimensions(level)])
-        return low + distribution.points(level, chances) * (high - low)
-
     def test_has_the_levels_and_marginals_of_its_file(self, tmp_path):
         found = self.stated(
             tmp_path,
@@ -147,10 +138,11 @@ class TestADistribution:
             },
         )
         assert found.levels == {1: 0.75, 2: 0.25}
-        x, v, psi = self.sample(found).T
+        points = found.points(2, np.random.default_rng(0).random((4000, 3)))
+        low, high = np.array([(d.low, d.high) for d in US23.dimensions(2)]).T
+        x, v, psi = (low + points * (high - low)).T
         assert kstest((x + 300.0) / 100.0, "uniform").pvalue > 0.01
-        low, high = (25.0 - 31.0) / 3.0, (35.0 - 31.0) / 3.0
-        assert kstest(v, truncnorm(low, high, loc=31.0, scale=3.0).cdf).pvalue > 0.01
+        assert kstest(v, truncnorm(-2.0, 4.0 / 3.0, loc=31.0, scale=3.0).cdf).pvalue > 0.01
         assert np.mean(psi < 0.5) == pytest.approx(0.75, abs=0.03)
         assert not ((psi > 0.5) & (psi < 1.0)).any()
         assert psi.max() <= 1.5
@@ -158,13 +150,10 @@ class TestADistribution:
     @pytest.mark.parametrize(
         ("text", "says"),
         [
-            ("{", "is no JSON"),
             ({"x_pov0": {}}, "'x_pov0'"),
             ({"levels": {"3": 1}}, "levels of the campaign"),
-            ({"levels": {"0": 0}}, "not all 0"),
             ({"x_pov0_m": {"kind": "beta"}}, "'beta'"),
             ({"x_pov0_m": {"kind": "uniform", "low": -400}}, "-340 to -180"),
-            ({"v_pov0_mps": {"kind": "normal", "mean": 30, "sd": 0}}, "sd is 0"),
             ({"svo_rad": {"kind": "histogram", "edges": [0, 1], "weights": [1, 1]}}, "3 edges"),
             ({"svo_rad": {"kind": "histogram", "edges": [1, 0], "weights": [1]}}, "rise"),
         ],
@@ -194,15 +183,6 @@ class TestATraffic:
         cars = traffic().cars_in_pool(US23)
         assert cars == pytest.approx(0.0087 * 160.0 * share)
         assert counted.sum() / 20_000 == pytest.approx(cars, rel=0.02)
-
-    def test_that_is_shipped_has_the_published_figures_and_their_source(self):
-        published = {"exid-2": (5.7, 23.3), "exid-3": (4.9, 21.5), "exid-5": (8.7, 25.1)}
-        assert shipped_traffics() == [*published]
-        for name, (density, mean) in published.items():
-            found = named_traffic(name)
-            assert found.density_veh_per_km == density
-            assert found.speeds == Normal(mean=mean, sd=2.85)
-            assert "arXiv 2303.11531" in found.source
 
     @pytest.mark.parametrize(
         ("scenario", "says"),
@@ -244,14 +224,6 @@ class TestOfACampaign:
         assert (read.overall, read.missed) == (found.overall, found.missed)
         assert found.campaign["vut"] == "design1"
 
-    def test_has_the_same_failures_in_sumo(self, campaign, tmp_path):
-        """The same 300 cases by the equations of motion and in SUMO."""
-        ours = failure_probability(campaign, tmp_path / "a.json", cases=300, seed=3)
-        sumo = failure_probability(campaign, tmp_path / "b.json", "sumo", cases=300, seed=3)
-        assert ours.overall == sumo.overall
-        assert ours.missed == sumo.missed
-        assert ours.in_sumo < 60 < sumo.in_sumo == 300
-
     def test_in_a_traffic_is_a_number_of_cars_per_merge(self, campaign, tmp_path, command_line):
         out = tmp_path / "p.json"
         options = ("--traffic", "exid-5", "--cases", 400, "--workers", 1, "--out", out)
@@ -268,9 +240,7 @@ class TestOfACampaign:
     @pytest.mark.parametrize(
         ("options", "says"),
         [
-            ({"cases": 0}, "`cases` is 0"),
             ({"confidence": 1.0}, "`confidence` is 1.0"),
-            ({"seed": -1}, "`seed` is -1"),
             ({"traffic": "exid-5", "distribution": "d.json"}, "a distribution or a traffic"),
         ],
     )

@@ -55,8 +55,6 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     [
         {"vut": "design2"},
         {"level": 1},
-        {"cases": 301},
-        {"seed": 1},
         {"deadline_s": 1.0},
     ],
 )

@@ -38,7 +38,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     assert shares is not None
     [level] = shares.levels
     plan = resolve(campaign_settings(vut="design1")).with_engine(None)
-    points = np.random.default_rng(99).random((20_000, 2))
+    points = np.random.default_rng(99).random((5000, 2))
     pool = campaign_settings(vut="design1").pool
     many = evaluate(plan, pool.cases(points, 0), None, end_of)
     known = sum(fails for fails, _ in many) / len(points)
@@ -46,8 +46,6 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
     assert low < known < high
     assert (level.cases, level.failures > 0) == (2000, True)
     assert any(f"  {level.shown} of all starts fail, by 2,000  " in line for line in run.lines())
-    again = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "two", workers=2)
-    assert SHARES.read(again.folder) == shares
 
 
 OWN = """
@@ -69,13 +67,13 @@ class Broken:
 
 @pytest.fixture
 def own(tmp_path, monkeypatch):
-    """Work in a folder with controllers of a person's own."""
+    """Work in a folder with controllers of the user."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.py").write_text(OWN)
 
 
 @pytest.mark.usefixtures("own")
-def test_of_a_controller_of_ones_own_is_measured_too():
+def test_of_a_controller_of_the_user_is_measured_too():
     run = api.campaign("own.py:Own", level="0,1", seed=4, cases=10, out="run", progress=False)
     shares = SHARES.read(run.folder)
     assert shares is not None
@@ -88,8 +86,6 @@ def test_of_a_controller_of_ones_own_is_measured_too():
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
         assert any(said in line for line in run.lines())
-    again = api.resume(run.folder, vut="own.py:Own", cases=12, progress=False)
-    assert not any("not measured" in line for line in again.lines())
 
 
 @pytest.mark.usefixtures("own")
@@ -115,13 +111,6 @@ def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
     note_shares(RunStudy(run, settings, resolve(settings)), lambda *part: told.append(part))
     assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
     assert (told[0], told[-1]) == ((0, 480), (480, 480))
-
-
-def test_of_a_controller_that_needs_sumo_is_not_measured_and_the_command_is_named(tmp_path):
-    run = api.campaign("sumo:IDM", level="0", cases=10, out=tmp_path / "run", progress=False)
-    assert SHARES.read(run.folder) is None
-    said = f"starts that fail are not measured: merge-sumo probability {run.folder}"
-    assert any(line.endswith(said) for line in run.lines())
 
 
 def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):

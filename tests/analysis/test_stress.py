@@ -25,7 +25,6 @@ FAIL_WHEN = "bumper_gap_m < 15"
 """Two fifths of the cases fail: no sampler need look for them."""
 TRIED: dict[str, dict[str, Any]] = {
     "lag-0.5": {"act": Actuation(lag_s=0.5)},
-    "lag-0.2": {"act": Actuation(lag_s=0.2)},
     "power": {"act": Actuation(power_w_per_kg=34.0)},
     "long-pov": {"pov_length_m": 10.0},
 }
