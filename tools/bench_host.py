@@ -164,7 +164,8 @@ def _episode_by_traci(
         if x["vut.0"] >= 0.0:
             return
         columns = (x["pov.0"], v["pov.0"], x["vut.0"], v["vut.0"])
-        scene = Scene.of_pair(np.array([True]), np.array([step]), *(np.array([c]) for c in columns))
+        pair = np.array(columns).reshape(2, 2, 1).swapaxes(0, 1)
+        scene = Scene(np.array([True]), np.array([step]), *pair)
         a = {"pov.0": float(pov.act(scene)[0]), "vut.0": float(vut.act(scene)[0])}
         for name in names:
             vehicle.setSpeed(name, v[name])

@@ -97,7 +97,8 @@ def us_per_step(driver: Driver, episodes: int) -> float:
         x_pov, v_pov = np.full(k, CASE.x_pov0_m), np.full(k, CASE.v_pov0_mps)
         x, v = np.full(k, -182.0), np.full(k, CASE.v_vut0_mps)
         for step in range(STEPS):
-            scene = Scene.of_pair(active, np.full(k, step), x_pov, v_pov, x, v)
+            x_m, v_mps = np.array([x_pov, x]), np.array([v_pov, v])
+            scene = Scene(active, np.full(k, step), x_m, v_mps)
             start = time.perf_counter()
             a = driver.act(scene)
             if step:  # the first step of a client includes its turn to a new episode

@@ -10,11 +10,11 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 
 ROUNDING_MPS2 = 1e-9
-"""A command outside the limits by less is a rounding error."""
+"""Smaller differences between a command and a limit are rounding errors."""
 
 
 def whole_steps(time_s: float) -> tuple[int, float]:
-    """Return the whole steps of a time, and the share of a step that is left over."""
+    """Return the whole steps of a time, and the rest as a share of a step."""
     steps = round(time_s / DT_S, 9)
     return int(steps), steps % 1.0
 
@@ -33,7 +33,7 @@ class _Actuator:
         self._commands = [0.0] * (wait + 2)
         """Commands in the dead time, the oldest first."""
         lag_s = act.at_most("lag_s")
-        # Shares of the distance of a from u that remain at the end of a step, and in its mean.
+        # Shares of the distance of a from u at the end of a step, and in its mean.
         self._decay = float(np.exp(-DT_S / lag_s)) if lag_s > 0.0 else 0.0
         self._mean = lag_s / DT_S * (1.0 - self._decay)
         self._power = act.at_most("power_w_per_kg")
@@ -63,6 +63,9 @@ class ActuatedDriver(DriverWrapper):
     acts through a first-order lag, T a' = u - a with a = 0 at the start. Eq. (4) has one
     acceleration per step: the mean of a over the step, so that speeds are those of the continuous
     lag. Finally, power over speed limits it.
+
+    Example:
+        driver = ActuatedDriver(RuleBasedVut(1, DESIGNS["design2"]))
     """
 
     def __init__(self, driver: Driver) -> None:

@@ -1,4 +1,4 @@
-"""Drivers: the scene that they see, and the accelerations that they answer."""
+"""Drivers: their scenes and their accelerations."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ class Scene(NamedTuple):
     """The state of K corridors with A vehicles each at one step, as read from SUMO.
 
     Attributes:
-        active: whether an episode runs in the corridor, (K,); elsewhere the numbers mean nothing.
+        active: whether an episode runs in the corridor, (K,); elsewhere the numbers are undefined.
         step: steps since the episode of the corridor began, (K,).
         x_m: distances of the front bumpers to M along their lanes, (A, K), negative before M.
         v_mps: speeds, (A, K).
         facing: row of the car that a driver of two-car games takes for the POV, (K,); None for
             the POV itself everywhere.
-        merged: whether the VUT is on the mainline, (K,); None where there is no acceleration lane:
-            it then is from M on.
+        merged: whether the VUT is on the mainline, (K,); None without an acceleration lane, where
+            it is there from M on.
     """
 
     active: NDArray[np.bool_]
@@ -38,28 +38,6 @@ class Scene(NamedTuple):
     v_mps: FloatArray
     facing: NDArray[np.int64] | None = None
     merged: NDArray[np.bool_] | None = None
-
-    @classmethod
-    def of_pair(
-        cls,
-        active: NDArray[np.bool_],
-        step: NDArray[np.int64],
-        x_pov_m: FloatArray,
-        v_pov_mps: FloatArray,
-        x_vut_m: FloatArray,
-        v_vut_mps: FloatArray,
-    ) -> Scene:
-        """Return the scene of a POV and a VUT.
-
-        Args:
-            active: whether an episode runs in the corridor, (K,).
-            step: steps since it began, (K,).
-            x_pov_m: positions of the POV, (K,).
-            v_pov_mps: its speeds, (K,).
-            x_vut_m: positions of the VUT, (K,).
-            v_vut_mps: its speeds, (K,).
-        """
-        return cls(active, step, np.array((x_pov_m, x_vut_m)), np.array((v_pov_mps, v_vut_mps)))
 
     @property
     def x_pov_m(self) -> FloatArray:
@@ -114,11 +92,11 @@ class VutLostError(Exception):
 
 
 class PovLostError(VutLostError):
-    """The driver of the POV has lost it."""
+    """The driver of the POV has lost the state of its corridors."""
 
 
 NO_WISH, STAY, MERGE = -1, 0, 1
-"""Wishes of a VUT on an acceleration lane. One without a wish only accelerates, and merges at M."""
+"""Merge requests of a VUT on an acceleration lane. Without a request it merges at M."""
 
 
 class Driver(ABC):
@@ -155,13 +133,14 @@ class Driver(ABC):
         """
 
     def reason(self, corridor: int) -> str | None:
-        """Return why the last answer for a corridor was not finite, if the driver knows."""
+        """Return the reason why the last answer for a corridor was not finite, if it is known."""
         return None
 
     def wishes(self) -> NDArray[np.int8] | None:
-        """Return the wishes of the last answers, (K,), `NO_WISH`, `STAY` or `MERGE`, or None.
+        """Return the merge requests of the last answers, (K,), or None without any.
 
-        A wish is granted in the next step from where the acceleration lane begins.
+        Each is `NO_WISH`, `STAY` or `MERGE`. A request is granted in the next step, if the VUT has
+        reached the acceleration lane.
         """
         return self._wishes
 
@@ -177,7 +156,7 @@ class Driver(ABC):
         return {}
 
     def signals(self) -> Mapping[int, Left]:
-        """Return the signals of the last answers, by corridor."""
+        """Return the signals of the last answers by corridor."""
         return {}
 
     def in_vain(self, corridor: int) -> Collection[str]:
@@ -185,7 +164,7 @@ class Driver(ABC):
         return ()
 
     def files(self) -> tuple[Path, ...]:
-        """Return the user's files that its answers have depended on so far."""
+        """Return the files of the user on which the answers have depended so far."""
         return ()
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
@@ -197,7 +176,7 @@ class Design:
     """Parameters of a driver of this package, with units in their names.
 
     Raises:
-        UserError: for a parameter that is not a number from 0 up. Subclasses check more.
+        UserError: for a parameter that is not a number from 0 up, or by a check of a subclass.
     """
 
     def __post_init__(self) -> None:
@@ -242,11 +221,11 @@ class DriverWrapper(Driver):
         return self._driver.reason(corridor)
 
     def wishes(self) -> NDArray[np.int8] | None:
-        """Return the wishes of the driver, (K,)."""
+        """Return the merge requests of the driver, (K,)."""
         return self._driver.wishes()
 
     def clipped(self) -> NDArray[np.bool_] | None:
-        """Return which of the driver's commands were outside the limits, if it knows."""
+        """Return which of the commands of the driver were outside the limits, or None."""
         return self._driver.clipped()
 
     def signals(self) -> Mapping[int, Left]:
@@ -254,7 +233,7 @@ class DriverWrapper(Driver):
         return self._driver.signals()
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return the driver's commands that changed nothing."""
+        """Return the commands of the driver that changed nothing."""
         return self._driver.in_vain(corridor)
 
     def files(self) -> tuple[Path, ...]:

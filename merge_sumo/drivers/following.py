@@ -1,6 +1,6 @@
-"""Traffic on the mainline: how cars follow each other, and which of them the VUT will meet.
+"""Traffic on the mainline: the cars follow each other, and one of them conflicts with the VUT.
 
-Each car plays its level against the VUT, but drives no faster than is safe behind the car ahead.
+Each car plays its level against the VUT, but at most at the safe speed behind the car ahead.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ def keep_safe(a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: 
 
 
 def car_met(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[np.int64]:
-    """Return the row of the car that the VUT will meet, (K,).
+    """Return the row of the conflicting car, (K,).
 
-    This car would be nearest to M when the VUT is there, if the car kept its speed and the VUT
-    followed the level-0 profile. Of two equally near cars it is the one with the lower row.
+    It is nearest to M when the VUT is there, if all cars keep their speeds and the VUT follows the
+    level-0 profile. Of two equally near cars it is the one with the lower row.
 
     Args:
         x_m: positions of all vehicles, (A, K).

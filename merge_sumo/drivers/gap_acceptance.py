@@ -1,4 +1,4 @@
-"""A rule-based VUT for entries where it gives way: it takes a gap, or waits at a line for one."""
+"""A rule-based VUT for entries where it gives way: it takes a gap, or waits for one at a line."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class GapDesign(Design):
 
     Attributes:
         line_m: distance before M of the line at which it waits.
-        lead_s: it goes first where the POV is due at M at least this much after it.
-        lag_s: it goes second where the POV is due at M at least this much before it.
-        brake_mps2: deceleration, positive, from which on it brakes to stop at the line.
+        lead_s: least time by which the POV is due at M after it, for it to go first.
+        lag_s: least time by which the POV is due at M before it, for it to go second.
+        brake_mps2: deceleration, positive, above which it brakes to stop at the line.
     """
 
     line_m: float
@@ -30,7 +30,7 @@ class GapDesign(Design):
 
 
 ROUNDABOUT = GapDesign(line_m=7.0, lead_s=1.8, lag_s=2.0, brake_mps2=1.5)
-"""Noses in 4 m over the yield line. `policies/roundabout/README.md` says how it was chosen."""
+"""Waits 4 m past the yield line. `policies/roundabout/README.md` has the reasons."""
 
 
 class GapAcceptanceVut(Level0Vut):
@@ -55,10 +55,10 @@ class GapAcceptanceVut(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the level-0 acceleration where it goes, else the braking to stop at the line."""
         design, v = self.design, scene.v_vut_mps
-        # As a POV it is driven after M as well.
+        # A POV drives after M as well.
         distance_m = np.maximum(-scene.x_vut_m, 0.0)
         due_s = level0_time_to(distance_m, v, self.scenario)
-        # A POV that stands is due in hours.
+        # A standing POV is due in hours.
         later_s = -scene.x_pov_m / np.maximum(scene.v_pov_mps, 1e-3) - due_s
         # Eq. (4) moves by the speed before the step: a stop takes half a step's distance more.
         room_m = distance_m - design.line_m - 0.5 * DT_S * v

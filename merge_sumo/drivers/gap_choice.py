@@ -15,7 +15,7 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
 
 END_MARGIN_M = 1.0
-"""Distance before the end of the lane at which it stands."""
+"""Distance before the end of the lane at which it stops."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -23,8 +23,8 @@ class GapChoice(Design):
     """Parameters of a VUT that chooses a gap.
 
     Attributes:
-        headway_s: the least time gaps, ahead and behind, of a gap that it accepts.
-        brake_mps2: deceleration with which it comes to a stand before the lane's end, positive.
+        headway_s: least time gaps, ahead and behind, of a gap that it accepts.
+        brake_mps2: deceleration with which it stops before the end of the lane, positive.
     """
 
     headway_s: float = 0.8
@@ -33,7 +33,7 @@ class GapChoice(Design):
     def __post_init__(self) -> None:
         Design.__post_init__(self)
         if self.brake_mps2 == 0.0:
-            raise UserError("brake_mps2 is 0: a VUT that cannot brake comes to no stand")
+            raise UserError("brake_mps2 is 0: choose a number above 0, so that the VUT stops")
 
 
 HEADWAY = GapChoice()
@@ -43,11 +43,11 @@ class GapChoiceVut(Level0Vut):
     """Drives the level-0 profile along the acceleration lane, and merges into the first gap.
 
     A time gap is the distance from bumper to bumper, over the speed of the following car. The VUT
-    wishes to merge where, in the next step, the time gaps to the car ahead of it and to the car
-    behind it are both at least `headway_s`. Their positions in that step follow from eq. (4).
-    Without such a gap it drives no faster than a speed from which `brake_mps2` stops it before the
-    lane's end, and waits there. On the mainline it drives the level-0 profile, and follows the car
-    ahead no closer than ACC does. Without a lane it is the level-0 VUT.
+    requests a merge where, in the next step by eq. (4), the time gaps to the car ahead of it and to
+    the car behind it are both at least `headway_s`. Without such a gap it keeps a speed from which
+    `brake_mps2` stops it before the end of the lane, and waits there. On the mainline it drives the
+    level-0 profile, and follows the car ahead no closer than ACC. Without a lane it is the level-0
+    VUT.
     """
 
     def __init__(self, corridors: int, choice: GapChoice = HEADWAY) -> None:
@@ -64,7 +64,7 @@ class GapChoiceVut(Level0Vut):
             self._before_mps[:, corridor] = [v_mps for _, v_mps in case.starts()]
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the acceleration in each corridor, and take the wishes."""
+        """Return the acceleration in each corridor, (K,), and make the merge requests."""
         answer = super().act(scene)
         if self.scenario.lane_m is None or scene.merged is None:
             self._wishes = np.full(self.corridors, NO_WISH, dtype=np.int8)
@@ -78,18 +78,18 @@ class GapChoiceVut(Level0Vut):
         stopping = stopping_mps(end_m - END_MARGIN_M - next_m[VUT], self.choice.brake_mps2)
         slower = np.minimum(answer, (stopping - scene.v_vut_mps) / DT_S)
         follows = np.minimum(answer, self._following_mps2(scene))
-        answer = np.where(stays, slower, follows)
         self._before_mps = scene.v_mps.copy()
-        return answer
+        return np.where(stays, slower, follows)
 
     def _accepts(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
-        """Return the corridors in which both time gaps suffice in states, (A, K): (K,)."""
-        others, headway_s = np.arange(len(x_m)) != VUT, self.choice.headway_s
-        x_other, v_other = x_m[others], v_mps[others]
-        ahead = x_other - self.scenario.pov_length_m - x_m[VUT] >= headway_s * v_mps[VUT]
-        behind = x_m[VUT] - self.scenario.vut_length_m - x_other >= headway_s * v_other
-        gap: NDArray[np.bool_] = np.where(x_other >= x_m[VUT], ahead, behind).all(axis=0)
-        return gap
+        """Return whether both time gaps suffice in states, (A, K): (K,)."""
+        headway_s = self.choice.headway_s
+        ahead = x_m - self.scenario.pov_length_m - x_m[VUT] >= headway_s * v_mps[VUT]
+        behind = x_m[VUT] - self.scenario.vut_length_m - x_m >= headway_s * v_mps
+        suffices = np.where(x_m >= x_m[VUT], ahead, behind)
+        suffices[VUT] = True
+        accepted: NDArray[np.bool_] = suffices.all(axis=0)
+        return accepted
 
     def _following_mps2(self, scene: Scene) -> FloatArray:
         """Return the acceleration of ACC behind the car ahead, (K,)."""

@@ -1,7 +1,7 @@
 """Driving along an acceleration lane: the POVs, and a VUT that only accelerates.
 
 On such a road the VUT is on the mainline from the step of its merge on, and M is only the place
-where POVs expect it.
+where POVs expect the merge.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ A_MPS2 = 1.5
 B_MPS2 = 2.0
 """Acceleration and comfortable deceleration of IDM and ACC. Kesting, Treiber and Helbing (2010)."""
 LEAST_GAP_M = 0.01
-"""A smaller gap, or an overlap, counts as this."""
+"""Smaller gaps, and overlaps, count as this."""
 END_MARGIN_M = 0.5
-"""A VUT that may not pass the lane's end stands at least this far before it."""
+"""Least distance from the end of the lane of a VUT that has to stop before it."""
 
 
 def idm_mps2(
@@ -97,7 +97,7 @@ def car_ahead(x_m: FloatArray) -> tuple[FloatArray, Places]:
 
 
 def follow_mps2(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return the acceleration of a VUT that is driven for after its merge, (K,): IDM.
+    """Return the acceleration by IDM of a VUT after its merge, (K,).
 
     It follows the nearest car ahead and desires the level-0 speed.
 
@@ -124,14 +124,14 @@ def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
 class LanePov(DriverWrapper):
     """Drives cars of the mainline at an acceleration lane by a driver that expects a merge at M.
 
-    While the VUT is before M, the driver's answer holds. From M on the driver sees the lane's end
-    as M. A car that has passed the VUT returns to its first speed, and brakes no more for it. After
-    the merge every car does so, and a car behind the VUT follows it no closer than ACC does. A
-    user's POV decides for itself until the merge.
+    While the VUT is before M, the driver decides. When the VUT is past M, the driver sees the end
+    of the lane as M. A car that has passed the VUT returns to its first speed. After the merge
+    every car does so, and a car behind the VUT follows it no closer than ACC. A POV of the user
+    decides for itself until the merge.
     """
 
     follow_mps2 = staticmethod(acc_mps2)
-    """How a car follows a VUT that has merged."""
+    """Model by which a car follows a VUT that has merged."""
 
     def __init__(self, driver: Driver) -> None:
         """Take the driver of all cars."""
@@ -171,7 +171,7 @@ class LanePov(DriverWrapper):
 
 
 class Merging:
-    """Which VUTs of K corridors are on the mainline of a road with an acceleration lane.
+    """The merges of the VUTs of K corridors on a road with an acceleration lane.
 
     Attributes:
         merged: whether the VUT of a corridor is on the mainline, (K,).
@@ -180,16 +180,16 @@ class Merging:
     def __init__(self, corridors: int, scenario: Scenario) -> None:
         """Take the lane of a scenario, and its `lane_end`."""
         self.begin_m, self.end_m = scenario.lane_m or (0.0, 0.0)
-        self._stops = getattr(scenario, "lane_end", "merge") == "stop"
+        self._stops = scenario.lane_end == "stop"
         self._scenario = scenario
         self.merged = np.zeros(corridors, dtype=np.bool_)
         self._states_wishes = np.zeros(corridors, dtype=np.bool_)
-        """Whether the VUT has ever stated a wish."""
+        """Whether the VUT has ever made a merge request."""
         self._wishes = np.zeros(corridors, dtype=np.bool_)
 
     @property
     def driven_for(self) -> NDArray[np.bool_]:
-        """Which VUTs have merged without ever stating a wish, (K,): they are driven for."""
+        """Which VUTs have merged without any merge request, (K,): they are driven for."""
         only_accelerate: NDArray[np.bool_] = self.merged & ~self._states_wishes
         return only_accelerate
 
@@ -204,10 +204,10 @@ class Merging:
         x_m: FloatArray,
         v_mps: FloatArray,
     ) -> None:
-        """Take the wishes of the VUTs, and limit their answers in place.
+        """Take the merge requests of the VUTs, and limit their answers in place.
 
         Args:
-            wishes: wishes of the last answers, (K,); None for a VUT that only accelerates.
+            wishes: requests of the last answers, (K,); None for a VUT that only accelerates.
             answer: accelerations of all vehicles, (A, K).
             x_m: their positions, (A, K).
             v_mps: their speeds, (A, K).
@@ -233,5 +233,5 @@ class Merging:
         return self.merged
 
     def _granted(self, next_m: FloatArray) -> NDArray[np.bool_]:
-        """Return the granted wishes, (K,), for the next positions of the VUTs, (K,)."""
+        """Return the granted requests, (K,), for the next positions of the VUTs, (K,)."""
         return self._wishes & (next_m >= self.begin_m)

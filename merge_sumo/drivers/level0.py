@@ -10,7 +10,7 @@ from merge_sumo.scenario.scenario import DT_S, Scenario
 
 
 def level0_acceleration(v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return the level-0 VUT's acceleration, m/s2: constant until its speed, which it meets."""
+    """Return the acceleration of the level-0 VUT, m/s2: constant until exactly its speed."""
     missing = np.maximum((scenario.level0_v_mps - v_vut_mps) / DT_S, 0.0)
     return np.minimum(missing, scenario.level0_a_mps2)
 
@@ -18,9 +18,9 @@ def level0_acceleration(v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray
 def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
     """Return the seconds that a vehicle needs for a distance on the level-0 profile.
 
-    The profile as eq. (4) drives it: `level0_a_mps2` up to `level0_v_mps`, then constant; a vehicle
-    that is faster keeps its speed. The steps of eq. (4) lie on the parabola that begins slower by
-    half a step's gain of speed. So the time does not drift while the vehicle follows the profile.
+    The profile accelerates by `level0_a_mps2` to `level0_v_mps`, then keeps the speed; a faster
+    vehicle keeps its own. The steps of eq. (4) lie on the parabola that begins slower by half the
+    gain of speed of a step. So the time does not drift while the vehicle follows the profile.
 
     Args:
         distance_m: distances, not negative, of any shape.

@@ -1,8 +1,8 @@
 """Level-k drivers: greedy on a learned action-value function Q (Wang et al., section IV-C).
 
-The networks are trained by `merge_sumo.training` with torch; here they act in float64 numpy, so
-that a campaign needs no torch, and each corridor is evaluated on its own, so that an episode does
-not depend on concurrent episodes.
+The networks are trained by `merge_sumo.training` with torch. They act in float64 numpy, so that a
+campaign needs no torch, and each corridor is evaluated on its own, so that an episode does not
+depend on concurrent episodes.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from itertools import chain
 from typing import Protocol
 
@@ -30,12 +29,8 @@ ACTIONS = len(BRAKING) + 1 + len(ACCELERATING)
 DECISION_STEPS = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
 
-BLOCK = 512
-"""Most rows of a product: their hidden units fit into the cache of a core."""
-LEAST_ROWS = 256
-TILE = 16
-"""Fewest rows of a product, and what divides their number: products of fewer rows, or of the rows
-that are left over, round otherwise."""
+BLOCK = 256
+"""Rows of a product: their hidden units fit into the cache of a core."""
 
 FEATURES = 26
 SVO_FEATURES = 2
@@ -45,8 +40,8 @@ tanh(gap / 25 m)."""
 MANY_ROWS = 40
 """Rows from which products of whole matrices are quicker than one after the other."""
 SINGLE_ERROR = 1e-3
-"""A lead of the best action, as a share of 1 + max |Q|, that float32 cannot turn round. Of 200,000
-states for each of the eight shipped networks the largest error is 1e-5."""
+"""Lead of the best action, as a share of 1 + max |Q|, that float32 cannot reverse. The largest
+error in 200,000 states for each of the eight shipped networks is 1e-5."""
 LIMIT = "a_min_mps2"
 """Name of the tensor, (1,), with the hardest braking that a network chooses, where it has one."""
 _HORIZON_S = 20.0
@@ -83,13 +78,13 @@ def features(
     """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation.
 
     All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
-    scaled; the VUT's time to M on the level-0 profile, at constant speed and at full
+    scaled; the time of the VUT to M on the level-0 profile, at constant speed and at full
     acceleration; the gap at M that follows from them for a POV that keeps its speed, accelerates
-    or brakes, each on three scales; and final speeds. A gap decides the reward, so a network that
-    is given gaps learns in minutes what it would otherwise have to work out first.
+    or brakes, each on three scales; and final speeds. A gap decides the reward, so that a network
+    that sees gaps learns in minutes.
 
-    Times and gaps follow from what vehicles can do in the scenario, and all is measured in its
-    units. The numbers below are those of the paper's scenario, whose units are 1.
+    Times and gaps follow from the limits of the scenario, in its units. The numbers below are those
+    of the scenario of the paper, whose units are 1.
 
     Args:
         state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
@@ -156,8 +151,13 @@ def prospects(
 class QNetwork:
     """A multilayer perceptron with rectified units that gives Q of every action.
 
-    `layers` are pairs of weights (outputs, inputs) and biases (outputs,). `a_min_mps2` is the
-    hardest braking that its driver chooses; None for that of the scenario.
+    Example:
+        network = load_network("pov1")
+        actions = network.greedy(features(state, scenario=US23))
+
+    Attributes:
+        layers: pairs of weights, (outputs, inputs), and biases, (outputs,).
+        a_min_mps2: hardest braking that its driver chooses; None for that of the scenario.
     """
 
     def __init__(
@@ -167,17 +167,22 @@ class QNetwork:
     ) -> None:
         """Take the layers, as float64, and the limit of braking."""
         self.a_min_mps2 = a_min_mps2
-        self.layers = [
-            (np.ascontiguousarray(weight, dtype=np.float64), np.asarray(bias, dtype=np.float64))
-            for weight, bias in layers
-        ]
+        self.layers = []
+        self._single = []
+        for weight, bias in layers:
+            double = np.ascontiguousarray(weight, dtype=np.float64), bias.astype(np.float64)
+            self.layers.append(double)
+            with np.errstate(over="ignore"):
+                self._single.append((weight.T.astype(np.float32), bias.astype(np.float32)))
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, FloatArray]) -> QNetwork:
         """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ...
 
-        The limit of braking, if the network has one, is a tensor of one number. Raises `ValueError`
-        for tensors of other names, shapes or types: numpy would broadcast some of them.
+        The limit of braking, if the network has one, is a tensor of one number.
+
+        Raises:
+            ValueError: for other names, shapes or types, some of which numpy would broadcast.
         """
         count = max(len(tensors) // 2, 1)
         names = [(f"{i}.weight", f"{i}.bias") for i in range(count)]
@@ -197,7 +202,7 @@ class QNetwork:
         return cls(layers, float(tensors[LIMIT].item()) if LIMIT in tensors else None)
 
     def limited(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the network's limit of braking, if that is the lower one.
+        """Return the scenario with the limit of braking of the network, if it brakes less hard.
 
         Its observations and its actions are those of this scenario.
         """
@@ -213,8 +218,8 @@ class QNetwork:
     def values(self, inputs: FloatArray) -> FloatArray:
         """Return Q, (n, actions), of inputs, (n, features).
 
-        Every row is a matrix-vector product of its own, so that it is the same to the last bit
-        whatever rows stand beside it. Q is not finite where the products are too large.
+        Every row is a matrix-vector product of its own, so that it is the same to the last bit with
+        any other rows. Q is not finite where the products are too large.
         """
         hidden = inputs[..., None]
         weight, bias = self.layers[-1]
@@ -227,32 +232,30 @@ class QNetwork:
     def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
         """Return Q, (n, actions), in float32 by products of whole matrices.
 
-        Several times faster for many rows. The sizes of the products are chosen so that a row is
-        the same whatever rows stand beside it, but no library promises that to the last bit: for
-        training and searching, not for driving.
+        Several times faster for many rows. Products of one size give the same row with any other
+        rows, but no library promises that to the last bit: for training and searching, not for
+        driving.
         """
         n = len(inputs)
-        size = max(LEAST_ROWS, math.ceil(n / max(math.ceil(n / BLOCK), 1) / TILE) * TILE)
-        single: NDArray[np.float32] = np.zeros(
-            (math.ceil(n / size) * size, inputs.shape[1]), np.float32
+        rows: NDArray[np.float32] = np.zeros(
+            (math.ceil(n / BLOCK) * BLOCK, inputs.shape[1]), np.float32
         )
-        single[:n] = inputs
-        values = np.empty((len(single), len(self._single[-1][1])), dtype=np.float32)
-        buffers = [np.empty((size, len(bias)), dtype=np.float32) for _, bias in self._single[:-1]]
-        for first in range(0, n, size):
-            hidden = single[first : first + size]
-            for (weight, bias), buffer in zip(self._single, buffers, strict=False):
-                hidden = np.matmul(hidden, weight, out=buffer)
+        rows[:n] = inputs
+        last_weight, last_bias = self._single[-1]
+        values = np.empty((len(rows), len(last_bias)), dtype=np.float32)
+        for first in range(0, n, BLOCK):
+            hidden = rows[first : first + BLOCK]
+            for weight, bias in self._single[:-1]:
+                hidden = hidden @ weight
                 hidden += bias
                 np.maximum(hidden, 0.0, out=hidden)
-            weight, bias = self._single[-1]
-            values[first : first + size] = hidden @ weight + bias
+            values[first : first + BLOCK] = hidden @ last_weight + last_bias
         return values[:n]
 
     def greedy(self, inputs: FloatArray) -> NDArray[np.int64]:
         """Return the actions of the highest Q by `values`, (n,); -1 where Q is not finite.
 
-        Of many rows float32 decides those whose best action leads by more than it can be wrong.
+        Of many rows float32 decides those whose best action leads by more than its error.
         """
         if len(inputs) < MANY_ROWS:
             return _highest(self.values(inputs))
@@ -264,10 +267,6 @@ class QNetwork:
         unsure = np.flatnonzero(~sure)
         actions[unsure] = _highest(self.values(inputs[unsure]))
         return actions
-
-    @cached_property
-    def _single(self) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:
-        return [(w.T.astype(np.float32), b.astype(np.float32)) for w, b in self.layers]
 
 
 def _highest(values: FloatArray) -> NDArray[np.int64]:
@@ -281,7 +280,7 @@ class LevelKDriver(Driver):
     """Takes the action of the highest Q every 0.5 s and holds it."""
 
     def __init__(self, corridors: int, network: QNetwork) -> None:
-        """Drive with a network; whether it plays POV or VUT is in what it was trained for."""
+        """Drive as POV or VUT, depending on the training of the network."""
         super().__init__(corridors)
         self.network = network
         self._svo_rad = np.zeros(corridors)

@@ -1,4 +1,4 @@
-"""Policies, shipped or the user's own: safetensors with a manifest that says what they are."""
+"""Policies, shipped or of the user: safetensors files with a manifest that describes them."""
 
 from __future__ import annotations
 
@@ -14,36 +14,38 @@ from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, LevelKDri
 from merge_sumo.errors import UserError
 from merge_sumo.files import read_limited, resource
 from merge_sumo.printable import quoted
-from merge_sumo.records import Record, convert, decode
+from merge_sumo.records import Record, convert, decode, to_plain
 from merge_sumo.scenario.scenario import US23, Scenario
 
 MANIFEST = "manifest.json"
 NETWORKS = ("pov1", "vut1", "pov2", "vut2")
-"""In the order of the helix: each is trained against an earlier one, or against level 0."""
+"""The networks in the order of the helix: each is trained against an earlier one or level 0."""
 PLAYED = (
     *("x_pov0_m", "v_pov0_mps", "x_vut0_m", "v_vut0_mps", "a_min_mps2", "a_max_mps2"),
     *("v_hw_min_mps", "v_hw_max_mps", "v_min_mps", "ttc_min_s", "dx_crash_m", "dx_critical_m"),
     *("level0_a_mps2", "level0_v_mps", "timeout_s"),
 )
-"""Numbers of a scenario that decide what a driver learns; the road and other cars do not."""
+"""Numbers of a scenario that decide the training of a driver; the road and other cars do not."""
 LIMITS = ("reach_m", "v_start_max_mps")
-"""Of what these numbers may be."""
+"""Numbers of a scenario that limit the others."""
 MOST_BYTES = 1 << 26
-"""No network and no manifest is larger."""
+"""Largest size of a network, and of a manifest."""
 HUMAN = "human"
-"""Shipped library for `us23` in which no POV brakes harder than people did: it is used by name."""
+"""Shipped library for `us23` in which POVs brake no harder than people did; it is used by name."""
 
 
 def policies_of(scenario: Scenario) -> Path:
-    """Return the shipped policies for a scenario: those of its name, else those of the paper's."""
+    """Return the shipped policies for a scenario: those of its name, else those for us23."""
     by_name = {name: folder for name, folder in _shipped().items() if name != HUMAN}
     return by_name.get(scenario.name, resource("policies"))
 
 
 def _shipped() -> dict[str, Path]:
-    """Return the shipped libraries besides the paper's, by name."""
-    manifests = resource("policies").glob(f"*/{MANIFEST}")
-    return {manifest.parent.name: manifest.parent for manifest in manifests}
+    """Return the shipped libraries by name, without that for us23."""
+    libraries = {}
+    for manifest in resource("policies").glob(f"*/{MANIFEST}"):
+        libraries[manifest.parent.name] = manifest.parent
+    return libraries
 
 
 def policies_name(folder: Path) -> str:
@@ -52,33 +54,37 @@ def policies_name(folder: Path) -> str:
 
 
 def policies_in(folder: str | Path) -> Path:
-    """Return the policies that a user or a record names, as a whole path.
+    """Return the whole path of policies that a user or a record names.
 
-    That is a folder, or the name of a shipped library. Raises `UserError` where there are none, or
-    where a folder here has the name of a shipped library.
+    Args:
+        folder: a folder, or the name of a shipped library.
+
+    Raises:
+        UserError: if there are none, or a folder has the name of a shipped library.
     """
-    shipped = _shipped().get(str(folder))
+    path, shipped = Path(folder), _shipped().get(str(folder))
     try:
-        if shipped is not None:
-            if (Path(folder) / MANIFEST).is_file() and Path(folder).resolve() != shipped.resolve():
-                raise UserError(
-                    f"`policies`: {folder} is a shipped library and a folder here: name the folder "
-                    "by its whole path, or another folder to run in"
-                )
-            return shipped
-        if (Path(folder) / MANIFEST).is_file():
-            return Path(folder).resolve()
-        what = "has no manifest" if Path(folder).is_dir() else "is not a folder"
+        is_library = (path / MANIFEST).is_file()
+        if shipped is None and is_library:
+            return path.resolve()
+        if shipped is not None and is_library and path.resolve() != shipped.resolve():
+            raise UserError(
+                f"`policies`: {folder} is a shipped library and a folder here: name the folder "
+                "by its whole path, or another folder to run in"
+            )
+        problem = "has no manifest" if path.is_dir() else "is not a folder"
     except (OSError, ValueError, RuntimeError) as error:
-        what = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+    if shipped is not None:
+        return shipped
     raise UserError(
-        f"`policies`: {folder} {what}: name a folder of policies, such as `merge-sumo train --out "
-        f"DIR` makes, or a shipped library: {', '.join(sorted(_shipped()))}"
+        f"`policies`: {folder} {problem}: name a folder of policies, such as `merge-sumo train "
+        f"--out DIR` makes, or a shipped library: {', '.join(sorted(_shipped()))}"
     )
 
 
 def policies_sha256(folder: Path) -> dict[str, str]:
-    """Return the hashes of the networks of a folder by name: they decide what its drivers do."""
+    """Return the hashes of the networks of a folder by name."""
     return {name: entry["sha256"] for name, entry in read_manifest(folder).items()}
 
 
@@ -87,7 +93,7 @@ class _Manifest(Record, frozen=True):
 
 
 def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Return the entries of a manifest by name; empty where nothing was trained yet."""
+    """Return the entries of a manifest by name; none before a training."""
     path = (folder or resource("policies")) / MANIFEST
     if not path.is_file():
         return {}
@@ -104,17 +110,15 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
 
 def scenario_record(scenario: Scenario) -> dict[str, Any]:
     """Return the entry of a manifest for the scenario that a network was trained for."""
-    values = {name: getattr(scenario, name) for name in (*PLAYED, *LIMITS)}
-    return {
-        "name": scenario.name,
-        **{k: list(v) if isinstance(v, tuple) else v for k, v in values.items()},
-    }
+    record = to_plain(scenario)
+    return {name: record[name] for name in ("name", *PLAYED, *LIMITS)}
 
 
 def scenario_of(entry: dict[str, Any]) -> Scenario:
-    """Return the scenario that a network was trained for, on no road; the paper's if none is said.
+    """Return the scenario that a network was trained for, without its road; us23 by default.
 
-    Raises `UserError` when the manifest describes none.
+    Raises:
+        UserError: if the manifest has other entries for it.
     """
     record = entry.get("scenario", scenario_record(US23))
     if not set(convert(record, dict[str, Any])) <= {"name", *PLAYED, *LIMITS}:
@@ -128,7 +132,11 @@ def plays_as(one: Scenario, other: Scenario) -> bool:
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:
-    """Return a network; `UserError` when it is missing or is not the file of its manifest."""
+    """Return a network of a folder, by default that of the shipped policies.
+
+    Raises:
+        UserError: if it is missing, or is not the file of its manifest.
+    """
     folder = folder or resource("policies")
     entry = read_manifest(folder).get(name)
     if entry is None:
@@ -142,7 +150,7 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
 
 
 def how_to_train(folder: Path) -> str:
-    """Return the end of a sentence on a network that is not there."""
+    """Return the end of a sentence on a missing network."""
     if folder == resource("policies"):
         return ": run `merge-sumo train` to make it"
     return f" in {folder}: run `merge-sumo train --out {quoted(folder)}` to make it"

@@ -3,24 +3,24 @@
 The models are of rear-end conflicts on one lane; UN Regulation No. 157 covers cut-ins there. The
 transposition to a merge is ours, and no claim of compliance follows from it.
 
-`RampDriver`, in the VUT's place, has to yield. It predicts the state at M in two ways, on the
-scenario's level-0 profile (P0) and at its present speed (P1; a standing VUT waits), and the other
-vehicle at its present speed. Whichever vehicle is behind at M is the rear one, the gap is |dx| less
+`RampDriver` drives the VUT and has to yield. It predicts the state at M in two ways, on the level-0
+profile of the scenario (P0) and at its present speed (P1; a standing VUT waits), and the other
+vehicle at its present speed. The vehicle that is behind at M is the rear one, the gap is |dx| less
 `dx_crash_m`, the speeds are those at M. A plan has a conflict where the gap is negative or unsafe
-under the model. The VUT can fall behind where braking at the limit, after what is left of its
-delay, stops it before M or brings it there at least `dx_crash_m` behind the other vehicle.
+under the model. The VUT can fall behind where braking at the limit, after the rest of its delay,
+stops it before M or brings it there at least `dx_crash_m` behind the other vehicle.
 
 1. Free: it takes the level-0 profile, until P0 has a conflict, the model says that it is time to
    react (`is_due`), and the VUT is the rear vehicle or can fall behind.
-2. Delay: it goes on, or releases the pedal (the careful driver).
+2. Delay: it continues, or releases the pedal (the careful driver).
 3. From then on, in each step: it takes the level-0 profile where P0 has no conflict, holds its
    speed where P1 has none, brakes as the model says for P1 where it is the rear vehicle in P1 or
    can fall behind, and takes the level-0 profile where that is too late. The deceleration grows
    from 0 by the model's jerk, and begins again at 0 after a step without braking.
 
-The drawn angle of the ramp means nothing, so the lateral conditions of the models became times to
-M. `tests/drivers/test_cut_in.py` compares the models with their published code, and the ramp driver
-with a table that was made by another implementation of the rules above.
+The angle of the ramp in a drawing is arbitrary, so the lateral conditions of the models became
+times to M. `tests/drivers/test_cut_in.py` compares the models with their published code, and
+`test_reference_drivers.py` the ramp driver with a table of another implementation of these rules.
 """
 
 from __future__ import annotations
@@ -206,7 +206,7 @@ class FsmVut(RampDriver):
         return np.ones(self.corridors, dtype=np.bool_)
 
     def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
-        """Return the deceleration of the model; where bodies would overlap, what it takes."""
+        """Return the deceleration of the model; where bodies would overlap, the needed one."""
         comfortable = min(self.model.comfortable_mps2, self.limit_mps2)
         enough = self._can_fall_behind(scene, 0.0, comfortable)
         overlap = np.where(enough, self.model.comfortable_mps2, self.model.hardest_mps2)
@@ -278,7 +278,7 @@ class CarefulPov(Driver):
 
 
 def _x_pov_m(scene: Scene) -> FloatArray:
-    """Return the POV's position, (K,); relative to the VUT where an episode goes on after M."""
+    """Return the position of the POV, (K,); after M relative to the VUT."""
     x_m: FloatArray = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
     return x_m
 

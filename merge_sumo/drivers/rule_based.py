@@ -53,11 +53,11 @@ DESIGNS = {
 
 
 class RuleBasedVut(Level0Vut):
-    """Follows the level-0 profile, coasts when it will be too close, finally regulates the gap.
+    """Follows the level-0 profile, coasts for a predicted short gap, finally regulates the gap.
 
     All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
-    Before x1 the VUT follows that profile. From x1 to x2 it coasts while |dx| is predicted too
-    close. From x2 on it then sets its acceleration by a PID on the predicted dx, towards +target:
+    Before x1 the VUT follows that profile. From x1 to x2 it coasts while the predicted |dx| is too
+    small. From x2 on it then sets its acceleration by a PID on the predicted dx, towards +target:
     it gives way and falls back behind the POV.
     """
 
@@ -81,13 +81,13 @@ class RuleBasedVut(Level0Vut):
         design = self.design
         distance = np.maximum(-scene.x_vut_m, 0.0)
         t_m = level0_time_to(distance, scene.v_vut_mps, self.scenario)
-        # After M it is the present gap.
+        # After M, the present gap.
         dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m - np.maximum(scene.x_vut_m, 0.0)
         command = super().act(scene)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0
         regulate = too_close & (distance <= design.x2_m)
-        if np.count_nonzero(regulate):
+        if regulate.any():
             command[regulate] = self._pid(dx_at_m)[regulate]
         self._regulated = regulate
         if design.lag_s <= 0.0:
@@ -103,9 +103,7 @@ class RuleBasedVut(Level0Vut):
         rate = (error - self._last_error) * self._regulated / DT_S
         self._last_error = error
         pid = design.kp * error + design.ki * self._integral + design.kd * rate
-        limits = self.scenario.a_min_mps2, self.scenario.a_max_mps2
-        limited: FloatArray = np.clip(pid, *limits)
-        return limited
+        return np.clip(pid, self.scenario.a_min_mps2, self.scenario.a_max_mps2)
 
 
 VUTS = {name: BuiltInVut(RuleBasedVut, design) for name, design in DESIGNS.items()}

@@ -175,10 +175,10 @@ class FsmModel(SafetyModel):
     def cfs(self, pair: Pair) -> FloatArray:
         """Return the critical fuzzy metric, 0 (safe) to 1: the leader keeps its speed.
 
-        The rear vehicle goes on with its acceleration a (not below -4 m/s2) for tau, and then
-        brakes. With u its speed by then, s(b) = (v_r + a tau / 2 - v_f) tau + (u - v_f)^2 / (2 b):
-        0 from s(4) on, 1 up to s(6), linear between. Where u < v_f, 1 if the gap closes before the
-        speeds are equal, else 0. Where v_r <= v_f, 0.
+        The rear vehicle keeps its acceleration a (not below -4 m/s2) for tau, and then brakes. With
+        u its speed by then, s(b) = (v_r + a tau / 2 - v_f) tau + (u - v_f)^2 / (2 b): 0 from s(4)
+        on, 1 up to s(6), linear between. Where u < v_f, 1 if the gap closes before the speeds are
+        equal, else 0. Where v_r <= v_f, 0.
         """
         gap_m, v_rear_mps, v_front_mps, a_rear_mps2 = pair
         a = np.maximum(a_rear_mps2, -self.comfortable_mps2)

@@ -15,13 +15,13 @@ X, V = range(2)
 
 
 def far_m(scenario: Scenario) -> float:
-    """Return the position, out of the way, at which a hidden car is shown."""
+    """Return the distant position at which a hidden car is shown."""
     ahead = 1.0 if scenario.mainline == scenario.ramp else -1.0
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
 
 class _Sensors:
-    """The sensors of one episode, and what they have measured so far.
+    """The sensors of one episode, and their measurements so far.
 
     A state has the positions and the speeds of the A vehicles, (2, A).
     """
@@ -71,7 +71,7 @@ class _Sensors:
         self._measured.append(seen)
 
     def shown(self, state: FloatArray) -> FloatArray:
-        """Return what the VUT sees when the vehicles are in a state, (2, A) each."""
+        """Return the state that the VUT sees when the vehicles are in a state, (2, A) each."""
         shown = self._measured[-1 - self._late_steps].copy()
         shown[X] += shown[V] * self._drives_on_s
         unseen = np.isnan(shown[X])
@@ -111,7 +111,7 @@ class SensedDriver(DriverWrapper):
         super().begin(corridor, shown)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the answers of the driver to what it sees, (K,)."""
+        """Return the answers of the driver to the scene that it sees, (K,)."""
         x_m, v_mps, facing = scene.x_m.copy(), scene.v_mps.copy(), scene.facing
         for corridor in np.flatnonzero(scene.active).tolist():
             sensors = self._sensors[corridor]

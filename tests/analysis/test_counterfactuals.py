@@ -8,10 +8,10 @@ import json
 import shutil
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
+from support.scenes import scene_of
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance, avoidances
 from merge_sumo.analysis.run_study import RunStudy
@@ -20,7 +20,6 @@ from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
 from merge_sumo.errors import UserError
@@ -48,8 +47,7 @@ def passes(failure, driver, until, *, in_the_povs_place=False):
     driver.begin(0, case)
     (x_pov, v_pov), (x, v) = case.starts()
     for step in range(300):
-        state = (np.array([value]) for value in (x_pov, v_pov, x, v))
-        seen = Scene.of_pair(np.array([True]), np.array([step]), *state)
+        seen = scene_of(x_pov, v_pov, x, v, step=step)
         a = a_pov = 0.0
         if in_the_povs_place:
             a, a_pov = failure.a_vut_mps2[step], driver.act(seen)[0]

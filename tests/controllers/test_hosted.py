@@ -17,6 +17,7 @@ import pytest
 from support.campaigning import campaign_settings, run_campaign
 from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
+from support.scenes import scene_of
 
 from merge_sumo.controllers.controller import Start
 from merge_sumo.controllers.host import HostRequest, decode_request, encode
@@ -72,8 +73,7 @@ def test_a_second_interrupt_does_not_wait_for_a_vut_that_hangs(write_vut, tmp_pa
 
 
 def scene(corridors: int) -> Scene:
-    active, step = np.ones(corridors, dtype=bool), np.zeros(corridors, dtype=np.int64)
-    return Scene.of_pair(active, step, *[np.full(corridors, 20.0)] * 4)
+    return scene_of(*[np.full(corridors, 20.0)] * 4)
 
 
 def test_after_a_death_it_starts_again_and_knows_which_files_there_were(write_vut):

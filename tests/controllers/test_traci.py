@@ -25,12 +25,12 @@ from support.controllers import (
 )
 from support.processes import none_left
 from support.raw_traci import Client, GoneError
+from support.scenes import scene_of
 from support.vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.controllers.traci import vut
 from merge_sumo.controllers.traci.vut import TraciVut
-from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import Case
@@ -75,8 +75,7 @@ class Played:
         driver.begin(0, CASE)
         x_pov, v_pov, x, v = -250.0, 30.0, -182.0, 18.0
         for step in range(steps):
-            columns = (np.array([value]) for value in (x_pov, v_pov, x, v))
-            a = driver.act(Scene.of_pair(np.array([True]), np.array([step]), *columns))[0]
+            a = driver.act(scene_of(x_pov, v_pov, x, v, step=step))[0]
             if not np.isfinite(a):
                 self.reasons.append(driver.reason(0))
                 return

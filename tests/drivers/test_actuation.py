@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.scenes import scene_of
 
 from merge_sumo.drivers.actuation import ActuatedDriver
-from merge_sumo.drivers.base import Driver, Scene
+from merge_sumo.drivers.base import Driver
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
@@ -26,16 +27,14 @@ class Commands(Driver):
 
 
 def executed(commands, v_mps=20.0, **act):
-    """Return what a vehicle does of commands, and which of them were clipped."""
+    """Return the accelerations of a vehicle, and which of its commands were clipped."""
     actuation = Actuation(**act)
     driver = ActuatedDriver(Commands(commands))
     scenario = replace(US23, act=actuation)
     driver.begin(0, Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario))
     done, clipped = [], []
     for step in range(len(commands)):
-        x, v = np.array([-100.0]), np.array([v_mps])
-        scene = Scene.of_pair(np.array([True]), np.array([step]), x, v, x, v)
-        done.append(float(driver.act(scene)[0]))
+        done.append(float(driver.act(scene_of(v_vut_mps=v_mps, step=step))[0]))
         clipped.append(bool(driver.clipped()[0]))
     return done, clipped
 
@@ -55,7 +54,7 @@ def test_a_part_of_a_step_is_a_mean_of_two_commands():
 
 
 @pytest.mark.parametrize("lag_s", [0.2, 0.355])
-def test_speeds_behind_a_lag_are_those_of_the_continuous_one(lag_s):
+def test_speeds_after_a_lag_are_those_of_the_continuous_one(lag_s):
     done, _ = executed([-4.0] * 12, lag_s=lag_s)
     t_s = 0.1 * np.arange(1, 13)
     speed = -4.0 * (t_s - lag_s * (1.0 - np.exp(-t_s / lag_s)))
@@ -73,7 +72,7 @@ def test_a_command_outside_the_limits_counts_as_clipped_before_the_lag():
     assert min(done) > -4.0
 
 
-def test_an_answer_that_is_no_number_is_passed_on_at_once():
+def test_an_answer_that_is_not_finite_passes_at_once():
     done, _ = executed([1.0, np.nan, np.inf], delay_s=1.0, lag_s=0.3)
     assert done[0] == 0.0
     assert np.isnan(done[1])
@@ -81,12 +80,10 @@ def test_an_answer_that_is_no_number_is_passed_on_at_once():
 
 
 def test_an_episode_begins_with_nothing_commanded():
-    driver = ActuatedDriver(Commands([2.0, 2.0, 2.0]))
+    driver = ActuatedDriver(Commands([2.0] * 4))
     scenario = replace(US23, act=Actuation(delay_s=0.1, lag_s=0.2))
     case = Case(level=0, x_pov0_m=-200.0, v_pov0_mps=30.0, scenario=scenario)
-    scene = Scene.of_pair(np.array([True]), np.array([0]), *np.full((4, 1), 20.0))
-    driver.begin(0, case)
-    assert driver.act(scene)[0] == 0.0
-    assert driver.act(scene)[0] > 0.0
-    driver.begin(0, case)
-    assert driver.act(scene)[0] == 0.0
+    for _ in range(2):
+        driver.begin(0, case)
+        assert driver.act(scene_of())[0] == 0.0
+        assert driver.act(scene_of())[0] > 0.0

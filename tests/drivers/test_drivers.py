@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.scenes import scene_of
 
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.kinds import load
-from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
 from merge_sumo.errors import UserError
@@ -16,13 +16,6 @@ from merge_sumo.scenario.scenario import US23
 
 CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 DESIGN = RuleBasedDesign(x1_m=100.0, x2_m=40.0, gap_m=15.0, target_m=15.0, kp=0.2, ki=0.1, kd=0.05)
-
-
-def scene(x_pov=-250.0, v_pov=30.0, x_vut=-182.0, v_vut=18.0, step=0):
-    columns = [np.atleast_1d(np.asarray(c, dtype=float)) for c in (x_pov, v_pov, x_vut, v_vut)]
-    k = max(len(c) for c in columns)
-    columns = [np.broadcast_to(c, (k,)).copy() for c in columns]
-    return Scene.of_pair(np.ones(k, dtype=bool), np.full(k, step), *columns)
 
 
 def seconds_to_m(distance, v):
@@ -36,10 +29,10 @@ def pov_that_meets(gap, x_vut, v_vut, v_pov=30.0):
 
 class TestLevel0:
     def test_the_pov_keeps_its_speed(self):
-        assert Level0Pov(3).act(scene(x_pov=[-300.0, -200.0, 5.0])).tolist() == [0.0, 0.0, 0.0]
+        assert Level0Pov(3).act(scene_of([-300.0, -200.0, 5.0])).tolist() == [0.0, 0.0, 0.0]
 
     def test_the_vut_accelerates_by_1_until_28_and_meets_it_exactly(self):
-        answer = Level0Vut(5).act(scene(v_vut=[0.0, 18.0, 27.95, 28.0, 33.0]))
+        answer = Level0Vut(5).act(scene_of(v_vut_mps=[0.0, 18.0, 27.95, 28.0, 33.0]))
         assert answer == pytest.approx([1.0, 1.0, 0.5, 0.0, 0.0])
 
     @pytest.mark.parametrize(
@@ -59,33 +52,30 @@ class TestLevel0:
 
 
 class TestRuleBased:
-    def make(self, design=DESIGN, corridors=1):
-        vut = RuleBasedVut(corridors, design)
-        for k in range(corridors):
-            vut.begin(k, CASE)
+    def make(self, design=DESIGN):
+        vut = RuleBasedVut(1, design)
+        vut.begin(0, CASE)
         return vut
 
-    def test_stage_1_follows_the_level0_profile_whatever_the_pov_does(self):
-        x_pov = pov_that_meets(0.0, -150.0, 20.0)
-        assert self.make().act(scene(x_pov, 30.0, -150.0, 20.0)).tolist() == [1.0]
-
-    @pytest.mark.parametrize("gap", [-14.9, 0.0, 14.9])
-    def test_stage_2_coasts_when_it_will_be_too_close(self, gap):
-        x_pov = pov_that_meets(gap, -80.0, 20.0)
-        assert self.make().act(scene(x_pov, 30.0, -80.0, 20.0)).tolist() == [0.0]
-
-    @pytest.mark.parametrize("gap", [-15.1, 15.1])
-    def test_stages_2_and_3_follow_the_profile_when_the_gap_is_wide_enough(self, gap):
-        for x_vut in (-80.0, -20.0):
-            x_pov = pov_that_meets(gap, x_vut, 20.0)
-            assert self.make().act(scene(x_pov, 30.0, x_vut, 20.0)).tolist() == [1.0]
-
-    @pytest.mark.parametrize(("gap", "expected"), [(12.0, -0.63), (5.0, -2.1), (-5.0, -4.0)])
-    def test_stage_3_falls_back_behind_the_pov_on_whichever_side_it_is(self, gap, expected):
-        # Errors of -3, -10, -20 m: 0.2 e + 0.1 e * 0.1 s, no rate in the first step.
-        x_pov = pov_that_meets(gap, -30.0, 20.0)
-        answer = self.make().act(scene(x_pov, 30.0, -30.0, 20.0))
-        assert answer == pytest.approx([max(expected, -4.0)])
+    @pytest.mark.parametrize(
+        ("gap", "x_vut", "expected"),
+        [
+            (0.0, -150.0, 1.0),  # stage 1 follows the level-0 profile
+            (-14.9, -80.0, 0.0),  # stage 2 coasts when it will be too close
+            (14.9, -80.0, 0.0),
+            (-15.1, -80.0, 1.0),  # stages 2 and 3 follow the profile when the gap is wide
+            (15.1, -20.0, 1.0),
+            # Stage 3 falls back behind the POV. Errors of -3, -10, -20 m: 0.2 e + 0.1 e * 0.1 s, no
+            # rate in the first step.
+            (12.0, -30.0, -0.63),
+            (5.0, -30.0, -2.1),
+            (-5.0, -30.0, -4.0),
+        ],
+    )
+    def test_the_first_answer_in_each_stage(self, gap, x_vut, expected):
+        x_pov = pov_that_meets(gap, x_vut, 20.0)
+        answer = self.make().act(scene_of(x_pov, 30.0, x_vut, 20.0))
+        assert answer == pytest.approx([expected])
 
     def test_the_pid_adds_integral_and_rate_in_the_second_step(self):
         vut = self.make()
@@ -94,12 +84,12 @@ class TestRuleBased:
             (6.0, -0.2 * 9 - 0.1 * 1.9 + 0.05 * 10),
         ):
             x_pov = pov_that_meets(gap, -30.0, 20.0)
-            assert vut.act(scene(x_pov, 30.0, -30.0, 20.0)) == pytest.approx([expected])
+            assert vut.act(scene_of(x_pov, 30.0, -30.0, 20.0)) == pytest.approx([expected])
 
     def test_an_actuator_with_a_lag_of_a_second_gives_a_tenth_in_the_first_step(self):
         lagged = RuleBasedDesign(x1_m=100, x2_m=40, gap_m=15, target_m=15, kp=0.2, lag_s=1.0)
         vut = self.make(lagged)
-        answers = [vut.act(scene()).item() for _ in range(3)]
+        answers = [vut.act(scene_of()).item() for _ in range(3)]
         assert answers == pytest.approx([0.1, 0.19, 0.271])
 
 
@@ -108,6 +98,6 @@ def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
         driver = load(name).open(4)
         for k in range(4):
             driver.begin(k, CASE)
-        assert driver.act(scene(x_pov=[-300.0, -250.0, -200.0, -180.0])).shape == (4,)
+        assert driver.act(scene_of([-300.0, -250.0, -200.0, -180.0])).shape == (4,)
     with pytest.raises(UserError, match=r"no VUT 'design9': did you mean design[12] or "):
         load("design9")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.scenes import scene_of
 
-from merge_sumo.drivers.base import Scene
 from merge_sumo.drivers.gap_acceptance import ROUNDABOUT, GapAcceptanceVut
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.road.scenario_file import named_scenario
@@ -27,25 +27,18 @@ def due_s(x_vut_m, v_vut_mps):
     return float(level0_time_to(np.array(-x_vut_m), np.array(v_vut_mps), SCENARIO))
 
 
-def scene(*state):
-    """Return the scene of one corridor: x and v of the POV, x and v of the VUT."""
-    return Scene.of_pair(np.array([True]), np.array([0]), *(np.array([value]) for value in state))
-
-
 def answer(vut, x_vut_m, v_vut_mps, later_s):
     """Return the acceleration where a POV of 8 m/s is due at M so much later than the VUT."""
     x_pov_m = -8.0 * (due_s(x_vut_m, v_vut_mps) + later_s)
-    return float(vut.act(scene(x_pov_m, 8.0, x_vut_m, v_vut_mps))[0])
+    return float(vut.act(scene_of(x_pov_m, 8.0, x_vut_m, v_vut_mps))[0])
 
 
 class TestAGap:
-    @pytest.mark.parametrize("later_s", [1.81, 5.0, -2.01, -5.0])
-    def test_is_taken_by_the_level0_profile(self, vut, later_s):
-        assert answer(vut, -50.0, 6.0, later_s) == 1.0
-
-    @pytest.mark.parametrize("later_s", [1.79, 0.0, -1.99])
-    def test_is_none_where_both_are_due_at_about_the_same_time(self, vut, later_s):
-        assert answer(vut, -50.0, 6.0, later_s) == 0.0
+    @pytest.mark.parametrize(
+        ("later_s", "a_mps2"), [(1.81, 1.0), (1.79, 0.0), (0.0, 0.0), (-1.99, 0.0), (-2.01, 1.0)]
+    )
+    def test_is_taken_where_both_are_due_at_different_times(self, vut, later_s, a_mps2):
+        assert answer(vut, -50.0, 6.0, later_s) == a_mps2
 
     def test_is_taken_once_and_for_all(self, vut):
         assert answer(vut, -50.0, 6.0, 5.0) == 1.0
@@ -57,7 +50,7 @@ class TestAGap:
         assert answer(vut, -50.0, 6.0, 0.0) == 0.0
 
     def test_is_there_before_a_pov_that_stands(self, vut):
-        assert vut.act(scene(-3.0, 0.0, -7.0, 0.0))[0] == 1.0
+        assert vut.act(scene_of(-3.0, 0.0, -7.0, 0.0))[0] == 1.0
 
 
 class TestWithoutOne:
@@ -78,5 +71,5 @@ class TestWithoutOne:
         assert answer(vut, x, v, -2.5) == 1.0
 
 
-def test_behind_m_where_a_pov_may_get_it_goes_on(vut):
-    assert vut.act(scene(0.0, 8.0, 40.0, 6.0))[0] == 1.0
+def test_after_m_where_a_pov_drives_it_accelerates(vut):
+    assert vut.act(scene_of(0.0, 8.0, 40.0, 6.0))[0] == 1.0

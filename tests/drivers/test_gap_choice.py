@@ -1,4 +1,4 @@
-"""The VUT that chooses a gap on an acceleration lane: which one, and where it waits for none."""
+"""The VUT that chooses a gap on an acceleration lane, and where it waits."""
 
 # mypy: no-strict-optional
 
@@ -8,12 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.vut_contract import LANE, ON_LANE, begin, factory, run_on
+from support.vut_contract import ON_LANE, begin, factory, run_on
 
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
 from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End
 
@@ -24,10 +23,10 @@ def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scen
     return Scene(np.array([True]), np.array([9]), x, v, merged=np.array([merged]))
 
 
-def asked(x_m, v_mps, *, merged=False, choice=HEADWAY, case=ON_LANE) -> tuple[float, int]:
-    """Return its answer and its wish."""
+def asked(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
+    """Return its answer and its merge request."""
     vut = GapChoiceVut(1, choice)
-    begin(vut, case)
+    begin(vut)
     answer = vut.act(scene(x_m, v_mps, merged=merged))
     return float(answer[0]), int(vut.wishes()[0])
 
@@ -39,7 +38,7 @@ def asked(x_m, v_mps, *, merged=False, choice=HEADWAY, case=ON_LANE) -> tuple[fl
         (-69.99, 30.0, STAY),
         (-18.5, 15.0, MERGE),  # ahead: -17 - 5 - (-38) = 16 m, 0.8 s at its own 20 m/s
         (-18.51, 15.0, STAY),
-        (-41.0, 20.0, STAY),  # beside it
+        (-41.0, 20.0, STAY),  # next to it
         (500.0, 30.0, MERGE),
     ],
 )
@@ -55,7 +54,7 @@ def test_both_gaps_count_and_so_does_the_headway():
     assert asked([-75.0, -40.0, -21.0, -140.0], between[1])[1] == STAY
 
 
-def test_it_wishes_nothing_before_the_gore_and_on_the_mainline():
+def test_it_requests_no_merge_before_the_gore_and_on_the_mainline():
     assert asked([500.0, -72.1], [30.0, 20.0]) == (1.0, STAY)
     assert asked([500.0, -72.0], [30.0, 20.0]) == (1.0, MERGE)
     assert asked([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_WISH)
@@ -102,10 +101,3 @@ def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
         assert all(t.x_vut_m[-1] < 130.0 for t in ran), "no merge is forced"
         mean_m.append(np.mean([t.x_vut_m[-1] for t in ran]))
     assert mean_m[0] < mean_m[1]
-
-
-def test_a_point_of_its_own_is_the_scenarios():
-    shorter = replace(LANE, lane_m=(-20.0, 40.0))
-    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=shorter)
-    assert asked([500.0, -40.0], [30.0, 20.0], case=case)[1] == STAY
-    assert asked([500.0, -22.0], [30.0, 20.0], case=case)[1] == MERGE

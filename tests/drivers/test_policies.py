@@ -1,4 +1,4 @@
-"""The shipped drivers: deterministic, rational, and with the paper's picture."""
+"""The shipped drivers: deterministic and nearly rational."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 from support.merges import HALF, SMALLER
-from support.plans import POVS
+from support.plans import plan_for
 
-from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.levelk import (
     FEATURES,
     LevelKDriver,
@@ -21,16 +20,20 @@ from merge_sumo.drivers.policies import (
     HUMAN,
     NETWORKS,
     load_network,
+    plays_as,
     policies_in,
     policies_of,
     read_manifest,
+    scenario_of,
 )
-from merge_sumo.metrics.measures import Measures
+from merge_sumo.road.merge import road_for
+from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.simulation.povs import PovLibrary, Povs
+from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.povs import Povs
 from merge_sumo.simulation.rollout import Rollout
-from merge_sumo.sumo.world import World
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.game import Game, greedy, pool_starts
 from merge_sumo.training.reward import Reward, RewardWeights
@@ -50,37 +53,34 @@ def uniform_cases(level, count, seed=0):
     return from_unit(points, level, scenario=US23)
 
 
-def played(vut, cases, corridors=32):
-    """Return the measures of cases, in order, and the trajectories."""
-    with World(corridors, scenario=US23) as world:
-        driver = load(vut).open(corridors)
-        trajectories = Rollout(world, PovLibrary(corridors, POVS), driver, cases).run()
-    return [Measures.of(t) for t in trajectories], trajectories
-
-
-@pytest.mark.parametrize("folder", [policies_of(US23), policies_in(HUMAN)], ids=["paper", HUMAN])
-def test_the_library_is_complete_and_its_manifest_says_how_it_was_made(folder):
+@pytest.mark.parametrize("name", ["us23", HUMAN, "roundabout"])
+def test_a_shipped_library_is_complete_and_its_manifest_says_how_it_was_made(name):
+    folder = policies_in(name) if name == HUMAN else policies_of(named_scenario(name))
+    scenario = US23 if name == HUMAN else named_scenario(name)
     manifest = read_manifest(folder)
     assert tuple(manifest) == NETWORKS
-    for name, entry in manifest.items():
-        network, limited = load_network(name, folder), folder.name == HUMAN and name[:3] == "pov"
-        assert network.sees_svo == (name == "pov2")
+    weights = dataclasses.asdict(RewardWeights.of(scenario))
+    for network_name, entry in manifest.items():
+        network = load_network(network_name, folder)
+        limited = name == HUMAN and network_name.startswith("pov")
+        assert network.sees_svo == (network_name == "pov2")
         assert network.a_min_mps2 == entry.get("a_min_mps2") == (-2.0 if limited else None)
-        assert entry["command"].startswith(f"merge-sumo train --only {name} ")
-        assert RewardWeights(**entry["reward_weights"]) == RewardWeights()
+        assert entry["command"].startswith(f"merge-sumo train --only {network_name} ")
+        assert plays_as(scenario_of(entry), scenario)
+        assert entry["reward_weights"] == pytest.approx(weights)
         assert entry["check"]["avoidable_collisions"] == 0
-        mean_bound, p99_bound = REGRET_BOUNDS[name]
+        mean_bound, p99_bound = REGRET_BOUNDS[network_name]
         assert entry["check"]["mean_regret"] <= mean_bound
         assert entry["check"]["p99_regret"] <= p99_bound
-    for name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
-        assert manifest[name]["opponent_sha256"] == manifest[opponent]["sha256"]
+    for network_name, opponent in (("pov2", "vut1"), ("vut2", "pov1")):
+        assert manifest[network_name]["opponent_sha256"] == manifest[opponent]["sha256"]
 
 
 def test_learned_episodes_are_the_same_in_1_and_in_32_corridors():
-    cases = [case for level in (1, 2) for case in uniform_cases(level, 50, seed=3)]
-    one, many = (played("level1", cases, corridors)[1] for corridors in (1, 32))
-    for alone, beside in zip(one, many, strict=True):
-        assert np.array_equal(alone.motion, beside.motion)
+    cases = uniform_cases(1, 50, seed=3) + uniform_cases(2, 50, seed=3)
+    one, many = (simulate(plan_for("level1", corridors=n), cases) for n in (1, 32))
+    for alone, among_others in zip(one, many, strict=True):
+        assert np.array_equal(alone.trajectory.motion, among_others.trajectory.motion)
 
 
 def states(n):
@@ -109,7 +109,7 @@ class TestOtherScenarios:
 
 
 class TestALimitOfBraking:
-    """A network whose driver brakes by 2 m/s2 at most, and drives beside others."""
+    """A network whose driver brakes by 2 m/s2 at most."""
 
     LAYERS = (  # weights (actions, features) and biases
         (np.zeros((7, FEATURES)), np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])),
@@ -128,24 +128,17 @@ class TestALimitOfBraking:
 
     def test_holds_in_a_simulation_in_which_the_vut_brakes_harder(self):
         corridors, case = 2, from_unit(np.array([[0.5, 0.5]]), 1, scenario=US23)[0]
-        with World(corridors, scenario=US23) as world:
-            pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
-            vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
-            (found,) = Rollout(world, pov, vut, [case]).run()
+        world = EquationWorld(corridors, road_for(US23), US23)
+        pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
+        vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
+        (found,) = Rollout(world, pov, vut, [case]).run()
         assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
         assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
 
 
-class TestTheLibraryOfPeople:
-    """`--policies human`, whose POVs brake by 2 m/s2 at most."""
-
-    POVS = Povs(policies=policies_in(HUMAN))
-
-    @pytest.mark.parametrize("level", [1, 2])
-    def test_brakes_no_harder_than_people_did(self, level):
-        cases = uniform_cases(level, 300, seed=4)
-        with World(32, scenario=US23) as world:
-            pov, vut = PovLibrary(32, self.POVS), load("design2").open(32)
-            found = [Measures.of(t) for t in Rollout(world, pov, vut, cases).run()]
-        hardest = max(m.pov_max_brake_mps2 for m in found)
-        assert 1.5 <= hardest <= 2.0
+@pytest.mark.parametrize("level", [1, 2])
+def test_the_povs_of_the_human_library_brake_by_2_mps2_at_most(level):
+    plan = plan_for("design2", povs=Povs(policies=policies_in(HUMAN)))
+    found = simulate(plan, uniform_cases(level, 300, seed=4))
+    hardest = max(one.outcome.measures.pov_max_brake_mps2 for one in found)
+    assert 1.5 <= hardest <= 2.0

@@ -1,4 +1,4 @@
-"""The levels that a person names, in a text or as a list."""
+"""The levels that a user names, in a text or as a list."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Learned drivers of one's own: `--policies DIR` for everything that runs or needs drivers."""
+"""Learned drivers of the user: `--policies DIR`."""
 
 from __future__ import annotations
 
@@ -109,33 +109,22 @@ class TestACampaign:
         assert run_campaign(settings(None), tmp_path / "shipped").record["policies"] is None
 
 
-class TestOtherCommands:
-    @pytest.mark.parametrize(
-        "command",
-        [
-            ("campaign", "--vut", "design1"),
-            ("reproduce", "--quick"),
-        ],
-        ids=lambda command: command[0],
-    )
-    def test_all_refuse_what_is_no_folder_of_policies_in_one_sentence(
-        self, call, command, tmp_path
-    ):
-        (tmp_path / "file").touch()
-        (tmp_path / "empty").mkdir()
-        before = sorted(tmp_path.iterdir())
-        for named in ("nowhere", "file", "empty", ".", "/dev/null"):
-            assert_refused(call(*command, "--policies", named), "name a folder of policies")
-        assert sorted(tmp_path.iterdir()) == before
+@pytest.mark.parametrize("command", [("campaign", "--vut", "design1"), ("reproduce", "--quick")])
+def test_commands_refuse_anything_but_a_folder_of_policies(call, command, tmp_path):
+    (tmp_path / "file").touch()
+    (tmp_path / "empty").mkdir()
+    before = sorted(tmp_path.iterdir())
+    for named in ("nowhere", "file", "empty", "/dev/null"):
+        assert_refused(call(*command, "--policies", named), "name a folder of policies")
+    assert sorted(tmp_path.iterdir()) == before
 
 
-class TestAShippedLibrary:
-    def test_is_not_confused_with_a_folder_of_its_name(self, same, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        shutil.copytree(same, tmp_path / "roundabout")
-        with pytest.raises(UserError, match="a shipped library and a folder here"):
-            policies_in("roundabout")
-        assert policies_in(tmp_path / "roundabout") == tmp_path / "roundabout"
+def test_a_shipped_library_is_not_confused_with_a_folder_of_its_name(same, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(same, tmp_path / "roundabout")
+    with pytest.raises(UserError, match="a shipped library and a folder here"):
+        policies_in("roundabout")
+    assert policies_in(tmp_path / "roundabout") == tmp_path / "roundabout"
 
 
 class TestAFolder:
@@ -168,44 +157,39 @@ class TestAFolder:
             run_campaign(settings(folder), tmp_path / "run")
         assert not (tmp_path / "run").exists()
 
-    @pytest.mark.parametrize("name", ["pov1", "vut1"])
     @pytest.mark.parametrize(
         ("changed", "said"),
         [
-            ({"1.bias": np.zeros((0, 5))}, "1.bias (0, 5)"),
-            ({"0.bias": np.zeros((0, 5))}, "0.bias (0, 5)"),
             ({"0.bias": np.zeros(1)}, "0.bias (1,)"),
             ({"1.weight": np.zeros((1, ACTIONS, 8))}, "1.weight is (1, 7, 8)"),
             ({"1.weight": np.zeros((ACTIONS, 9))}, "1.weight is (7, 9)"),
             ({"0.weight": np.zeros((8, FEATURES), dtype=np.int64)}, "of int64"),
-            ({"1.bias": np.zeros(ACTIONS, dtype=np.complex64)}, "of complex64"),
             ({"0.weight": np.zeros((0, FEATURES)), "0.bias": np.zeros(0)}, "0.weight is (0, 26)"),
             ({"a_min_mps2": np.zeros((2, 2))}, "can only convert an array of size 1"),
             ({"2.weight": np.zeros((7, 7))}, "and not 0.weight, 0.bias, ..."),
-            ({"1.weight": np.full((ACTIONS, 8), np.nan)}, "a weight is NaN"),
             ({"1.weight": np.full((ACTIONS, 8), 1e39)}, "a weight is NaN"),
             (None, "its tensors are [], and not 0.weight"),
         ],
     )
     def test_with_tensors_of_other_shapes_or_types_leaves_nothing(
-        self, call, same, tmp_path, name, changed, said
+        self, call, same, tmp_path, changed, said
     ):
-        folder, path = tmp_path / "policies", tmp_path / "policies" / f"{name}.safetensors"
-        with_layers(same, folder, name, [np.zeros((8, FEATURES)), np.zeros((ACTIONS, 8))])
+        folder, path = tmp_path / "policies", tmp_path / "policies" / "vut1.safetensors"
+        with_layers(same, folder, "vut1", [np.zeros((8, FEATURES)), np.zeros((ACTIONS, 8))])
         tensors = {} if changed is None else safetensors.numpy.load_file(path) | changed
         safetensors.numpy.save_file(tensors, path)
         write(folder, with_hash(networks(folder), path))
-        vut = "level1" if name == "vut1" else "design2"
-        asked = ("--vut", vut, "--level", "1", "--cases", 4, "--policies", folder)
+        asked = ("--vut", "level1", "--level", "1", "--cases", 4, "--policies", folder)
         result = call("campaign", *asked, "--out", tmp_path / "run")
-        assert_refused(result, f"{name}.safetensors holds no action-value network: ")
+        assert_refused(result, "vut1.safetensors holds no action-value network: ")
         assert said in result[2]
         assert not (tmp_path / "run").exists()
 
     @pytest.mark.parametrize(("name", "end"), [("pov1", End.SIM_ERROR), ("vut1", End.VUT_ERROR)])
     def test_whose_action_values_are_not_finite_gives_no_result(self, same, tmp_path, name, end):
         big = np.full((2, 2), 1e38)  # finite weights whose products are not
-        layers = [np.outer([1.0, -1.0], np.ones(FEATURES)), *[big] * 9, np.full((ACTIONS, 2), 1e38)]
+        first, last = np.outer([1.0, -1.0], np.ones(FEATURES)), np.full((ACTIONS, 2), 1e38)
+        layers = [first, *[big] * 9, last]
         folder = with_layers(same, tmp_path / "policies", name, layers)
         vut = "level1" if name == "vut1" else "design2"
         asked = dataclasses.replace(settings(folder), vut=vut)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from support.plans import plan_for
+from support.scenes import scene_of
 
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
@@ -31,11 +32,9 @@ ON_LANE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=LANE)
 
 def on_lane(x_vut_m: Sequence[float], merged: Sequence[bool] | None = None) -> Scene:
     """Return a scene of VUTs at 20 m/s, each with a POV at 30 m/s 30 m behind it."""
-    count, x_m = len(x_vut_m), np.array(x_vut_m)
-    active, step = np.ones(count, dtype=bool), np.full(count, 7)
-    state = x_m - 30.0, np.full(count, 30.0), x_m, np.full(count, 20.0)
-    known = np.zeros(count, dtype=bool) if merged is None else np.array(merged)
-    return Scene.of_pair(active, step, *state)._replace(merged=known)
+    x_m = np.array(x_vut_m)
+    known = np.zeros(len(x_m), dtype=bool) if merged is None else np.array(merged)
+    return scene_of(x_m - 30.0, 30.0, x_m, 20.0, step=7)._replace(merged=known)
 
 
 def begin(driver: Driver, case: Case = ON_LANE) -> None:
