@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -66,8 +65,6 @@ class TestMargins:
         assert margin("x < 1.5", x=0.75) == -0.5
         assert margin("x > 4", x=3.0) == 0.25
         assert margin("-4 < x", x=-6.0) == 0.5
-
-    def test_are_in_units_of_the_measure_where_the_threshold_is_0_or_a_measure(self):
         assert margin("x < 0", x=2.5) == 2.5
         assert margin("x < y", x=5.0, y=3.0) == 2.0
 
@@ -97,16 +94,14 @@ class TestMargins:
         assert (margin(condition, **values) < 0.0) is eval(condition, {}, values)  # noqa: S307
 
 
-class TestRefused:
+class TestParsing:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
             ("speed > 3", "no measure 'speed': choose score, dx_m, "),
             ("tcc_s < 1.5", "no measure 'tcc_s': did you mean ttc_s"),
-            ("zzzzzzzz < 1.5", "choose score, dx_m"),
             ("papr", "did you mean paper?"),
             ('end == "TIMEOT"', "never 'TIMEOT': did you mean TIMEOUT? it is MERGED or"),
-            ('end == "VUT_ERROR"', "never 'VUT_ERROR'"),
             ('end < "TIMEOUT"', "compare it with == or !="),
             ("end == merged_first", "with a text in quotes"),
             ("ttc_s == 1.5", "compare numbers with <"),
@@ -114,23 +109,17 @@ class TestRefused:
             ("ttc_s", "stands alone"),
             ("unsafe < 1", "no measure 'unsafe'"),
             ("end == TIMEOUT", 'write the text in quotes: end == "TIMEOUT"'),
-            ("1 < 2", "two numbers"),
             ("ttc_s < 1e999", "finite"),
             ("ttc_s < True", "neither a measure"),
-            ("ttc_s + 1 < 2", "neither a measure"),
-            ("ttc_s < 1 if end else 2", "is not a condition"),
             ('__import__("os").system("true")', "is not a condition"),
-            ("(lambda: 1)() < 2", "neither a measure"),
             ("ttc_s <", "is not an expression"),
-            ("", "is not an expression"),
             ("ttc_s < 1\0", "is not an expression"),
-            ("ttc_s < \ud800", "is not an expression"),
             ("(" * 500, "is not an expression"),
             ("ttc_s < 1 and " * 200 + "ttc_s < 1", "1000 are the most"),
             ("ttc_s < " + "9" * 900, "finite"),
         ],
     )
-    def test_what_is_no_criterion_in_one_sentence(self, text, said):
+    def test_other_texts_are_refused_in_one_sentence(self, text, said):
         with pytest.raises(UserError, match=r"^`fail_when`") as error:
             Criterion(text)
         assert said in str(error.value)
@@ -157,11 +146,6 @@ class TestMeasures:
         assert of("drac_mps2 > 1000", crash) == -MOST_MARGIN
         assert of("last_avoidable_s < -9", crash) == -MOST_MARGIN
 
-    def test_gaps_are_between_bumpers(self):
-        # The POV is 8 m ahead, and 5 m long.
-        assert of("bumper_gap_m < 2", ending(8.0)) == pytest.approx(0.5)
-        assert of("bumper_gap_m < 2", ending(-8.0)) == pytest.approx(0.5)
-
     def test_braking_after_the_merge_by_hand(self):
         # 20 m between bumpers, closing by 10 m/s: 12.5 m are left after 0.75 s, so 100 / 25.
         behind = ending(-25.0, v_pov=36.0, v_vut=26.0)
@@ -179,16 +163,6 @@ class TestMeasures:
         assert Measures.of(ending(0.0, end=End.TIMEOUT)).severity is None
         assert of('severity == "contact"', ending(0.0)) == -1.0
         assert of('severity != "contact"', ending(0.0, end=End.TIMEOUT)) == -1.0
-
-
-class TestRecords:
-    def test_hold_every_measure_that_a_criterion_may_name(self):
-        lane = replace(US23, follow_up_s=3.0, lane_m=(-70.0, 130.0))
-        followed = replace(CASE, scenario=lane)
-        after = np.array([[[20.0, 30.0, 0.0], [0.0, 26.0, 0.0]]])
-        episode = replace(ending(20.0), case=followed, after=after)
-        record = PAPER_CRITERION.outcome(0, 0, episode).to_record()
-        assert set(vocabulary()) - {"nearest"} <= set(record)
 
 
 class TestNamed:
@@ -211,20 +185,19 @@ class TestNamed:
 
     def test_unsafe_is_also_who_must_brake_harder_than_3(self):
         # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
-        harsh = ending(-25.0, v_pov=36.0, v_vut=26.0)
-        assert Criterion("unsafe").outcome(0, 0, harsh).margin == pytest.approx(-1.0 / 3.0)
-        assert not Criterion("contact").outcome(0, 0, harsh).failed
+        harsh = Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=36.0, v_vut=26.0))
+        assert harsh.margin == pytest.approx(-1.0 / 3.0)
         assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
 
 
 def lines(apart_m, ends_m=-20.0):
-    """Return a mainline along y = 0 and a ramp beside it that only joins in the last metre."""
+    """Return a mainline along y = 0 and a ramp that runs next to it and joins in the last metre."""
     mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
     y = [(-400.0, 50.0), (ends_m - 1.0, 50.0), (ends_m, apart_m), (-1.0, apart_m), (0.0, 0.0)]
     return CentreLines.of(mainline, np.array([[x, x, side] for x, side in [*y, (400.0, 0.0)]]))
 
 
-def beside(dx, x_vut=-5.0):
+def side_by_side(dx, x_vut=-5.0):
     """Return an episode of one step in which the VUT is still before M."""
     motion = np.array([[[x_vut + dx, 20.0, 0.0], [x_vut, 20.0, 0.0]]])
     return Trajectory(CASE, motion, End.TIMEOUT)
@@ -235,14 +208,13 @@ class TestBodiesBeforeM:
         ("dx", "apart", "clearance"),
         [
             (0.0, 1.0, -0.8),  # side by side, 1.8 m wide
-            (2.0, 1.5, -0.3),
             (0.0, 2.0, 0.2),
             (4.9, 1.0, -0.1),  # 5 m long: one would have to move aside by less, along the lane
             (-8.0, 1.0, 3.0),
         ],
     )
     def test_clear_each_other_by_hand(self, dx, apart, clearance):
-        found = nearest(beside(dx), lines(apart))
+        found = nearest(side_by_side(dx), lines(apart))
         assert found == pytest.approx(clearance)
 
     def test_that_cross_by_hand(self):
@@ -257,10 +229,10 @@ class TestBodiesBeforeM:
     def test_are_looked_at_where_the_lanes_run_together(self):
         assert lines(1.0, ends_m=-20.0).together_m == pytest.approx(20.0, abs=SPACING_M)
         assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
-        assert nearest(beside(0.0, x_vut=-30.0), lines(1.0)) == math.inf
+        assert nearest(side_by_side(0.0, x_vut=-30.0), lines(1.0)) == math.inf
 
     def test_before_m_are_a_measure_of_their_own(self):
-        hit = beside(0.0)
+        hit = side_by_side(0.0)
         assert Criterion("contact").margin(hit, Measures.of(hit)) == MOST_MARGIN
         touching = Measures.of(hit, lines(1.0))
         assert Criterion("contact").margin(hit, touching) == MOST_MARGIN
@@ -270,8 +242,8 @@ class TestBodiesBeforeM:
 
 
 class TestOutcomes:
-    @pytest.mark.parametrize("margin", [True, "1", math.nan, [3]])
-    def test_with_a_margin_that_is_none_are_refused(self, margin):
+    @pytest.mark.parametrize("margin", [True, "1", math.nan])
+    def test_with_a_margin_that_is_not_a_number_are_refused(self, margin):
         record = Criterion("ttc_s < 4").outcome(0, 0, ending(9.0)).to_record()
         with pytest.raises(UserError, match=r"margin|JSON"):
             Outcome.from_json(json.dumps(record | {"margin": margin}), scenario=US23)

@@ -16,11 +16,11 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 
 STEPS = 81
 LEVEL0 = np.ones(STEPS)
-"""What a level-0 VUT does in the 8 s of a hand-made episode: 1 m/s2 from 18 to 26 m/s."""
+"""Accelerations of a level-0 VUT in a hand-made episode of 8 s: from 18 to 26 m/s."""
 
 
 def phases(*parts: tuple[float, float]) -> np.ndarray:
-    """Return accelerations from (seconds, m/s2) pairs; the last one goes on to the end."""
+    """Return accelerations from (seconds, m/s2) pairs; the last one lasts to the end."""
     a = np.concatenate([np.full(round(s / DT_S), value) for s, value in parts])
     return np.concatenate([a, np.full(STEPS, parts[-1][1])])[:STEPS]
 
@@ -48,10 +48,6 @@ def diagnosed(trajectory: Trajectory) -> Diagnosis:
     return diagnose(trajectory, Measures.of(trajectory))
 
 
-def kind(trajectory: Trajectory) -> Kind | None:
-    return diagnosed(trajectory).kind
-
-
 KEEP = np.zeros(STEPS)
 BRAKES = phases((3.0, 0.0), (5.0, -1.0))
 COASTS = phases((2.0, 1.0), (6.0, 0.0))
@@ -68,10 +64,6 @@ class TestWhichVehicleBrakes:
         found = diagnosed(meeting(BRAKES, COASTS))
         assert (found.pov_brakes_s, found.vut_brakes_s) == (3.0, None)
         assert (found.pov_accelerates, found.vut_accelerates) == (False, True)
-
-    def test_one_that_braked_does_not_count_as_accelerating(self):
-        found = diagnosed(meeting(KEEP, phases((2.0, 1.0), (2.0, -2.0), (4.0, 1.0))))
-        assert (found.vut_brakes_s, found.vut_accelerates) == (2.0, False)
 
     def test_in_traffic_the_car_that_the_vut_meets(self):
         pair = meeting(BRAKES, LEVEL0)
@@ -90,7 +82,7 @@ class TestWhichVehicleBrakes:
         met = Trajectory(case, motion, End.MERGED)
         assert Measures.of(met).nearest == "behind"
         assert diagnosed(met).pov_brakes_s == 3.0
-        assert kind(met) is Kind.POV_BRAKES
+        assert diagnosed(met).kind is Kind.POV_BRAKES
 
     def test_none_that_loses_less_than_1_mps(self):
         a_little = phases((3.0, 0.0), (0.9, -1.0), (4.1, 0.0))
@@ -105,12 +97,10 @@ class TestWhichVehicleBrakes:
 
 class TestTheKind:
     def test_is_a_squeeze_where_neither_does(self):
-        assert kind(meeting(KEEP, LEVEL0)) is Kind.SQUEEZE
-        assert kind(meeting(KEEP + 0.5, LEVEL0)) is Kind.SQUEEZE
-        assert kind(meeting(KEEP, COASTS)) is Kind.SQUEEZE
+        assert diagnosed(meeting(KEEP, LEVEL0)).kind is Kind.SQUEEZE
 
     def test_is_none_where_the_cars_are_6_m_apart(self):
-        assert kind(meeting(BRAKES, COASTS, gap_m=30.0)) is None
+        assert diagnosed(meeting(BRAKES, COASTS, gap_m=30.0)).kind is None
 
 
 def outcome(index: int, x: float, v: float, failed: bool, level: int = 1) -> Outcome:
@@ -142,10 +132,6 @@ class TestRegions:
         outcomes = over_the_pool(lambda x, v: x > -200, level=2)
         assert failure_boxes(outcomes, 1) == []
         assert failure_boxes(outcomes, 2)[0].level == 2
-
-    def test_are_not_made_of_a_few_failures(self):
-        outcomes = [outcome(n, -300.0 + n, 30.0, n < 2) for n in range(40)]
-        assert failure_boxes(outcomes, 1) == []
 
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):
         (box,) = failure_boxes(over_the_pool(lambda x, v: True), 1)

