@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from support.handmade import write_run
 import merge_sumo as ms
 from merge_sumo.campaigns.run import failures
 from merge_sumo.errors import UserError
-from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.summary import Gate, LevelSummary, Summary, judge, parse_gates, summarise
 from merge_sumo.printable import counted
 from merge_sumo.reports.junit import write_junit
@@ -222,16 +220,3 @@ class TestACampaignWithGates:
         said = invoke("campaign", *again(mixed, vuts), "--junit", file)
         assert "choose another name with `junit`" in str(said.exception)
         assert file.read_bytes() == before
-
-    def test_that_is_stopped_says_them_in_the_command_that_goes_on(self, tmp_path, monkeypatch):
-        def stop(self) -> None:
-            raise Stopped(signal.SIGINT)
-
-        monkeypatch.setattr("merge_sumo.interrupt.Interrupt.check", stop)
-        said: list = []
-        monkeypatch.setattr("merge_sumo.console.say", said.append)
-        file = tmp_path / "a file.xml"
-        with pytest.raises(Stopped):
-            campaign("design2", tmp_path / "run", "--gate", "fmc>0.5", "--junit", file)
-        assert said[-1].endswith(f"--gate 'fmc>0.5' --junit '{file}'")
-        assert not file.exists()

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import subprocess
 import sys
@@ -79,14 +78,13 @@ class TestOpenScenario:
                 assert turned == pytest.approx(0.0, abs=1e-8)
 
 
-class TestAFreeVut:
-    def test_has_the_controller_that_a_parameter_names(self, scenario):
-        tree = etree.parse(scenario.with_name(f"{scenario.stem}-free.xosc"))
-        (assigned,) = tree.findall(".//Private[@entityRef='vut']//AssignControllerAction")
-        assert assigned.get("activateLateral") == assigned.get("activateLongitudinal") == "true"
-        assert assigned.find("Controller").get("name") == "$EgoController"
-        (declared,) = tree.findall("ParameterDeclarations/ParameterDeclaration")
-        assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
+def test_a_free_vut_has_the_controller_that_a_parameter_names(scenario):
+    tree = etree.parse(scenario.with_name(f"{scenario.stem}-free.xosc"))
+    (assigned,) = tree.findall(".//Private[@entityRef='vut']//AssignControllerAction")
+    assert assigned.get("activateLateral") == assigned.get("activateLongitudinal") == "true"
+    assert assigned.find("Controller").get("name") == "$EgoController"
+    (declared,) = tree.findall("ParameterDeclarations/ParameterDeclaration")
+    assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
 
 
 class TestAMergeFromALane:
@@ -124,35 +122,27 @@ class TestAMergeFromALane:
         assert set(second) == {0}
 
 
-class TestATable:
-    def test_has_a_row_for_every_step_of_every_case(self, made, tmp_path):
-        path = write_table(made, [0, 3], tmp_path)
-        with path.open(newline="") as file:
-            header, *rows = csv.reader(file)
-        assert header == [
-            *("case", "level", "time_s", "x_pov_m", "v_pov_mps", "a_pov_mps2"),
-            *("x_vut_m", "v_vut_mps", "a_vut_mps2", "x_pov0_m", "v_pov0_mps", "svo_rad"),
-            "severity",
-        ]
-        motion = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
-        assert np.array_equal(
-            np.array([row[3:9] for row in rows], dtype=float), motion.reshape(-1, 6)
-        )
-        case = made.outcome(0).case
-        assert [float(cell) for cell in rows[5][9:11]] == [case.x_pov0_m, case.v_pov0_mps]
-        assert rows[5][11] == "", "level 0 has no psi"
-        assert {row[12] for row in rows} == {made.outcome(i).measures.severity for i in (0, 3)}
-        assert {row[0] for row in rows} == {"0", "3"}
-        assert float(rows[5][2]) == pytest.approx(5 * DT_S)
+def test_a_table_has_a_row_for_every_step_of_every_case(made, tmp_path):
+    frame = polars.read_csv(write_table(made, [0, 3], tmp_path))
+    motion = ["x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"]
+    start = ["x_pov0_m", "v_pov0_mps", "svo_rad"]
+    assert frame.columns == ["case", "level", "time_s", *motion, *start, "severity"]
+    recorded = np.concatenate([made.trajectory(i).motion for i in (0, 3)])
+    assert np.array_equal(frame[motion].to_numpy(), recorded.reshape(-1, 6))
+    case = made.outcome(0).case
+    # Level 0 has no psi.
+    assert frame[start].row(5) == (case.x_pov0_m, case.v_pov0_mps, None)
+    assert set(frame["severity"]) == {made.outcome(i).measures.severity for i in (0, 3)}
+    assert set(frame["case"]) == {0, 3}
+    assert frame["time_s"][5] == pytest.approx(5 * DT_S)
 
 
-class TestTheCommand:
-    def test_says_how_many_cases_of_more_a_file_has(self, tmp_path):
-        run = write_run(tmp_path / "run", per_level=15)
-        with pytest.warns(Notice, match="the file has 40 of 45 cases"):
-            ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
-        with pytest.raises(UserError, match=r"end it in \.csv"):
-            ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
+def test_a_cases_file_of_more_says_how_many_it_has(tmp_path):
+    run = write_run(tmp_path / "run", per_level=15)
+    with pytest.warns(Notice, match="the file has 40 of 45 cases"):
+        ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
+    with pytest.raises(UserError, match=r"end it in \.csv"):
+        ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
 
 
 def test_no_export_loads_libsumo():

@@ -1,14 +1,14 @@
 """The cause of each case against its recorded motion, for controllers of many families.
 
-The second calculation is plain Python over the numbers of the trajectory: it shares nothing with
-the diagnosis, the measures or the page. A sentence that it does not know fails the test.
+The second calculation is plain Python over the numbers of the trajectory, without the diagnosis and
+the measures. An unknown sentence fails the test.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -27,6 +27,7 @@ from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.road.scenario_file import named_scenario
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -36,10 +37,7 @@ OWN = {
     "Waits": "return 0.7 if seen.x_vut_m < -20.0 else -0.4, seen.x_pov_m > seen.x_vut_m + 5.0",
 }
 """Controllers of the tests, by what `act` returns."""
-VUTS = (
-    *("design1", "design2", "gap", "level0", "level1", "level2", "sumo:IDM", "sumo:Krauss"),
-    *("trial:Delayed", "own:Startled", "stop:Waits"),
-)
+VUTS = ("design1", "gap", "level2", "sumo:IDM", "trial:Delayed", "own:Startled", "stop:Waits")
 CASES = 40
 """Of each controller."""
 ON_LANE = replace(named_scenario("us23-lane"), name="stop", follow_up_s=0.0, lane_end="stop")
@@ -66,8 +64,8 @@ def spec_of(vut: str, folder: Path) -> str:
     return f"{file}:{name}"
 
 
-class Told:
-    """What the motion of the VUT and the car that it met says, by plain arithmetic."""
+class Motion:
+    """The motion of the VUT and the nearest car, evaluated by plain arithmetic."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.pov, self.vut = (trajectory.motion[:, row].tolist() for row in (0, 1))
@@ -125,6 +123,12 @@ class Told:
         return False
 
 
+COORDINATES: dict[str, Callable[[Case], float | None]] = {
+    "x_POV0": lambda case: case.x_pov0_m,
+    "v_POV0": lambda case: case.v_pov0_mps,
+    "psi": lambda case: case.svo_rad,
+    "POV due": lambda case: -case.x_pov0_m / case.v_pov0_mps,
+}
 KINDS: dict[str, Callable[[float | None, float | None, float], bool]] = {
     "stalemate": lambda vut, pov, out: vut is not None and vut <= out and pov is not None,
     "squeeze": lambda vut, pov, _: vut is None and pov is None,
@@ -135,26 +139,26 @@ KINDS: dict[str, Callable[[float | None, float | None, float], bool]] = {
 """What is true of each kind, by when the VUT and the POV begin to brake and the last way out."""
 
 
-def check_kind(kind: str, told: Told) -> None:
-    step = told.way_out_s()
+def check_kind(kind: str, motion: Motion) -> None:
+    step = motion.way_out_s()
     out = -1.0 if step is None else round(step * DT_S, 1)
-    assert abs(told.dx) < NEAR_M
-    assert KINDS[kind](told.braking_s(told.vut), told.braking_s(told.pov), out)
+    assert abs(motion.dx) < NEAR_M
+    assert KINDS[kind](motion.braking_s(motion.vut), motion.braking_s(motion.pov), out)
 
 
 def near(said: str, value: float, digits: int = 1) -> None:
     assert abs(float(said) - value) <= 0.5 * 10.0**-digits + 1e-4, (said, value)
 
 
-def check_cause(text: str, outcome: Outcome, told: Told) -> None:
+def check_cause(text: str, outcome: Outcome, motion: Motion) -> None:
     """Check all that a cause says."""
     if outcome.measures.end is End.TIMEOUT:
         found = re.fullmatch(rf"Timeout: {CONDUCT} did not reach {GOAL} in (.+) s\.", text)
         assert found is not None, text
         vut, pov, after = found.groups()
-        assert not told.arrived
-        near(after, told.end_s, 0)
-        assert (vut, pov) == (told.conduct(told.vut), told.conduct(told.pov))
+        assert not motion.arrived
+        near(after, motion.end_s, 0)
+        assert (vut, pov) == (motion.conduct(motion.vut), motion.conduct(motion.pov))
         return
     found = re.fullmatch(
         rf"([A-Za-z ]+)(?:, (contact|conflict))?(?: at a relative speed of {NUMBER} m/s)?: "
@@ -164,41 +168,28 @@ def check_cause(text: str, outcome: Outcome, told: Told) -> None:
         text,
     )
     assert found is not None, text
-    head, severity, impact, vut, pov, where, share, at, apart, side, avoided = found.groups()
+    head, severity, _, vut, pov, where, share, at, apart, side, avoided = found.groups()
     head = head[0].lower() + head[1:]
-    assert (vut, pov) == (told.conduct(told.vut), told.conduct(told.pov))
-    assert told.arrived
-    near(at, told.end_s)
-    near(apart, abs(told.dx))
-    assert (side == "ahead of") == (told.dx < 0.0)
-    assert (where is None) == (told.lane_m is None)
-    if told.lane_m is not None:
-        begin_m, end_m = told.lane_m
-        merged_at = (told.place_m - begin_m) / (end_m - begin_m)
+    assert (vut, pov) == (motion.conduct(motion.vut), motion.conduct(motion.pov))
+    assert motion.arrived
+    near(at, motion.end_s)
+    near(apart, abs(motion.dx))
+    assert (side == "ahead of") == (motion.dx < 0.0)
+    assert (where is None) == (motion.lane_m is None)
+    if motion.lane_m is not None:
+        begin_m, end_m = motion.lane_m
+        merged_at = (motion.place_m - begin_m) / (end_m - begin_m)
         assert (share is None) == (merged_at >= 1.0)
         if share is not None:
             near(share, merged_at, 2)
-    assert (abs(told.dx) < NEAR_M) == (severity is not None) == (avoided is not None)
-    check_severity(severity or head, impact, told)
+    assert (abs(motion.dx) < NEAR_M) == (severity is not None) == (avoided is not None)
     if avoided is not None:
-        check_kind(head, told)
-        check_avoided(avoided, told)
+        check_kind(head, motion)
+        check_avoided(avoided, motion)
 
 
-def check_severity(word: str, impact: str | None, told: Told) -> None:
-    touching = [(pov, vut) for pov, vut in told.after if abs(pov[0] - vut[0]) <= LENGTH_M]
-    assert (word == "contact") == bool(touching) == (impact is not None)
-    if impact is not None:
-        near(impact, abs(touching[0][0][1] - touching[0][1][1]))
-    elif abs(told.dx) < NEAR_M:
-        assert word == "conflict"
-    else:
-        behind = [rows[told.dx > 0.0] for rows in told.after]
-        assert word == ("harsh" if max(-a for _, _, a in behind) > 3.0 else "safe")
-
-
-def check_avoided(text: str, told: Told) -> None:
-    step = told.way_out_s()
+def check_avoided(text: str, motion: Motion) -> None:
+    step = motion.way_out_s()
     until = rf"The last way out, full braking or full acceleration of the VUT, closes at {NUMBER} s"
     never = "At no time does full braking or full acceleration of the VUT keep 6 m at (M|the merge)"
     found = re.fullmatch(f"(?:{never}|{until})(?:; {OTHERS})?", text)
@@ -234,10 +225,6 @@ def campaign(request, campaign_of) -> Run:
     return campaign_of(request.param)
 
 
-def failing(run: Run) -> Iterable[str]:
-    return causes(run, [outcome for outcome in run.cases if outcome.failed]).values()
-
-
 class TestTheCause:
     def test_of_each_case_is_true(self, campaign):
         for index, text in causes(campaign, campaign.cases).items():
@@ -245,14 +232,14 @@ class TestTheCause:
             if outcome.measures.end.is_error:
                 assert text.startswith(f"{outcome.measures.end} at ")
                 continue
-            check_cause(text, outcome, told := Told(campaign.trajectory(index)))
+            check_cause(text, outcome, motion := Motion(campaign.trajectory(index)))
             slows_mps = outcome.measures.pov_slowdown_mps or 0.0
             brakes_mps2 = outcome.measures.pov_sustained_brake_mps2 or 0.0
-            assert (slows_mps >= BRAKED_MPS - 1e-6) == (told.braking_s(told.pov) is not None)
+            assert (slows_mps >= BRAKED_MPS - 1e-6) == (motion.braking_s(motion.pov) is not None)
             assert slows_mps >= 1.6 * brakes_mps2 - 1e-6
 
     def test_is_said_first_wherever_the_case_is_shown(self, campaign_of, tmp_path):
-        run = campaign_of("design2")
+        run = campaign_of("design1")
         outcome = next(o for o in run.cases if o.failed)
         index, said = outcome.index, causes(run, [outcome])[outcome.index]
         assert ms.run(recorded=(run.folder, index)).lines()[1] == said
@@ -266,28 +253,16 @@ class TestTheCause:
         assert said.startswith(without.removesuffix("."))
         assert comparison_page(compared).count(f": {without}</p>") == 2
 
-    def test_begins_with_each_kind_in_some_case(self, campaign_of):
-        said = [text for vut in VUTS for text in failing(campaign_of(vut))]
-        assert {re.split("[,:]", text[0].lower() + text[1:])[0] for text in said} == set(KINDS)
-
 
 def test_regions_in_words_hold_the_cases_that_they_count(campaign):
-    bound = re.compile(
-        rf"(x_POV0|v_POV0|psi|POV due)\D* (between|above|below) {NUMBER}(?: and {NUMBER})?"
-    )
+    names = "|".join(COORDINATES)
+    bound = re.compile(rf"({names})\D* (between|above|below) {NUMBER}(?: and {NUMBER})?")
     for box in ReportModel(campaign, learns=False).boxes:
         inside = [o for o in campaign.outcomes if o.case.level == box.level]
         for name, kind, *numbers in bound.findall(box.where):
             ends = [float(number) for number in numbers if number]
             low = -math.inf if kind == "below" else ends[0]
             high = math.inf if kind == "above" else ends[-1]
-            inside = [o for o in inside if low <= quantity(o, name) <= high]
+            inside = [o for o in inside if low <= (COORDINATES[name](o.case) or 0.0) <= high]
         failing = [o for o in inside if abs(o.measures.dx_m or NEAR_M) < NEAR_M]
         assert (len(failing), len(inside)) == (box.failures, box.cases), box.where
-
-
-def quantity(outcome: Outcome, name: str) -> float:
-    case = outcome.case
-    due_s = -case.x_pov0_m / case.v_pov0_mps
-    values = {"x_POV0": case.x_pov0_m, "v_POV0": case.v_pov0_mps, "POV due": due_s}
-    return values.get(name, case.svo_rad or 0.0)
