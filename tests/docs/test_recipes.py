@@ -17,7 +17,7 @@ NEW = {
 from merge_sumo.samplers.base import LevelwiseSampler
 
 
-class CornerSampler(LevelwiseSampler):
+class Corner(LevelwiseSampler):
     about = "draws from a corner of the pool"
     colour = "#994F00"
     learns = False
@@ -93,8 +93,7 @@ MORE = {
 '''
     },
     "samplers/registry.py": {
-        '        "uniform": "merge': """        "corner": "merge_sumo.samplers.corner:CornerSampler",
-"""
+        '        "uniform": "merge': '        "corner": "merge_sumo.samplers.corner:Corner",\n'
     },
     "controllers/kinds.py": {
         '        HERE: "merge': '        "hold": "merge_sumo.controllers.hold:HoldKind",\n'
