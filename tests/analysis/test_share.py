@@ -32,7 +32,8 @@ def test_is_said_with_its_exact_interval(failures, says):
     assert LevelShare(level=0, cases=2000, failures=failures).shown == says
 
 
-def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path):
+def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr(share, "CASES", 2000)
     run = api.campaign("design1", level=0, seed=4, cases=30, out=tmp_path / "run")
     shares = SHARES.read(run.folder)
     assert shares is not None
