@@ -77,6 +77,11 @@ class Version:
             sampler=run.settings.sampler,
         )
 
+    @property
+    def cases(self) -> list[Outcome]:
+        """The deciding run of each case."""
+        return one_per_case(self.outcomes, self.tolerated)
+
     @cached_property
     def at(self) -> dict[int, LevelSummary]:
         """The summary of each level with cases."""
@@ -421,28 +426,14 @@ def _check_comparable(a: Run, b: Run) -> None:
 def _step(versions: Sequence[Version], after: int) -> Step:
     """Return the changes to the version with an index from the one before it."""
     earlier, later = versions[after - 1], versions[after]
-    cases = paired(earlier.outcomes, later.outcomes, later.tolerated)
-    step = Step(after, after + 1, cases)
-    if earlier.sampler != later.sampler:
-        return step
-    shared = Counter(case.a.case.level for case in cases)
-    before, now = _by_level(earlier), _by_level(later)
-    own_before: list[Outcome] = []
-    own_now: list[Outcome] = []
-    for level in before.keys() & now.keys():
-        # The shares of a level decide where a version has cases of its own.
-        if shared[level] < max(len(before[level]), len(now[level])):
-            own_before += before[level]
-            own_now += now[level]
-    return with_shares(step, own_before, own_now) if own_now else step
-
-
-def _by_level(version: Version) -> dict[int, list[Outcome]]:
-    """Return the deciding run of each case by level."""
-    found: dict[int, list[Outcome]] = {}
-    for outcome in one_per_case(version.outcomes, version.tolerated):
-        found.setdefault(outcome.case.level, []).append(outcome)
-    return found
+    step = Step(after, after + 1, paired(earlier.outcomes, later.outcomes, later.tolerated))
+    levels = earlier.at.keys() & later.at.keys()
+    before = [outcome for outcome in earlier.cases if outcome.case.level in levels]
+    now = [outcome for outcome in later.cases if outcome.case.level in levels]
+    has_own = len(step.cases) < max(len(before), len(now))
+    if has_own and earlier.sampler == later.sampler:
+        return with_shares(step, before, now)
+    return step
 
 
 def with_shares(step: Step, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> Step:

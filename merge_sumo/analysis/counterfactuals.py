@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from itertools import compress
 from typing import Any, Literal
 
 import numpy as np
@@ -69,7 +70,7 @@ class Avoidance(Record, frozen=True):
 
     @property
     def clause(self) -> str:
-        """The drivers that would have avoided it, in words."""
+        """The drivers that would have avoided the failure, in words."""
         by = either(self.avoided_by) if self.avoided_by else "no reference driver"
         text = f"in the place of the VUT {by} would have avoided it"
         if self.latest_takeover_s is not None:
@@ -120,8 +121,8 @@ def avoidance(
         on_part: called with the number of failures that are done, and of all; may raise.
     """
     run = study.run
-    worst = sorted(outcome.index for outcome in failures(run.cases)[:MOST])
-    failing = list(run.trajectories(worst).items())
+    worst = [outcome.index for outcome in failures(run.cases)[:MOST]]
+    failing = list(run.trajectories(sorted(worst)).items())
     # No code of the VUT: a driver of the package is in its place.
     plan = replace(study.plan, vut=load(TAKES_OVER)).for_verdicts().with_engine(None)
     plan = plan.with_log(run.folder.resolve() / LOG)
@@ -174,72 +175,65 @@ class Counterfactual(Case):
 
 def avoidances(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoidance]:
     """Return which drivers would have avoided failures, by running their cases in this process."""
-    motions = [motion for _, motion in failing]
+    cases = []
+    # One driver after the other: a driver that is in no corridor costs nothing.
+    for name in REFERENCES:
+        cases += [Counterfactual.of(motion, by=name) for _, motion in failing]
+    for _, motion in failing:
+        until = len(motion.motion) - 1
+        cases.append(Counterfactual.of(motion, until=until, careful_pov=True))
     with opened_simulator(plan) as simulator:
-        passed = _Passed(plan, simulator)
-        # One driver after the other: a driver that is in no corridor costs nothing.
-        cases = [Counterfactual.of(motion, by=name) for name in REFERENCES for motion in motions]
-        for motion in motions:
-            until = len(motion.motion) - 1
-            cases.append(Counterfactual.of(motion, until=until, careful_pov=True))
-        *by_name, pov_careful = np.reshape(passed(cases), (-1, len(motions))).tolist()
-        latest = _latest_takeovers(passed, plan, motions)
+        passed = np.reshape(_passed(plan, simulator, cases), (-1, len(failing)))
+        latest = _latest_takeovers(plan, simulator, [motion for _, motion in failing])
     found = []
     for row, (index, _) in enumerate(failing):
-        names = [name for name, by in zip(REFERENCES, by_name, strict=True) if by[row]]
-        step = latest[row]
-        time_s = None if step is None else round(step * DT_S, 1)
-        found.append(Avoidance(index, tuple(names), time_s, pov_careful[row]))
+        *by_name, pov_careful = passed[:, row].tolist()
+        names = tuple(compress(REFERENCES, by_name))
+        found.append(Avoidance(index, names, latest[row], pov_careful))
     return found
 
 
 def _latest_takeovers(
-    passed: Callable[[Sequence[Counterfactual]], list[bool]],
-    plan: SimulationPlan,
-    motions: Sequence[Trajectory],
-) -> list[int | None]:
-    """Return the last steps at which a driver may take over; None without one."""
-    latest: list[int | None] = [None] * len(motions)
+    plan: SimulationPlan, simulator: Simulator, motions: Sequence[Trajectory]
+) -> list[float | None]:
+    """Return the last times at which a driver may take over, s; None without one."""
+    latest: list[float | None] = [None] * len(motions)
     ends = {row: len(motion.motion) - 1 for row, motion in enumerate(motions)}
     while ends:
-        takeovers, cases = [], []
+        rows, cases = [], []
         for row, end in ends.items():
             for until in range(max(end - BLOCK_STEPS, 0), end):
                 # Learned POVs have no other memory than their last decision; a user's POV may.
                 first = 0 if plan.engine is Engine.SUMO else until - until % DECISION_STEPS
-                takeovers.append((row, until))
-                how = {"by": TAKES_OVER, "first": first, "until": until}
-                cases.append(Counterfactual.of(motions[row], **how))
-        for (row, until), has_passed in zip(takeovers, passed(cases), strict=True):
-            if has_passed:
-                latest[row] = until  # in rising order
-        untried = {}
-        for row, end in ends.items():
-            if latest[row] is None and end > BLOCK_STEPS:
-                untried[row] = end - BLOCK_STEPS
-        ends = untried
+                takeover = {"by": TAKES_OVER, "first": first, "until": until}
+                rows.append(row)
+                cases.append(Counterfactual.of(motions[row], **takeover))
+        for row, case, passed in zip(rows, cases, _passed(plan, simulator, cases), strict=True):
+            if passed:
+                latest[row] = round(case.until * DT_S, 1)  # in rising order
+        for row, end in list(ends.items()):
+            ends[row] = end - BLOCK_STEPS
+            if latest[row] is not None or ends[row] <= 0:
+                del ends[row]
     return latest
 
 
-class _Passed:
-    """Runs counterfactuals in the world of a simulator, and returns whether each passes."""
-
-    def __init__(self, plan: SimulationPlan, simulator: Simulator) -> None:
-        self._plan, self._world = plan, simulator.world
-        self._mainline = _Mainline(simulator.pov)
-        self._substitutes = _Substitutes(simulator.world.corridors)
-
-    def __call__(self, cases: Sequence[Counterfactual]) -> list[bool]:
-        trajectories = Rollout(self._world, self._mainline, self._substitutes, cases).run()
-        criterion, lines = self._plan.criterion, centre_lines(self._plan.road)
-        passed = []
-        for case, trajectory in zip(cases, trajectories, strict=True):
-            whole = case.from_the_start(trajectory)
-            # A merge after which the vehicle behind cannot brake hard enough avoids nothing.
-            can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
-            tested = can_brake and whole.end.is_tested
-            passed.append(tested and not criterion.judged(whole, lines).failed)
-        return passed
+def _passed(
+    plan: SimulationPlan, simulator: Simulator, cases: Sequence[Counterfactual]
+) -> list[bool]:
+    """Run counterfactuals in the world of a simulator; return whether each passes."""
+    world = simulator.world
+    substitutes = _Substitutes(world.corridors)
+    trajectories = Rollout(world, _Mainline(simulator.pov), substitutes, cases).run()
+    lines = centre_lines(plan.road)
+    passed = []
+    for case, trajectory in zip(cases, trajectories, strict=True):
+        whole = case.from_the_start(trajectory)
+        # A merge after which the vehicle behind cannot brake hard enough avoids nothing.
+        can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
+        tested = can_brake and whole.end.is_tested
+        passed.append(tested and not plan.criterion.judged(whole, lines).failed)
+    return passed
 
 
 class _Substitutes(Driver):
