@@ -1,4 +1,4 @@
-"""Scenarios of a user: written for a merge in a net, and checked before they are run."""
+"""Scenarios of a user: written for a merge in a net, and checked before they run."""
 
 from __future__ import annotations
 
@@ -25,30 +25,32 @@ from merge_sumo.scenario.scenario import Scenario
 
 
 def shipped() -> Shown:
-    """Return the scenarios that the package brings, by name."""
-    known = {name: named_scenario(name) for name in shipped_scenarios()}
-    lines = []
-    for name, scenario in known.items():
+    """Return the scenarios of the package, by name."""
+    record, lines = {}, []
+    for name in shipped_scenarios():
+        scenario = named_scenario(name)
+        record[name] = scenario.to_record()
         x, v = scenario.dimensions(0)[:2]
         line = f"{name}: POV from {x.low:g} to {x.high:g} m at {v.low:g} to {v.high:g} m/s"
         if scenario.lane_m is not None:
             line += "; acceleration lane from {:g} to {:g} m".format(*scenario.lane_m)
         lines.append(line)
-    return Shown({name: scenario.to_record() for name, scenario in known.items()}, lines)
+    return Shown(record, lines)
 
 
-def write_scenario(asked: config.NewScenario) -> Shown:
+def write_scenario(options: config.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road.
 
-    Raises `UserError` for a net without such a merge, and where something is there.
+    Raises:
+        UserError: for a net without such a merge, and for files that exist.
     """
-    file, net = Path(asked.file), Path(asked.net)
+    file, net = Path(options.file), Path(options.net)
     check_new(file, "FILE", (SUFFIX,))
     picture = file.with_suffix(".svg")
     check_new(picture, "FILE")
-    edges = tuple(asked.mainline.split()), tuple(asked.ramp.split())
+    edges = tuple(options.mainline.split()), tuple(options.ramp.split())
     road = road_of(net, *edges)
-    if not asked.point:
+    if not options.point:
         road = road_of(net, *edges, lane_m=suggested_lane_m(road))
     scenario, found = suggested(road, file.stem), [*about(road), *kind_of_merge(road)]
     relative = os.path.relpath(net.resolve(), file.parent.resolve())
@@ -59,7 +61,7 @@ def write_scenario(asked: config.NewScenario) -> Shown:
 
 
 def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Shown:
-    """Say whether a scenario can be hosted, and whether the learned drivers were trained on it.
+    """Return the road of a scenario, and the differences to the training of the learned drivers.
 
     Args:
         scenario: the scenario.
@@ -68,16 +70,18 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
     """
     found = road_for(scenario)
     road, differing = about(found), unseen(scenario, policies)
-    warnings, lines = lane_warnings(scenario, found), list[str]()
+    warnings = lane_warnings(scenario, found)
+    lines = [*road, *(f"warning: {sentence}" for sentence in warnings)]
     if differing:
         made = quoted(f"{scenario.name}-policies")
-        lines = [
+        lines += [
             "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
             *(f"  {sentence}" for sentence in differing),
             f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
             f"then name it to campaigns with `policies`: {made}",
         ]
     else:
-        lines = ["the learned drivers (levels 1 and 2) were trained on such starts, or like ones"]
-    said = [*road, *(f"warning: {sentence}" for sentence in warnings), *lines]
-    return Shown({"about": road, "warnings": warnings, "unseen": differing}, said)
+        lines.append(
+            "the learned drivers (levels 1 and 2) were trained on such starts, or like ones"
+        )
+    return Shown({"about": road, "warnings": warnings, "unseen": differing}, lines)

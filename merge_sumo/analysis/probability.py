@@ -200,12 +200,14 @@ class Counted(NamedTuple):
     without_verdict: int
 
 
-def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -> ProbabilityResult:
+def failure_probability(
+    study: RunStudy, options: config.Probability, out: Path
+) -> ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail, with fresh cases; write it to a file.
 
     Args:
         study: the study of the campaign.
-        asked: options of the verb.
+        options: options of the verb.
         out: new file for the result.
 
     Raises:
@@ -213,22 +215,22 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
             another net or other POVs, and for a file that exists or cannot be written.
     """
     levels, scenario = study.settings.levels, study.settings.scenario
-    cases = DEFAULT_CASES[study.plan.engine] if asked.cases is None else asked.cases
-    check_least(asked, cases=1, seed=0)
-    if not 0.5 <= asked.confidence < 1.0:
-        raise UserError(f"`confidence` is {asked.confidence}: choose 0.5 or more, and below 1")
-    if asked.distribution is not None and asked.traffic is not None:
+    cases = DEFAULT_CASES[study.plan.engine] if options.cases is None else options.cases
+    check_least(options, cases=1, seed=0)
+    if not 0.5 <= options.confidence < 1.0:
+        raise UserError(f"`confidence` is {options.confidence}: choose 0.5 or more, and below 1")
+    if options.distribution is not None and options.traffic is not None:
         raise UserError("choose a distribution or a traffic: a traffic states its own")
     check_new(out, endings=(".json",))
     study.check_same_system()
     traffic = None
-    path = None if asked.distribution is None else Path(asked.distribution)
+    path = None if options.distribution is None else Path(options.distribution)
     distribution = read_distribution(path, levels, scenario)
-    if asked.traffic is not None:
-        traffic = named_traffic(str(asked.traffic))
+    if options.traffic is not None:
+        traffic = named_traffic(str(options.traffic))
         distribution = traffic.in_pool(scenario, levels)
     cells = expected_cells(study, distribution)
-    drawn = draw(cells, scenario, cases, np.random.default_rng([asked.seed, STREAM]))
+    drawn = draw(cells, scenario, cases, np.random.default_rng([options.seed, STREAM]))
     plan = study.plan.for_verdicts().for_cases(cases)
     open_simulators(plan, study.workers)
     counted, missed, in_sumo = [], list[dict[str, float]](), 0
@@ -248,17 +250,17 @@ def failure_probability(study: RunStudy, asked: config.Probability, out: Path) -
     by_level = {}
     for level in distribution.levels:
         at_level = [one for one in counted if one.cells.level == level]
-        by_level[level] = estimate(at_level, asked.confidence)
+        by_level[level] = estimate(at_level, options.confidence)
     result = ProbabilityResult(
-        overall=estimate(counted, asked.confidence) if traffic is None else None,
+        overall=estimate(counted, options.confidence) if traffic is None else None,
         levels=by_level,
         per_merge=None if traffic is None else _per_merge(traffic, scenario, by_level),
-        confidence=asked.confidence,
+        confidence=options.confidence,
         cases=cases,
         in_sumo=in_sumo,
         missed=tuple(missed),
         distribution=distribution.record(),
-        seed=asked.seed,
+        seed=options.seed,
         engine=study.plan.engine,
         campaign=study.record(),
     )
@@ -328,28 +330,26 @@ def draw(
 
 def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
     """Return the estimate of the share of failures among the cases of some cells."""
-    whole = sum(one.cells.share for one in counted)
-    present = sorted({one.cells.expects_failures for one in counted})
-    of_stratum = 1.0 - (1.0 - confidence) / len(present)
+    sums: dict[bool, FloatArray] = {}
+    for one in counted:
+        numbers = np.array([one.cells.share, one.cases, one.failures, one.without_verdict])
+        key = one.cells.expects_failures
+        sums[key] = sums.get(key, 0.0) + numbers
+    whole = sum(sums.values())[0]
+    of_stratum = 1.0 - (1.0 - confidence) / len(sums)
     probability = low = high = 0.0
     strata = []
-    for expects_failures in present:
-        some = [one for one in counted if one.cells.expects_failures == expects_failures]
-        cases, failures = sum(one.cases for one in some), sum(one.failures for one in some)
-        unjudged = sum(one.without_verdict for one in some)
-        one = Stratum(
-            expects_failures=expects_failures,
-            share=sum(one.cells.share for one in some) / whole,
-            cases=cases,
-            failures=failures,
-            without_verdict=unjudged,
-            low=clopper_pearson(failures, cases, of_stratum)[0],
-            high=clopper_pearson(failures + unjudged, cases, of_stratum)[1],
+    for expects_failures in sorted(sums):
+        share, *counts = (sums[expects_failures] / (whole, 1, 1, 1)).tolist()
+        cases, failures, unjudged = map(int, counts)
+        one_low, _ = clopper_pearson(failures, cases, of_stratum)
+        _, one_high = clopper_pearson(failures + unjudged, cases, of_stratum)
+        strata.append(
+            Stratum(expects_failures, share, cases, failures, unjudged, one_low, one_high)
         )
-        strata.append(one)
-        probability += one.share * failures / max(cases, 1)
-        low += one.share * one.low
-        high += one.share * one.high
+        probability += share * failures / max(cases, 1)
+        low += share * one_low
+        high += share * one_high
     return Estimate(probability, low, min(high, 1.0), tuple(strata))
 
 
@@ -359,13 +359,8 @@ def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]
     Its low end is above the fewest only where the end of that level is, and its high end below the
     most likewise; so all mixtures are inside with the confidence of a level.
     """
-    cars, found = traffic.cars_in_pool(scenario), levels.values()
-    return PerMerge(
-        traffic=traffic,
-        cars=cars,
-        counted_speeds=traffic.share_in_pool(scenario),
-        least=cars * min(one.probability for one in found),
-        most=cars * max(one.probability for one in found),
-        low=cars * min(one.low for one in found),
-        high=cars * max(one.high for one in found),
-    )
+    cars = traffic.cars_in_pool(scenario)
+    ends = [(one.probability, one.low, one.high) for one in levels.values()]
+    least, low, _ = (cars * np.min(ends, axis=0)).tolist()
+    most, _, high = (cars * np.max(ends, axis=0)).tolist()
+    return PerMerge(traffic, cars, traffic.share_in_pool(scenario), least, most, low, high)

@@ -91,11 +91,11 @@ QUICK = Scale(seeds=2, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
 """The scale of a first look and of tests: it shows that all works, and no more."""
 
 
-def scale_of(asked: config.Reproduce) -> Scale:
+def scale_of(options: config.Reproduce) -> Scale:
     """Return the scale of the options; `UserError` for no seeds."""
-    check_least(asked, seeds=1)
-    scale = QUICK if asked.quick else Scale()
-    return scale if asked.seeds is None else replace(scale, seeds=asked.seeds)
+    check_least(options, seeds=1)
+    scale = QUICK if options.quick else Scale()
+    return scale if options.seeds is None else replace(scale, seeds=options.seeds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -233,13 +233,13 @@ def reproduce(
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.
-        asked = config.Benchmark(
+        options = config.Benchmark(
             column.vut,
             seeds=scale.seeds,
             cases=scale.batches * scale.batch,
             truth_cases=scale.truth_cases[column.level],
         )
-        found = studies[column.vut].compare((column.level,), SAMPLERS, asked)
+        found = studies[column.vut].compare((column.level,), SAMPLERS, options)
         columns[column.title] = ColumnResult(column, found)
     batch = 2 * scale.batch
     search = SearchSettings(levels=LEVELS, cases=scale.batches * batch, batch=batch)

@@ -68,10 +68,10 @@ OnPart = Callable[[str, int, int, str, str], None]
 """Called with the progress of a part of a study: title, items done, all items, unit, note."""
 
 
-def check_least(asked: object, **least: int) -> None:
+def check_least(options: object, **least: int) -> None:
     """Raise `UserError` for an option, by its name, that is less than the least."""
     for name, number in least.items():
-        value = getattr(asked, name)
+        value = getattr(options, name)
         if value is not None and value < number:
             raise UserError(f"`{name}` is {value}: it must be {number} or more")
 

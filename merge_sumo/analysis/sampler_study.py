@@ -62,13 +62,15 @@ class SamplerRun:
 
     def failures(self, level: int) -> FloatArray:
         """Return the failing cases of a level as points, (m, d)."""
-        return to_unit((o.case for o in self.outcomes if o.failed and o.case.level == level), level)
+        return to_unit((one.case for one in self._failing(level)), level)
+
+    def _failing(self, level: int) -> list[Outcome]:
+        return [one for one in self.outcomes if one.failed and one.case.level == level]
 
     def covered_shares(self, level: int, points: FloatArray) -> FloatArray:
         """Return the share of points, (m, d), that the failures cover after each batch."""
         failing = self.failures(level)
-        failed = [o.batch for o in self.outcomes if o.failed and o.case.level == level]
-        batches = np.array(failed, dtype=int)
+        batches = np.array([one.batch for one in self._failing(level)], dtype=int)
         is_covered = np.zeros(len(points), dtype=bool)
         shares = []
         for batch in range(len(self.fmc)):
@@ -103,7 +105,10 @@ class SearchSettings:
             search = SamplerRun([], [])
             for group in groups:
                 search.outcomes.extend(episode.outcome for episode in group)
-                search.fmc.append(sum(fmc(search.failures(level)) for level in self.levels))
+                total = 0.0
+                for level in self.levels:
+                    total += fmc(search.failures(level))
+                search.fmc.append(total)
             searches.append(search)
         return searches
 
@@ -112,14 +117,14 @@ def _lost_search(task: Task) -> SamplerRun:
     raise UserError(f"the search of {task[0]} with seed {task[1]} ended its process each time")
 
 
-def names_of(asked: config.Benchmark) -> list[str]:
+def names_of(options: config.Benchmark) -> list[str]:
     """Return the names of the samplers to compare; `UserError` for none, or no seeds."""
-    known = SAMPLERS if asked.samplers is None else asked.samplers
+    known = SAMPLERS if options.samplers is None else options.samplers
     listed = known.split(",") if isinstance(known, str) else known
     names = list(dict.fromkeys(map(str.strip, listed)))
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
-    check_least(asked, seeds=1)
+    check_least(options, seeds=1)
     return names
 
 
@@ -165,9 +170,11 @@ class Study:
             plan, level, total, seed, workers=self.workers, cache=self.cache, on_case=on_case
         )
 
-    def truths(self, settings: CampaignSettings, asked: config.GroundTruth) -> TruthResult:
+    def truths(self, settings: CampaignSettings, options: config.GroundTruth) -> TruthResult:
         """Return the truth of settings at each of their levels."""
-        by_level = {level: self.truth(level, asked.cases, asked.seed) for level in settings.levels}
+        by_level = {
+            level: self.truth(level, options.cases, options.seed) for level in settings.levels
+        }
         if not self.plan.vut.files_are_known and not is_here(settings.vut):
             notice(
                 "merge-sumo does not know which files the program of this VUT loads; this truth is "
@@ -176,7 +183,7 @@ class Study:
         return TruthResult(settings.vut, by_level, settings.criterion, settings.scenario)
 
     def compare(
-        self, levels: tuple[int, ...], samplers: Sequence[str], asked: config.Benchmark
+        self, levels: tuple[int, ...], samplers: Sequence[str], options: config.Benchmark
     ) -> SamplerStudy:
         """Let each sampler search with the seeds 0, 1, ..., and compare it with the truths.
 
@@ -185,16 +192,16 @@ class Study:
         Args:
             levels: levels of the POV.
             samplers: names of the samplers.
-            asked: options of the verb.
+            options: options of the verb.
         """
         truths, dense = {}, {}
         for level in levels:
-            truths[level] = self.truth(level, asked.truth_cases)
+            truths[level] = self.truth(level, options.truth_cases)
             truth = known_truth(self.plan, level, DENSE_CASES, cache=self.cache)
             if truth is not None:
                 dense[level] = truth
-        search = SearchSettings(levels=levels, cases=asked.cases, batch=asked.batch)
-        return SamplerStudy(self.searches(search, samplers, asked.seeds), truths, dense)
+        search = SearchSettings(levels=levels, cases=options.cases, batch=options.batch)
+        return SamplerStudy(self.searches(search, samplers, options.seeds), truths, dense)
 
     def searches(
         self, search: SearchSettings, samplers: Sequence[str], seeds: int

@@ -62,9 +62,12 @@ class Rung(Record, frozen=True):
     @property
     def counts(self) -> tuple[int, int, int]:
         """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
-        passes = sum(len(run.passes) for run in self.runs)
-        fails = sum(len(run.fails) for run in self.runs)
-        return passes, fails, sum(len(run.without_verdict) for run in self.runs)
+        passes = fails = without_verdict = 0
+        for run in self.runs:
+            passes += len(run.passes)
+            fails += len(run.fails)
+            without_verdict += len(run.without_verdict)
+        return passes, fails, without_verdict
 
     @property
     def flips(self) -> int:
@@ -239,9 +242,9 @@ def stress(study: RunStudy) -> StressResult:
     tested = [outcome for outcome in run.cases if outcome.is_tested]
     if not tested:
         raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
-    rungs = tuple(_rung(study, tested, one) for one in RUNGS)
-    failing = tuple(outcome.index for outcome in failures(tested))
-    found = StressResult(len(tested), failing, rungs, run.vut)
+    rungs = [_rung(study, tested, one) for one in RUNGS]
+    failing = [outcome.index for outcome in failures(tested)]
+    found = StressResult(len(tested), tuple(failing), tuple(rungs), run.vut)
     STRESS.write(run.folder, found)
     return found
 

@@ -1,7 +1,6 @@
-"""The chance to fail of the cases that a campaign did not run, by a surrogate.
+"""The probability to fail of cases that a campaign did not run, by a surrogate.
 
-The surrogate is that of the sampler `coverage`, learned afresh from the outcomes of a run,
-whichever sampler chose its cases.
+It is the surrogate of the sampler `coverage`, learned from the outcomes of any sampler.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from merge_sumo.workers import workers_or_cores
 FEWEST_FAILURES = 5
 """Failures at a level from which a surrogate is learned. Chosen, not tuned."""
 PART = 4000
-"""Points asked at a time, so that memory does not grow with their number."""
+"""Points predicted at a time, so that memory does not grow with their number."""
 
 Grid = tuple[int, int, int]
 """Nodes in each coordinate; of two coordinates the last number is 1."""
@@ -30,7 +29,7 @@ Grid = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """The surrogate of one level of a run; `predict` is its learned chance to fail."""
+    """The surrogate of one level of a run; `predict` returns the probability to fail."""
 
     predict: Callable[[FloatArray], FloatArray]
 

@@ -294,8 +294,8 @@ class TruthResult(Result):
         levels = [{**same, "level": one, **of.to_record()} for one, of in self.truths.items()]
         if len(levels) == 1:
             return levels[0]
-        sums: dict[str, Any] = {}
+        record: dict[str, Any] = {**same, "level": ",".join(map(level_name, self.truths))}
         for name in ("cases", "failures", "fmc", "real_regions"):
             of_levels = [one[name] for one in levels]
-            sums[name] = None if None in of_levels else sum(of_levels)
-        return {**same, "level": ",".join(map(level_name, self.truths)), **sums, "levels": levels}
+            record[name] = None if None in of_levels else sum(of_levels)
+        return {**record, "levels": levels}
