@@ -271,7 +271,7 @@ class _Search:
         return self._vut, replace(self._case, **changed)
 
     def _with_parameter(self, name: str, value: float) -> Trial:
-        return self._vut.with_values({name: value}), self._case
+        return self._vut.with_value(name, value), self._case
 
     def _passes(self, plan: SimulationPlan, trials: Sequence[Trial]) -> list[bool]:
         """Run trials, those of a VUT at a time; a value that the controller refuses fails."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import chdir, suppress
 from functools import cached_property
+from importlib import import_module
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -36,7 +37,7 @@ class FmuKind(FileKind):
         inputs: index in the state and variable of each input.
         output: variable of the acceleration, or of the speed reached.
         reaches: whether the output is the speed reached.
-        wish: variable of whether to merge, if there is one.
+        wish: variable of the merge request, if there is one.
         seed: variable of the seed, if there is one.
     """
 
@@ -64,20 +65,22 @@ class FmuKind(FileKind):
         self._variables = {each.name: each for each in self._description.modelVariables}
         self.inputs: list[tuple[int, Any]] = []
         for index, key in enumerate(INPUTS):
-            if key in self.chosen or key in self._variables:
-                self.inputs.append((index, self._variable(key)))
+            if (variable := self._variable(key, "input")) is not None:
+                self.inputs.append((index, variable))
         if not self.inputs:
             raise UserError(
                 f"{path} has none of the inputs {', '.join(INPUTS)}: name its own, as in "
                 f"fmu:{path}?v_vut_mps=NAME"
             )
-        reached = None
+        self.output = None
         if REACHED in self.chosen or OUTPUT not in self.chosen:
-            reached = self._optional(REACHED, ("output",), FLOATS)
-        self.reaches = reached is not None
-        self.output = reached or self._variable(OUTPUT)
-        self.wish = self._optional(MERGE, ("output",), (*FLOATS, "Boolean"))
-        self.seed = self._optional(SEED, ("input", "parameter"), (*FLOATS, *INTEGERS))
+            self.output = self._variable(REACHED, "output")
+        self.reaches = self.output is not None
+        if self.output is None:
+            self.chosen.setdefault(OUTPUT, OUTPUT)  # it must be there
+            self.output = self._variable(OUTPUT, "output")
+        self.wish = self._variable(MERGE, "output", (*FLOATS, "Boolean"))
+        self.seed = self._variable(SEED, "input parameter", (*FLOATS, *INTEGERS))
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
@@ -86,13 +89,10 @@ class FmuKind(FileKind):
     def instance(self) -> Any:
         """Return a new instance of the unit."""
         self._instances += 1
-        if self.version == "2":
-            from fmpy.fmi2 import FMU2Slave as Slave
-        else:
-            from fmpy.fmi3 import FMU3Slave as Slave
+        module = import_module(f"fmpy.fmi{self.version}")
         # FMPy goes to the folder of the binary and, when that cannot be loaded, stays there.
         with chdir("."):
-            instance: Any = Slave(
+            instance: Any = getattr(module, f"FMU{self.version}Slave")(
                 guid=self._description.guid,
                 unzipDirectory=self._folder.name,
                 modelIdentifier=self._description.coSimulation.modelIdentifier,
@@ -108,24 +108,24 @@ class FmuKind(FileKind):
         self.api.extract(str(self.path), folder.name)
         return folder
 
-    def _optional(self, key: str, causalities: tuple[str, ...], types: tuple[str, ...]) -> Any:
-        """Return a variable that the spec names, or that has the name `key`; None for neither.
+    def _variable(self, key: str, causalities: str, types: tuple[str, ...] = FLOATS) -> Any:
+        """Return the variable of one of our names, or None.
 
         Args:
             key: our name of the variable.
-            causalities: causalities that it may have where the spec does not name it.
+            causalities: causalities that it must have where the spec does not name it.
             types: types that it may have.
-        """
-        own = getattr(self._variables.get(key), "causality", None)
-        if key in self.chosen or own in causalities:
-            return self._variable(key, types)
-        return None
 
-    def _variable(self, key: str, types: tuple[str, ...] = FLOATS) -> Any:
-        """Return the variable of one of our names; `UserError` where it is not of some types."""
+        Raises:
+            UserError: for a variable that the spec names and that is not there, or is of another
+                type.
+        """
         name = self.chosen.get(key, key)
         variable = self._variables.get(name)
-        if variable is None:
+        if key not in self.chosen:
+            if variable is None or variable.causality not in causalities.split():
+                return None
+        elif variable is None:
             names = ", ".join(sorted(self._variables)[:12])
             raise UserError(f"{self.path} has no variable {name!r}; it has {names}")
         if variable.type not in types or variable.dimensions:

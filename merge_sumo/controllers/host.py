@@ -37,24 +37,8 @@ INSTALLED_FOLDERS = (
 """Code in these folders does not belong to the user."""
 
 
-class HostSettings(msgspec.Struct):
-    """The controller that a process loads when it starts.
-
-    Attributes:
-        kind: "MODULE:CLASS" of the kind of the controller.
-        spec: the controller.
-        deadline_s: time for one call of it.
-        memory_gib: memory that the process may take.
-    """
-
-    kind: str
-    spec: ControllerSpec
-    deadline_s: float
-    memory_gib: float
-
-
 class HostRequest(msgspec.Struct, omit_defaults=True):
-    """Make drivers, let them act, list the files of code, or close the drivers.
+    """Make drivers, let them act, or close them.
 
     Attributes:
         action: the name of a method of `_Host`.
@@ -63,7 +47,7 @@ class HostRequest(msgspec.Struct, omit_defaults=True):
         scene: the scene in which they act.
     """
 
-    action: Literal["make", "act", "files", "close"]
+    action: Literal["make", "act", "close"]
     corridors: int = 0
     starts: list[tuple[int, Start]] = []
     scene: Scene | None = None
@@ -77,7 +61,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         is_finding: whether the code of the controller failed to load.
         max_corridors: corridors that one driver can serve.
         max_workers: processes that can have a driver.
-        files: files of code that were loaded so far.
+        files: files of code that were loaded, where they may be others than before.
         parameters: those of the controllers that were made.
         accelerations_mps2: answers of the drivers, (K,).
         wishes: their merge requests, (K,).
@@ -113,10 +97,9 @@ def main(settings: Mapping[str, Any]) -> None:
     # Workers block Ctrl-C, and processes that they start inherit it.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    hosted = msgspec.convert(settings["hosted"], HostSettings)
-    connection = connected(settings, RLIMIT_DATA=int(hosted.memory_gib * 2**30))
+    connection = connected(settings, RLIMIT_DATA=int(settings["memory_gib"] * 2**30))
     with suppress(EOFError):
-        _Host(connection, hosted).serve()
+        _Host(connection, settings).serve()
 
 
 class _Host:
@@ -125,15 +108,15 @@ class _Host:
     _kind: ControllerKind
     _driver: ControllerDriver
 
-    def __init__(self, connection: Connection, settings: HostSettings) -> None:
+    def __init__(self, connection: Connection, settings: Mapping[str, Any]) -> None:
         self._connection, self._settings = connection, settings
         self._alive_s = perf_counter()
-        self._imported = set(sys.modules)
+        self._imported, self._modules = set(sys.modules), 0
 
     def serve(self) -> None:
         """Load the controller, then answer request by request."""
         heartbeat.append(self._beat)
-        request = HostRequest("files")
+        request = HostRequest("make")
         self._reply(request, self._load)
         while request.action != "close":
             request = decode_request(self._connection.recv_bytes())
@@ -155,10 +138,11 @@ class _Host:
 
     def _load(self, _request: HostRequest) -> HostReply:
         settings = self._settings
-        options = ControllerOptions(deadline_s=settings.deadline_s, in_process=True)
-        self._kind = kind = named(settings.kind)(settings.spec, options)
+        spec = msgspec.convert(settings["spec"], ControllerSpec)
+        options = ControllerOptions(deadline_s=settings["deadline_s"], in_process=True)
+        self._kind = kind = named(settings["kind"])(spec, options)
         return HostReply(
-            max_corridors=kind.max_corridors, max_workers=kind.max_workers, files=self._code()
+            max_corridors=kind.max_corridors, max_workers=kind.max_workers, files=self._files()
         )
 
     def _make(self, request: HostRequest) -> HostReply:
@@ -183,10 +167,8 @@ class _Host:
             wishes=None if wishes is None else wishes.tolist(),
             reasons=reasons,
             signals=dict(driver.signals()),
+            files=self._files(),
         )
-
-    def _files(self, _request: HostRequest) -> HostReply:
-        return HostReply(files=self._code())
 
     def _close(self, _request: HostRequest) -> HostReply:
         self._driver.close()
@@ -198,9 +180,11 @@ class _Host:
             self._alive_s = now_s
             self._connection.send_bytes(encode(None))
 
-    def _code(self) -> list[bytes]:
-        """Return the files of code that were loaded and belong to the user."""
-        files = set(self._kind.code)
+    def _files(self) -> list[bytes]:
+        """Return the files of code that belong to the user; none if no module was loaded since."""
+        if len(sys.modules) == self._modules:
+            return []
+        self._modules, files = len(sys.modules), set(self._kind.code)
         for name, module in list(sys.modules.items()):
             file = getattr(module, "__file__", None)
             if file and name not in self._imported:

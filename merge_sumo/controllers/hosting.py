@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
-from merge_sumo.controllers.host import HostReply, HostRequest, HostSettings, decode_reply, encode
+from merge_sumo.controllers.host import HostReply, HostRequest, decode_reply, encode
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene, VutLostError
@@ -58,18 +58,18 @@ class ControllerProcess(ChildProcess):
         self._spec, self._connect_s = spec, options.connect_s
         self._patience_s = GRACE * options.deadline_s + GRACE_S
         self._late = f"took longer than the deadline of {options.deadline_s:g} s"
-        name = f"{kind.__module__}:{kind.__qualname__}"
-        hosted = HostSettings(name, spec, options.deadline_s, options.memory_gib)
+        settings = {
+            "kind": f"{kind.__module__}:{kind.__qualname__}",
+            "spec": msgspec.to_builtins(spec),
+            "deadline_s": options.deadline_s,
+            "memory_gib": options.memory_gib,
+        }
         # A process that is killed leaves its temporary files: they are in a folder of ours.
         folder = ScratchFolder()
         # The order of sets must not be another one in each run.
         environment = {**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder.name}
         super().__init__(
-            "merge_sumo.controllers.host:main",
-            {"hosted": msgspec.to_builtins(hosted)},
-            folder,
-            environment,
-            log=options.log,
+            "merge_sumo.controllers.host:main", settings, folder, environment, log=options.log
         )
         self.loaded = self._opened()
 
@@ -230,6 +230,7 @@ class HostedDriver(ControllerDriver):
             self._reply = reply = self._process.request(request)
         except (ProcessDiedError, UserError) as error:
             raise VutLostError(str(error)) from None
+        self._files.update(paths_of(reply))
         answers, wishes = np.array(reply.accelerations_mps2), reply.wishes
         self._wishes = None if wishes is None else np.array(wishes, dtype=np.int8)
         if not len(answers) == self.corridors == len(answers if wishes is None else wishes):
@@ -254,9 +255,6 @@ class HostedDriver(ControllerDriver):
 
     def files(self) -> tuple[Path, ...]:
         """Return the files of code that were loaded so far."""
-        if self._process.alive:
-            with suppress(ProcessDiedError, UserError):
-                self._files.update(paths_of(self._process.request(HostRequest("files"))))
         return tuple(sorted(self._files))
 
     def close(self) -> None:

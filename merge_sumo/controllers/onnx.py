@@ -1,6 +1,6 @@
-"""A VUT as an ONNX network: the state goes in, an acceleration or action values come out.
+"""A VUT as an ONNX network: the state goes in, an acceleration or values of actions come out.
 
-One more number says whether to merge, on a road with an acceleration lane.
+One more output is the merge request, on a road with an acceleration lane.
 """
 
 from __future__ import annotations
@@ -58,7 +58,13 @@ class OnnxKind(FileKind):
             self._session = self.api.InferenceSession(str(self.path), settings, providers)
         except Exception as error:  # onnxruntime has a class of its own for every failure
             raise UserError(f"{self.path} is not a usable ONNX network: {error}") from error
-        self._find_inputs()
+        self._input: Any = None
+        self._seed: Any = None
+        for each in self._session.get_inputs():
+            if each.name == SEED:
+                self._seed = each
+            else:
+                self._input = each
         self._check_output()
         metadata = self._session.get_modelmeta().custom_metadata_map
         text = self.chosen.get(PERIOD) or metadata.get(PERIOD) or str(DT_S)
@@ -77,43 +83,21 @@ class OnnxKind(FileKind):
         """Return the flat output for one state, and a seed for a network that takes one."""
         values = {self._input.name: np.array([state], DTYPES[self._input.type])}
         if self._seed is not None:
-            values[SEED] = np.full(self._seed_shape, seed, DTYPES[self._seed.type])
+            # An axis without a number is that of a batch.
+            shape = [size if isinstance(size, int) else 1 for size in self._seed.shape]
+            values[SEED] = np.full(shape, seed, DTYPES[self._seed.type])
         return np.asarray(self._session.run(None, values)[0]).ravel()
-
-    def _find_inputs(self) -> None:
-        """Find the inputs; raise `UserError` where the network needs others than a VUT's."""
-        self._input: Any = None
-        self._seed: Any = None
-        inputs = self._session.get_inputs()
-        for each in inputs:
-            if each.name == SEED and len(inputs) > 1:
-                self._seed = each
-            else:
-                self._input = each
-        state, seed = self._input, self._seed
-        is_known = len(inputs) == 1 + (seed is not None) and state.type in DTYPES
-        if not is_known or state.shape[-1:] != [len(STATE)]:
-            found = ", ".join(f"{each.name} {each.type} {each.shape}" for each in inputs)
-            raise UserError(
-                f"{self.path} has the inputs {found}: a VUT has one of floats, (1, 4), with "
-                f"{', '.join(STATE)}"
-            )
-        if seed is None:
-            return
-        # An axis without a number is that of a batch.
-        self._seed_shape = [size if isinstance(size, int) else 1 for size in seed.shape]
-        if seed.type not in DTYPES or math.prod(self._seed_shape) != 1:
-            raise UserError(
-                f"{self.path} has the input {SEED} {seed.type} {seed.shape}: it must be one "
-                "number, a float, a double or an int64"
-            )
 
     def _check_output(self) -> None:
         """Raise `UserError` where the network does not run, or its output is not a VUT's."""
         try:
             output = self.run((0.0, 0.0, 0.0, 0.0))
-        except Exception as error:
-            raise UserError(f"{self.path} does not run with an input (1, 4): {error}") from error
+        except Exception as error:  # also of inputs of other types
+            raise UserError(
+                f"{self.path} does not run with the inputs of a VUT: floats, (1, 4), with "
+                f"{', '.join(STATE)}, and optionally {SEED}, a float, a double or an int64 "
+                f"({type(error).__name__}: {error})"
+            ) from error
         if output.dtype.kind != "f":
             raise UserError(
                 f"{self.path} gives {output.dtype}, and a VUT gives floats: the index of an action "

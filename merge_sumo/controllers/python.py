@@ -166,17 +166,17 @@ class PythonKind(OfPython):
 
     def target(self) -> Any:
         """Return the object of that name in the module."""
-        source, _, name = self.spec.argument.rpartition(":")
+        return self.code_at(self.spec.argument)
+
+    def code_at(self, place: str) -> Any:
+        """Return the class or function MODULE:NAME, and note its file; `UserError` without one."""
+        source, _, name = place.rpartition(":")
         module = _module_of(source)
         target: Any = module
         for part in name.split("."):
             target = getattr(target, part, None)
         if target is None:
             raise UserError(f"{source} has no {name!r}: name a class or a function of it")
-        return self.code_of(target, module)
-
-    def code_of(self, target: Any, module: ModuleType | None) -> Any:
-        """Return a class or a function, and note its file; `UserError` for something else."""
         if not is_code(target):
             raise self.refused(target)
         if file := getattr(module, "__file__", None):
@@ -191,12 +191,8 @@ class InstalledKind(PythonKind):
 
     def target(self) -> Any:
         """Return the object that the package registers."""
-        name = self.spec.argument
-        try:
-            target = installed_vuts()[name].load()
-        except (Exception, SystemExit) as error:
-            raise _cannot_load(name, error) from error
-        return self.code_of(target, sys.modules.get(getattr(target, "__module__", "")))
+        entry = installed_vuts()[self.spec.argument]
+        return self.code_at(f"{entry.module}:{entry.attr}")
 
 
 class HereKind(OfPython):
@@ -429,7 +425,8 @@ def _module_of(source: str) -> ModuleType:
     except UserError:
         raise
     except (Exception, SystemExit) as error:
-        raise _cannot_load(source, error) from error
+        why = f"{type(error).__name__}: {text_of(error)}"
+        raise ControllerError(f"cannot load the VUT {source}: {why}") from error
 
 
 def _imported(name: str) -> ModuleType:
@@ -446,10 +443,6 @@ def _imported(name: str) -> ModuleType:
     finally:
         if is_new:
             sys.path.remove(folder)
-
-
-def _cannot_load(what: str, error: BaseException) -> ControllerError:
-    return ControllerError(f"cannot load the VUT {what}: {type(error).__name__}: {text_of(error)}")
 
 
 def module_of_file(path: Path) -> ModuleType:

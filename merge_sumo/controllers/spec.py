@@ -1,7 +1,6 @@
-"""What every controller has: a name in its parts, options, and a kind.
+"""The name of a controller in its parts, how it is hosted, and its kind.
 
-`kinds.parse` reads a name once, as a `ControllerSpec`. `kinds.load` gives the controller of that
-name, an instance of a subclass of `ControllerKind`, which opens drivers in any process.
+`kinds.parse` reads a name, and `kinds.load` gives the `ControllerKind` of it, which opens drivers.
 """
 
 from __future__ import annotations
@@ -72,9 +71,8 @@ class ControllerSpec(msgspec.Struct, frozen=True):
     parameters: tuple[tuple[str, str], ...] = ()
 
     def __str__(self) -> str:
-        head = self.argument if self.kind in WITHOUT_PREFIX else self.kind
-        if head is self.kind and self.argument:
-            head = f"{self.kind}:{self.argument}"
+        kind = "" if self.kind in WITHOUT_PREFIX else self.kind
+        head = ":".join(filter(None, (kind, self.argument)))
         options = "&".join(f"{name}={value}" for name, value in self.parameters)
         return f"{head}?{options}" if options else head
 
@@ -91,14 +89,9 @@ class ControllerSpec(msgspec.Struct, frozen=True):
                 raise UserError(f"{self}: {name} is {text!r}: give a number")
         return numbers
 
-    def with_values(
-        self, values: Mapping[str, float], today: Mapping[str, float] | None = None
-    ) -> ControllerSpec:
-        """Return the spec with other values of parameters, those that are `today`'s left out."""
-        present, parameters = today or {}, dict(self.parameters)
-        for name, value in values.items():
-            if present.get(name) != value:
-                parameters[name] = f"{value:.12g}"
+    def with_value(self, name: str, value: float) -> ControllerSpec:
+        """Return the spec with another value of a parameter."""
+        parameters = {**dict(self.parameters), name: f"{value:.12g}"}
         return msgspec.structs.replace(self, parameters=tuple(parameters.items()))
 
     def has_no(self, name: str, known: Iterable[str]) -> UserError:
@@ -189,14 +182,17 @@ class ControllerKind:
         changed: Self = _loaded(type(self), spec, options, self.files)
         return changed
 
+    @property
+    def _values(self) -> tuple[Any, ...]:
+        """The arguments of `_loaded`."""
+        return type(self), self.spec, self.options, self.files
+
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
         """Travel to another process as plain values; it is loaded there."""
-        return _loaded, (type(self), self.spec, self.options, self.files)
+        return _loaded, self._values
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, ControllerKind):
-            return False
-        return (self.spec, self.options, self.files) == (other.spec, other.options, other.files)
+        return isinstance(other, ControllerKind) and self._values == other._values
 
     def __hash__(self) -> int:
         return hash(self.spec)

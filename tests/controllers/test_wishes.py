@@ -1,46 +1,48 @@
-"""What VUTs see of an acceleration lane, and how they say when to merge."""
+"""Acceleration lanes in the observation of VUTs, and merge requests in their answers."""
 
 # mypy: no-strict-optional
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
-from support.vut_contract import ON_LANE, begin, factory, in_process, on_lane
+from support.vut_contract import ON_LANE, begin, factory, on_lane
 
-from merge_sumo.controllers.controller import Seen, Start, seen_in
+from merge_sumo.controllers.controller import Start, seen_in
 from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
 
 
 def begun(vut, corridors, **options):
     """Return a driver with an episode in each corridor."""
-    driver = factory(vut, **options).open(corridors) if isinstance(vut, str) else vut
+    driver = factory(vut, **options).open(corridors)
     begin(driver)
     return driver
 
 
-def test_it_sees_the_lane_and_whether_a_wish_would_be_granted():
-    seen = [
-        seen_in(0.0, 0, [x - 30.0, x], [30.0, 20.0], (-70.0, 130.0), merged=merged)
-        for x, merged in ((-72.01, False), (-72.0, False), (100.0, False), (-60.0, True))
-    ]
-    assert [s.may_merge for s in seen] == [False, True, True, False]
-    assert [s.merged for s in seen] == [False, False, False, True]
-    assert {(s.lane_begin_m, s.lane_end_m) for s in seen} == {(-70.0, 130.0)}
-    assert all(isinstance(s, Seen) for s in seen)
-    assert seen[0][1:] == (-102.01, 30.0, -72.01, 20.0)
-    assert [car.x_m for car in seen[0].others] == [-102.01]
+@pytest.mark.parametrize(
+    ("x_m", "merged", "may_merge"),
+    [(-72.01, False, False), (-72.0, False, True), (100.0, False, True), (-60.0, True, False)],
+)
+def test_on_a_lane_the_observation_says_whether_a_request_is_granted(x_m, merged, may_merge):
+    seen = seen_in(0.0, 0, [x_m - 30.0, x_m], [30.0, 20.0], (-70.0, 130.0), merged=merged)
+    assert (seen.may_merge, seen.merged) == (may_merge, merged)
+    assert (seen.lane_begin_m, seen.lane_end_m) == (-70.0, 130.0)
+    assert seen[1:] == (x_m - 30.0, 30.0, x_m, 20.0)
+    assert [car.x_m for car in seen.others] == [x_m - 30.0]
+
+
+def test_the_start_has_the_lane():
     start = Start.of(ON_LANE).seen
     assert (start.lane_begin_m, start.may_merge, start.merged) == (-70.0, False, False)
 
 
-def test_without_a_lane_it_sees_none_and_has_merged_from_m_on():
-    before, past = (seen_in(0.0, 0, [0.0, x], [30.0, 20.0]) for x in (-1e-9, 0.0))
-    assert type(before) is Seen
-    assert (before.lane_begin_m, before.lane_end_m, before.may_merge) == (0.0, 0.0, False)
-    assert (before.merged, past.merged, past.may_merge) == (False, True, False)
-    traffic = seen_in(0.0, 0, [0.0, -5.0, 9.0, -9.0], [30.0] * 4)
-    assert (traffic.may_merge, traffic.merged, len(traffic.others)) == (False, False, 3)
+@pytest.mark.parametrize("x_m", [-1e-9, 0.0])
+def test_without_a_lane_it_sees_none_and_has_merged_from_m_on(x_m):
+    seen = seen_in(0.0, 0, [0.0, x_m, 9.0, -9.0], [30.0] * 4)
+    assert (seen.lane_begin_m, seen.lane_end_m, seen.may_merge) == (0.0, 0.0, False)
+    assert (seen.merged, len(seen.others)) == (x_m == 0.0, 3)
 
 
 OF_EACH = """
@@ -67,7 +69,7 @@ class Vut:
 
 
 @pytest.mark.parametrize("process", ["this", "own"])
-def test_a_controller_answers_an_acceleration_or_it_and_a_wish(write_vut, process):
+def test_a_controller_answers_an_acceleration_or_it_and_a_merge_request(write_vut, process):
     driver = begun(write_vut(OF_EACH), 4, in_process=process == "this")
     try:
         answer = driver.act(on_lane([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
@@ -82,33 +84,26 @@ def test_a_controller_answers_an_acceleration_or_it_and_a_wish(write_vut, proces
 
 @pytest.mark.parametrize("process", ["this", "own"])
 def test_a_batched_controller_answers_one_row_or_two(write_vut, process):
+    idle = on_lane([-90.0, -71.0, -50.0], [False, False, True])
+    idle = idle._replace(active=np.array([True, True, False]))
     driver = begun(write_vut(OF_ALL), 3, in_process=process == "this")
     try:
-        idle = on_lane([-90.0, -71.0, -50.0], [False, False, True])
-        idle = idle._replace(active=np.array([True, True, False]))
         assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
         assert driver.wishes().tolist() == [STAY, MERGE, NO_WISH]
     finally:
         driver.close()
-    one_row = begun(in_process(write_vut(OF_ALL.replace(", seen.may_merge", ""))).open(3), 3)
-    assert one_row.act(on_lane([-90.0, -71.0, -50.0], [False] * 3)).tolist() == [1.0] * 3
-    assert one_row.wishes() is None
+    one_row = write_vut(OF_ALL.replace(", seen.may_merge", ""), file="one_row.py")
+    driver = begun(one_row, 3, in_process=True)
+    assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
+    assert driver.wishes() is None
 
 
-WISHES = {
-    "True": MERGE,
-    "False": STAY,
-    "1": MERGE,
-    "0.0": STAY,
-    "np.array(1)": MERGE,
-}
+REQUESTS = {"True": MERGE, "0.0": STAY, "np.array(1)": MERGE}
 WRONG = {
     "(1.0, float('nan'))": "wishes nan (float) instead of True or False",
     "(1.0, 'yes')": "wishes 'yes' (str) instead of True or False",
-    "(1.0, 0.5)": "wishes 0.5 (float) instead of True or False",
     "('1', True)": "answered '1' (str) instead of a number",
     "(1.0, True, 2)": "answered (1.0, True, 2) (tuple) instead of a number, or (number, merge)",
-    "np.array([1.0, 1.0])": "answered array([1., 1.]) (ndarray) instead of a number",
     "Pair((1.0, True))": "ZeroDivisionError: division by zero",
 }
 ANSWERS = """
@@ -121,16 +116,16 @@ def Vut(seen):
 """
 
 
-@pytest.mark.parametrize("wish", WISHES)
-def test_a_wish_is_true_or_false(write_vut, wish):
-    driver = begun(in_process(write_vut(ANSWERS.format(f"(1, {wish})"))).open(1), 1)
+@pytest.mark.parametrize("request_", REQUESTS)
+def test_a_merge_request_is_true_or_false(write_vut, request_):
+    driver = begun(write_vut(ANSWERS.format(f"(1, {request_})")), 1, in_process=True)
     assert driver.act(on_lane([-71.0], [False])).tolist() == [1.0]
-    assert driver.wishes().tolist() == [WISHES[wish]]
+    assert driver.wishes().tolist() == [REQUESTS[request_]]
 
 
 @pytest.mark.parametrize("answer", WRONG)
 def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
-    driver = begun(in_process(write_vut(ANSWERS.format(answer))).open(2), 2)
+    driver = begun(write_vut(ANSWERS.format(answer)), 2, in_process=True)
     assert np.isnan(driver.act(on_lane([-71.0, -90.0], [False] * 2))).tolist() == [True, False]
     assert WRONG[answer] in driver.reason(0)
     assert driver.reason(1) is None
@@ -140,21 +135,19 @@ def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
     ("answer", "said"),
     [
         ("np.zeros((3, 2))", "shape (3, 2) of float64 instead of 2 numbers, or these and 2 wishes"),
-        ("([1.0, 1.0], [True])", "ValueError"),
         ("([1.0, 1.0], ['yes', 'no'])", "of <U"),
     ],
 )
 def test_a_batch_of_another_shape_is_an_error_of_all(write_vut, answer, said):
     source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
-    driver = begun(in_process(write_vut(source)).open(2), 2)
-    with pytest.raises(VutLostError, match=r".*") as lost:
+    driver = begun(write_vut(source), 2, in_process=True)
+    with pytest.raises(VutLostError, match=re.escape(said)):
         driver.act(on_lane([-71.0, -90.0], [False, False]))
-    assert said in str(lost.value)
 
 
-def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(write_vut):
+def test_a_wrong_merge_request_of_a_batch_is_an_error_of_its_own_corridor(write_vut):
     wishes = "np.where(seen.x_vut_m > -80.0, np.nan, 0.0)"
-    driver = begun(in_process(write_vut(OF_ALL.replace("seen.may_merge", wishes))).open(3), 3)
+    driver = begun(write_vut(OF_ALL.replace("seen.may_merge", wishes)), 3, in_process=True)
     idle = on_lane([-71.0, -90.0, -71.0], [False] * 3)
     idle = idle._replace(active=np.array([True, True, False]))
     assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
@@ -162,16 +155,15 @@ def test_a_wrong_wish_of_a_batch_is_an_error_of_its_own_corridor(write_vut):
     assert driver.wishes().tolist() == [NO_WISH, STAY, NO_WISH]
 
 
-def test_a_process_that_forges_wishes_loses_its_episodes_and_no_more(write_vut):
+def test_a_process_that_forges_merge_requests_loses_its_episodes_and_no_more(write_vut):
     source = """
 from merge_sumo.controllers.host import HostReply, _Host
 _Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], wishes=[7, 7])
 def Vut(seen):
     return 1.0, True
 """
-    driver = factory(write_vut(source), deadline_s=1.0).open(2)
+    driver = begun(write_vut(source), 2, deadline_s=1.0)
     try:
-        begun(driver, 2)
         with pytest.raises(VutLostError, match="broke the channel to its process"):
             driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:

@@ -22,7 +22,7 @@ from merge_sumo.controllers.traci import protocol as tp
 from merge_sumo.controllers.traci.session import Session
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.merge import road_of
-from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario
+from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.sumo.binding import sumo_environment, sumo_program
 from merge_sumo.sumo.mirror import (
     COLOURS,
@@ -188,11 +188,11 @@ class Pair:
             place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
             vehicle.add(name, f"route.{name}", typeID=name, departLane=lane, **place)
             vehicle.setColor(name, COLOURS[name == "vut"])
-        begin = {
-            name: {piece.lane: piece.start_m for piece in path.pieces}
-            for name, (path, _, _) in starts.items()
-        }
-        before = {name: v_mps for name, (_, _, v_mps) in starts.items()}
+        begins_m: dict[str, dict[str, float]] = {}
+        before = {}
+        for name, (path, _, v_mps) in starts.items():
+            begins_m[name] = {piece.lane: piece.start_m for piece in path.pieces}
+            before[name] = v_mps
         for step in range(steps):
             self.session.answered()
             self.real.simulationStep()
@@ -202,7 +202,7 @@ class Pair:
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + changes_mps[name])
                 v_mps = vehicle.getSpeed(name)
-                x_m = begin[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
+                x_m = begins_m[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
                 states[name] = x_m, v_mps, (v_mps - before[name]) / DT_S
                 before[name] = v_mps
             if step:
@@ -233,9 +233,7 @@ class Drive:
 
     def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
         """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
-        self.pov = pov
-        self.session = Session(mirror(self.folder))
-        self.ours = ToSession(self.session)
+        self.restart(pov)
         _as_at_first(self.real)
         if "vut" in self.real.vehicle.getIDList():
             self.real.vehicle.remove("vut")
@@ -245,19 +243,14 @@ class Drive:
         self.real.vehicle.setLaneChangeMode("vut", 0)
         self.real.vehicle.setColor("vut", COLOURS[1])
         self.real.vehicle.setSpeed("vut", 18.0)
-        self.again()
 
-    def again(self) -> None:
-        """Let the vehicles of the session depart, after they have arrived."""
-        if self.session.sumo.at_m:
-            self.session.step()
-            self.session.clear()
-        (x_m, v_mps) = self.pov
+    def restart(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
+        """Let the vehicles depart in a new session."""
+        self.session = Session(mirror(self.folder))
+        self.ours = ToSession(self.session)
+        x_m, v_mps = pov
         self.x_m, self.v_mps = [x_m, -182.0], [v_mps, 18.0]
         self.session.enter(self._states(0.0))
-
-    def both(self, ask):
-        return ask(self.ours), ask(self.real)
 
     def step(self) -> None:
         wanted_mps = self.session.step()
@@ -270,14 +263,12 @@ class Drive:
         self.real.simulationStep()
 
     def speeds(self) -> tuple[float, float]:
-        ours, real = self.both(lambda c: c.vehicle.getSpeed("vut"))
-        return ours, real
+        ours = self.ours.vehicle.getSpeed("vut")
+        return ours, self.real.vehicle.getSpeed("vut")
 
     def _states(self, a_mps2: float) -> dict[str, tuple[float, float, float]]:
-        return {
-            name: (x_m, v_mps, a_mps2 if name == "vut" else 0.0)
-            for name, x_m, v_mps in zip(VEHICLES, self.x_m, self.v_mps, strict=False)
-        }
+        pov, vut = zip(self.x_m, self.v_mps, strict=True)
+        return {"pov": (*pov, 0.0), "vut": (*vut, a_mps2)}
 
     def close(self) -> None:
         close_mirror()
