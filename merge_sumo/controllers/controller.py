@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Self
 
@@ -179,8 +179,15 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         return seen_in(0.0, self.facing, self.x_m, self.v_mps, self.lane_m)
 
 
-class Controller(ABC):
-    """Drives the vehicle of one corridor, one episode after another.
+class Controller:
+    """Drives the vehicle of one corridor, one episode after another; subclasses implement `act`.
+
+    Example:
+        ```python
+        class Steady(Controller):
+            def act(self, seen: Seen) -> float:
+                return 0.0
+        ```
 
     Attributes:
         single_use: whether it drives one episode only, and a new one drives the next.
@@ -188,12 +195,12 @@ class Controller(ABC):
 
     single_use: bool = False
 
-    def reset(self, start: Start) -> None:  # noqa: B027 (most remember nothing)
+    def reset(self, start: Start) -> None:
         """Begin an episode."""
 
-    @abstractmethod
     def act(self, seen: Seen) -> Any:
         """Return the acceleration for the next step, m/s2, or (acceleration, whether to merge)."""
+        raise NotImplementedError
 
     def signals(self) -> Left:
         """Return the signals of the last answer."""
@@ -203,7 +210,7 @@ class Controller(ABC):
         """Return the numbers that a spec may set, with their present values."""
         return {}
 
-    def close(self) -> None:  # noqa: B027 (most hold nothing)
+    def close(self) -> None:
         """Release files, processes and memory of the controller."""
 
 
