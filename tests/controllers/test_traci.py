@@ -25,12 +25,12 @@ from support.controllers import (
 )
 from support.processes import none_left
 from support.raw_traci import Client, GoneError
-from support.scenes import scene_of
 from support.vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.controllers.traci import vut
 from merge_sumo.controllers.traci.vut import TraciVut
+from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import Case
