@@ -331,11 +331,12 @@ def draw(
 def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
     """Return the estimate of the share of failures among the cases of some cells."""
     sums: dict[bool, FloatArray] = {}
+    whole = 0.0
     for one in counted:
         numbers = np.array([one.cells.share, one.cases, one.failures, one.without_verdict])
         key = one.cells.expects_failures
-        sums[key] = sums.get(key, 0.0) + numbers
-    whole = sum(sums.values())[0]
+        sums[key] = sums.get(key, np.zeros(4)) + numbers
+        whole += one.cells.share
     of_stratum = 1.0 - (1.0 - confidence) / len(sums)
     probability = low = high = 0.0
     strata = []
