@@ -16,7 +16,7 @@ from support.campaigning import campaign_settings, run_campaign
 from support.handmade import write_run
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import Gate, LevelSummary, Summary, judge, parse_gates, summarise
 from merge_sumo.printable import counted
@@ -50,27 +50,19 @@ def campaign(vut: str, folder: Path, *options: object) -> Result:
     return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
 
 
-class TestErrorsAndTimeouts:
-    def test_are_grouped_by_message_errors_first_then_the_most_frequent(self, tmp_path):
-        errors = {2: "boom", 5: "other", 6: "other"}
-        timeouts = (0, 1, 3, 4)
-        run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=timeouts)
-        found = judge(run.outcomes)
-        assert [(t.end, t.message, t.cases) for t in found.troubles] == [
-            (End.VUT_ERROR, "other", (5, 6)),
-            (End.VUT_ERROR, "boom", (2,)),
-            (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
-        ]
-        assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
-        number = len(failures(run.outcomes))
-        assert found.found == ["3 errors", "4 timeouts", counted(number, "failure")]
-        contacts = counted(found.contacts, "contact")
-        assert found.counts.endswith(f"{counted(number, 'failure')} ({contacts}) in 10 cases")
-
-
-def summary_of(fmc: float, level: int = 1) -> Summary:
-    levels = {0: LevelSummary(10, 10, 0, {}, 0.0, 0), level: LevelSummary(10, 10, 1, {}, fmc, 1)}
-    return Summary(20, 1, {"MERGED": 20}, {}, levels)
+def test_errors_and_timeouts_are_grouped_by_message_errors_first_then_the_most_frequent(tmp_path):
+    errors = {2: "boom", 5: "other", 6: "other"}
+    run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=(0, 1, 3, 4))
+    found = judge(run.outcomes)
+    assert [(t.end, t.message, t.cases) for t in found.troubles] == [
+        (End.VUT_ERROR, "other", (5, 6)),
+        (End.VUT_ERROR, "boom", (2,)),
+        (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
+    ]
+    assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
+    failed = counted(len(failures(run.outcomes)), "failure")
+    contacts = counted(found.contacts, "contact")
+    assert found.counts == f"3 errors, 4 timeouts and {failed} ({contacts}) in 10 cases"
 
 
 class TestAGate:
@@ -83,11 +75,11 @@ class TestAGate:
         with pytest.raises(UserError, match="choose failures, errors"):
             parse_gates([text])
 
-    @pytest.mark.parametrize(("fmc", "met"), [(0.05, False), (0.0501, True)])
-    def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, tmp_path, fmc, met):
-        found = Gate("fmc", 0.05).check(judge([]), summary_of(fmc))
-        assert found.met is met
-        verb = "met" if met else "not met"
+    @pytest.mark.parametrize(("fmc", "verb"), [(0.05, "not met"), (0.0501, "met")])
+    def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, fmc, verb):
+        one, other = (LevelSummary(10, 10, 0, {}, volume, 0) for volume in (0.0, fmc))
+        summary = Summary(20, 0, {}, {}, {0: one, 1: other})
+        found = Gate("fmc", 0.05).check(judge([]), summary)
         assert found.sentence == f"gate fmc>0.05: {verb} (FMC {fmc:.4f} at level 1)"
 
     def test_on_cases_is_met_by_one_of_them(self, tmp_path):
@@ -105,39 +97,35 @@ def read_junit(file: Path) -> etree._Element:
 
 
 class TestJUnit:
-    @pytest.fixture
-    def root(self, tmp_path) -> etree._Element:
-        run = write_run(
-            *(tmp_path / "run", 20, (0, 2)),
-            vut=HOSTILE.replace("\ud800", ""),
-            errors={3: HOSTILE},
-            timeouts=(4, 6),
-        )
+    @pytest.fixture(scope="class")
+    def run(self, tmp_path_factory) -> Run:
+        vut = HOSTILE.replace("\ud800", "")
+        folder = tmp_path_factory.mktemp("junit") / "run"
+        return write_run(folder, 20, (0, 2), vut=vut, errors={3: HOSTILE}, timeouts=(4, 6))
+
+    @pytest.fixture(scope="class")
+    def root(self, run) -> etree._Element:
         opened = ms.open_run(run.folder)
         gates = [Gate(name).check(opened.verdict, opened.summary) for name in ("errors", "fmc")]
-        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.verdict, gates)
-        self.run = run
-        return read_junit(tmp_path / "junit.xml")
+        path = run.folder.with_name("junit.xml")
+        write_junit(path, run, opened.facts, opened.verdict, gates)
+        return read_junit(path)
 
-    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, root):
+    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, run, root):
         assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
         names = root.xpath("//testcase/@name")
         assert len(set(names)) == len(names) == 3 + 40
-        found = judge(self.run.outcomes)
         for suite, level in zip(root[1:], (0, 2), strict=True):
-            at = [o for o in self.run.outcomes if o.case.level == level]
-            assert suite.get("tests") == "20"
-            errors = sum(o.measures.end.is_error for o in at)
-            wrong = sum(o.failed or o.measures.end is End.TIMEOUT for o in at)
-            assert (suite.get("errors"), suite.get("failures")) == (str(errors), str(wrong))
-            assert float(suite.get("time")) == pytest.approx(sum(o.measures.t_end_s for o in at))
-        assert root.get("errors") == "1"
-        assert root.get("failures") == str(found.failures + 2 + 2), "and both gates are met"
+            at_level = [o.measures for o in run.outcomes if o.case.level == level]
+            assert float(suite.get("time")) == pytest.approx(sum(o.t_end_s for o in at_level))
+        assert (root.get("errors"), root[1].get("errors"), root[2].get("errors")) == ("1", "0", "1")
+        failed = judge(run.outcomes).failures
+        assert root.get("failures") == str(failed + 2 + 2), "with 2 timeouts and 2 gates"
 
-    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, root):
+    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, run, root):
         (error,) = root.xpath("//error")
         assert error.get("type") == "VUT_ERROR"
-        ended = self.run.outcome(3).measures
+        ended = run.outcome(3).measures
         said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
         assert error.get("message") == error.text == f"VUT_ERROR at {ended.t_end_s:g} s: {said}."
 

@@ -89,7 +89,6 @@ def test_without_repeats_each_outcome_with_a_verdict_is_a_case():
     """Also where a sampler proposes a case twice."""
     found = outcomes([(CASE, 0, FAILS), (CASE, 0, FAILS), (CASE, 0, None), (CASE, 0, PASSES)])
     assert [one.outcomes for one in by_case(found)] == [(found[0],), (found[1],), (found[3],)]
-    assert [one.deciding() for one in failing_cases(found)] == [o for o in found if o.failed]
 
 
 def test_the_interval_is_that_of_clopper_and_pearson():

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.measures import Measures
@@ -55,15 +56,20 @@ EASES = phases((2.0, 1.0), (6.0, -0.5))
 
 
 class TestWhichVehicleBrakes:
-    def test_none_that_keeps_its_speed_or_gains(self):
-        found = diagnosed(meeting(KEEP, LEVEL0))
-        assert (found.pov_brakes_s, found.vut_brakes_s) == (None, None)
-        assert (found.pov_accelerates, found.vut_accelerates) == (False, True)
-
-    def test_one_from_when_its_speed_falls(self):
-        found = diagnosed(meeting(BRAKES, COASTS))
-        assert (found.pov_brakes_s, found.vut_brakes_s) == (3.0, None)
-        assert (found.pov_accelerates, found.vut_accelerates) == (False, True)
+    @pytest.mark.parametrize(
+        ("a_pov", "a_vut", "brakes_s", "accelerate"),
+        [
+            (KEEP, LEVEL0, (None, None), (False, True)),
+            (BRAKES, COASTS, (3.0, None), (False, True)),
+            (KEEP, phases((2.0, 1.0), (2.0, -2.0), (4.0, 1.0)), (None, 2.0), (False, False)),
+        ],
+    )
+    def test_begins_where_its_speed_falls_and_does_not_accelerate(
+        self, a_pov, a_vut, brakes_s, accelerate
+    ):
+        found = diagnosed(meeting(a_pov, a_vut))
+        assert (found.pov_brakes_s, found.vut_brakes_s) == brakes_s
+        assert (found.pov_accelerates, found.vut_accelerates) == accelerate
 
     def test_in_traffic_the_car_that_the_vut_meets(self):
         pair = meeting(BRAKES, LEVEL0)

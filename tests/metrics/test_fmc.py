@@ -191,11 +191,6 @@ class TestTheBoundOfGrowth:
         assert growth_bound([[0.1, 0.1], [0.1, 0.1 + 1e-9]]) == pytest.approx(0.0, abs=1e-3)
         assert growth_bound(np.zeros((0, 2))) == growth_bound([]) == 0.0
 
-    def test_of_two_balls_is_the_share_that_they_do_not_have_in_common(self):
-        lens = common(RADIUS, 2)
-        bound = growth_bound([[0.1, 0.1], [0.1, 0.1 + RADIUS]])
-        assert bound == pytest.approx(1.0 - lens / (2 * DISC - lens), abs=0.01)
-
     @pytest.mark.parametrize("dimension", [2, 4])
     def test_is_no_less_than_the_mean_growth_with_twice_the_cases(self, dimension):
         rng = np.random.default_rng(dimension)
