@@ -18,7 +18,10 @@ from typing import Any
 import numpy as np
 
 from merge_sumo import api
+from merge_sumo.campaigns.campaign import run_campaign
+from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import load
 from merge_sumo.files import ScratchFolder
 from merge_sumo.metrics.measures import Measure, Measures
@@ -95,8 +98,16 @@ def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
     scratch = ScratchFolder()
     _kept.append(scratch)
     folder = Path(scratch.name) / "run"
-    keywords: dict[str, Any] = {"level": 0, "sampler": "uniform", "cases": 20, "seed": 1}
-    return api.campaign(vut, out=folder, scenario=scenario, progress=False, **keywords).run
+    settings = CampaignSettings(
+        vut=vut,
+        levels=(0,),
+        sampler="uniform",
+        cases=20,
+        seed=1,
+        scenario=scenario,
+        fail_when=scenario.criterion,
+    )
+    return run_campaign(settings, resolve(settings), folder)
 
 
 class VutContract:

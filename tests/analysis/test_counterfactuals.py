@@ -9,7 +9,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from support.campaigning import campaign_settings, run_campaign
+from support.campaigning import run_campaign
 from support.plans import plan_for
 from support.scenes import scene_of
 
@@ -18,7 +18,6 @@ from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.run import Run, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
-from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
@@ -95,12 +94,10 @@ class TestEveryFailure:
             assert one.pov_careful == avoids
 
 
-def test_eq_4_alone_says_what_sumo_says(tmp_path):
-    settings = campaign_settings(vut="design1", cases=60, batch=20, seed=1)
-    run = run_campaign(settings, tmp_path / "run")
+def test_eq_4_alone_says_what_sumo_says(run):
     failing = [(o.index, run.trajectory(o.index)) for o in run.outcomes if o.failed]
     assert len(failing) >= 10
-    plan = replace(resolve(settings), vut=load("careful"))
+    plan = plan_for("careful")
     in_sumo = avoidances(plan, failing)
     assert avoidances(plan.with_engine("kinematic"), failing) == in_sumo
     assert len({one.latest_takeover_s for one in in_sumo}) > 3
@@ -109,7 +106,13 @@ def test_eq_4_alone_says_what_sumo_says(tmp_path):
 def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
     road = named_scenario("us23-lane")
     settings = CampaignSettings(
-        vut="level0", scenario=road, levels=(0,), cases=120, seed=4, fail_when="unsafe"
+        vut="level0",
+        scenario=road,
+        levels=(0,),
+        sampler="uniform",
+        cases=80,
+        seed=4,
+        fail_when="unsafe",
     )
     run = run_campaign(settings, tmp_path / "run")
     plan = resolve(settings).with_engine("kinematic")

@@ -34,7 +34,7 @@ TRIED: dict[str, dict[str, Any]] = {
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("stress") / "run"
     return ms.campaign(
-        "design2", level=0, sampler="uniform", cases=80, fail_when=FAIL_WHEN, out=folder
+        "design2", level=0, sampler="uniform", cases=50, fail_when=FAIL_WHEN, out=folder
     )
 
 

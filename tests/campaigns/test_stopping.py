@@ -70,8 +70,11 @@ def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may
     assert 20 < len(run.run.outcomes) < 800
     assert run.lines()[0].endswith(f"; {len(run.run.outcomes)} of 800 cases, converged")
     more = api.resume(run, cases=len(run.run.outcomes) + 40, progress=False)
-    whole = api.campaign("design1", cases=len(more.run.outcomes), **plan, out=tmp_path / "whole")
     assert not more.converged
-    assert len(whole.run.outcomes) == len(run.run.outcomes) + 40
+    assert len(more.run.outcomes) == len(run.run.outcomes) + 40
+    settings = CampaignSettings(
+        vut="design1", levels=(0,), sampler="annealing", cases=len(more.run.outcomes), scenario=US23
+    )
+    whole = run_campaign(settings, tmp_path / "whole")
     texts = [(one.folder / "outcomes.jsonl").read_bytes() for one in (more, whole)]
     assert texts[0] == texts[1]
