@@ -9,7 +9,7 @@ run.report()        # path of the HTML report
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
 Before it runs anything, each raises `UserError` with one sentence for wrong values and files, and
 for an output that exists.
-Results print as the command prints them, and `to_record()` is what the command's `--json` prints.
+Results print as on the command line, and `to_record()` returns the object of `--json`.
 """
 
 from __future__ import annotations
@@ -28,28 +28,21 @@ from threadpoolctl import threadpool_limits
 
 from merge_sumo import config as c
 from merge_sumo.analysis import (
+    cases_file,
     comparison,
+    counterfactuals,
     explanation,
     own_scenario,
     reproduction,
+    run_study,
     sampler_study,
+    share,
     vut_check,
 )
 from merge_sumo.analysis import probability as estimates
 from merge_sumo.analysis import rerun as rerunning
 from merge_sumo.analysis import stress as ladder
-from merge_sumo.analysis.cases_file import CasesFile
-from merge_sumo.analysis.comparison import Comparison
-from merge_sumo.analysis.counterfactuals import note_avoidance
-from merge_sumo.analysis.explanation import EXPLANATIONS, ExplanationResult, note_explanation
-from merge_sumo.analysis.probability import PROBABILITY, ProbabilityResult
-from merge_sumo.analysis.reproduction import Reproduction
-from merge_sumo.analysis.run_study import RunStudy, notice_changes
-from merge_sumo.analysis.sampler_study import SamplerStudy, Study
-from merge_sumo.analysis.share import note_shares
-from merge_sumo.analysis.stress import STRESS, StressResult
 from merge_sumo.analysis.truth import TruthResult
-from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.again import again
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, run_campaign
 from merge_sumo.campaigns.plan import (
@@ -95,7 +88,6 @@ from merge_sumo.road.scenario_file import SUFFIX, spoken_name
 from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import (
     LEVELS,
-    OWN,
     US23,
     Scenario,
     level_name,
@@ -112,7 +104,7 @@ from merge_sumo.workers import open_workers
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
 
-__all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Comparison", "Seen", "SeenBatch", "dated"]
+__all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "dated"]
 
 FEW_CASES = 1000
 """Cases of built-in drivers that one process runs before others have started and share them."""
@@ -182,7 +174,7 @@ def campaign(config: c.Campaign) -> CampaignRun:
 
 @verb(c.Resume)
 def resume(config: c.Resume) -> CampaignRun:
-    """Go on with a campaign that was stopped."""
+    """Continue a campaign that was stopped."""
     folder = folder_of(config.run)
     recorded = read_settings(folder)
     fields, where = explicit(config, recorded.get("vut") or "", recorded.get("pov"))
@@ -216,7 +208,7 @@ def run(config: c.RunCase) -> CaseRun:
         notice(sentence)
     plan = resolve(settings, debug=config.debug)
     if before is not None:
-        notice_changes(before, plan)
+        run_study.notice_changes(before, plan)
     if config.gui:
         check_display()
     with open_workers(1):  # which closes the simulator
@@ -236,18 +228,18 @@ def run(config: c.RunCase) -> CaseRun:
 
 
 @verb(c.Rerun)
-def rerun(config: c.Rerun) -> Comparison:
+def rerun(config: c.Rerun) -> comparison.Comparison:
     """Run recorded cases again with a changed VUT."""
     before = recorded(config.run)
     indices = (config.indices,) if isinstance(config.indices, int) else tuple(config.indices)
     chosen = rerunning.chosen(before, indices, config.level)
-    out, junit = _new_files(config, SUFFIX if isinstance(before, CasesFile) else PAGE)
+    out, junit = _new_files(config, SUFFIX if isinstance(before, cases_file.CasesFile) else PAGE)
     some = len(chosen) < len(before.outcomes)
-    if isinstance(before, CasesFile) and out is not None and some:
+    if isinstance(before, cases_file.CasesFile) and out is not None and some:
         raise UserError("`out` of a cases file has all cases: name none of them, and no level")
     with opened_study(before, config, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
-    if isinstance(before, CasesFile):
+    if isinstance(before, cases_file.CasesFile):
         compared = with_file(compared, before, out or before.folder)
     return _written(compared, out, junit)
 
@@ -265,7 +257,9 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
     return out, junit
 
 
-def _written(compared: Comparison, out: Path | None, junit: Path | None) -> Comparison:
+def _written(
+    compared: comparison.Comparison, out: Path | None, junit: Path | None
+) -> comparison.Comparison:
     """Write the page, or the cases file of now, and JUnit, where they are wanted."""
     text = compared.text
     if out is not None and text is not None:
@@ -332,9 +326,7 @@ def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
     path = folder_of(folder)
     if not (path / SETTINGS).is_file():
         if index is not None:
-            raise UserError(
-                f"{path} is no campaign, so it has no case {index}: leave the index away"
-            )
+            raise UserError(f"{path} is not a campaign: leave the index away")
         return path
     if index is None:
         raise UserError(
@@ -350,8 +342,8 @@ def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
 
 
 @verb(c.Compare)
-def compare(config: c.Compare) -> Comparison:
-    """Compare recorded campaigns: what broke, and what was fixed."""
+def compare(config: c.Compare) -> comparison.Comparison:
+    """Compare recorded campaigns: broken and fixed cases."""
     if isinstance(config.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
     out, junit = _new_files(config)
@@ -368,7 +360,7 @@ def truth(config: c.GroundTruth) -> TruthResult:
 
 
 @verb(c.Benchmark)
-def benchmark(config: c.Benchmark) -> SamplerStudy:
+def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
     """Compare samplers with each other and with the ground truth."""
     picture = path_of(config.figure)
     if picture is not None:
@@ -387,30 +379,30 @@ def benchmark(config: c.Benchmark) -> SamplerStudy:
 
 
 @verb(c.Probability)
-def probability(config: c.Probability) -> ProbabilityResult:
+def probability(config: c.Probability) -> estimates.ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail."""
     before = campaign_of(config.run).run
-    target = path_of(config.out) or before.folder / PROBABILITY.name
+    target = path_of(config.out) or before.folder / estimates.PROBABILITY.name
     total = estimates.DEFAULT_CASES if config.cases is None else config.cases
     with opened_study(before, config, "fresh cases", total, engine=config.engine) as study:
         return estimates.failure_probability(study, config, target)
 
 
 @verb(c.Stress)
-def stress(config: c.Stress) -> StressResult:
+def stress(config: c.Stress) -> ladder.StressResult:
     """Run the cases of a campaign again, each time a little otherwise."""
     before = campaign_of(config.run).run
-    STRESS.check(before.folder)
+    ladder.STRESS.check(before.folder)
     cases = ladder.RUNS * sum(outcome.is_tested for outcome in before.outcomes)
     with opened_study(before, config, "cases again", cases) as study:
         return ladder.stress(study)
 
 
 @verb(c.Explain)
-def explain(config: c.Explain) -> ExplanationResult:
+def explain(config: c.Explain) -> explanation.ExplanationResult:
     """Find the smallest changes with which a failure passes."""
     before = campaign_of(config.run).run
-    EXPLANATIONS.check(before.folder)
+    explanation.EXPLANATIONS.check(before.folder)
     explanation.failure_of(before, config.case)
     ranges = tuple(map(Range.parsed, config.params))
     with opened_study(before, config, "explained", 1, "failures") as study:
@@ -418,7 +410,7 @@ def explain(config: c.Explain) -> ExplanationResult:
 
 
 @verb(c.Reproduce)
-def reproduce(config: c.Reproduce) -> Reproduction:
+def reproduce(config: c.Reproduce) -> reproduction.Reproduction:
     """Reproduce Table II and the figures of the paper."""
     scale = reproduction.scale_of(config)
     policies, folder = policies_folder(config.policies, US23), path_of(config.out)
@@ -442,8 +434,8 @@ def vuts(config: c.Vuts) -> Shown:
 
 
 @verb(c.CheckVut)
-def check_vut(config: c.CheckVut) -> VutCheck:
-    """Let a VUT drive a few cases and say what is wrong with it."""
+def check_vut(config: c.CheckVut) -> vut_check.VutCheck:
+    """Let a VUT drive a few cases and report its faults."""
     spec, _, _ = drivers_of(config.vut, None, 1)
     policies = None if config.policies is None else str(config.policies)
     fields = {"vut": spec, "levels": (0,), "policies": policies, **c.changed(config, c.Limits)}
@@ -483,7 +475,7 @@ def train(config: c.Train) -> PolicyChecks:
         return train_and_check(config, scenario, bars.counted, bars.say)
 
 
-# What the verbs share
+# Shared by the verbs
 
 
 @contextmanager
@@ -495,7 +487,7 @@ def opened_study(
     unit: str = "cases",
     *,
     engine: str | None = None,
-) -> Iterator[RunStudy]:
+) -> Iterator[run_study.RunStudy]:
     """Open a campaign for a study that runs cases of it, with a progress bar.
 
     Args:
@@ -503,7 +495,7 @@ def opened_study(
         config: how and where cases of it run.
         title: of the bar; "{vut}" in it stands for the VUT.
         total: number of cases, which may depend on the engine.
-        unit: what the bar counts.
+        unit: name of the counted things.
         engine: what moves the vehicles.
     """
     overrides, where = explicit(config, run.vut)
@@ -513,13 +505,13 @@ def opened_study(
     number = total if isinstance(total, int) else total[plan.engine]
     bar = Counter(title.format(vut=settings.vut), number, unit, shown=where.progress)
     with open_workers(plan.workers(where.workers)) as workers, bar:
-        yield RunStudy(run, settings, plan, workers, bar.ended)
+        yield run_study.RunStudy(run, settings, plan, workers, bar.ended)
 
 
 @contextmanager
 def opened_truths(
     settings: CampaignSettings, where: c.Execution, engine: str | None = None
-) -> Iterator[Study]:
+) -> Iterator[sampler_study.Study]:
     """Open a study of truths; the truths of objects of this process are not kept.
 
     Args:
@@ -539,7 +531,9 @@ def opened_truths(
         ScratchFolder() as folder,
         Bars(shown=where.progress) as bars,
     ):
-        yield Study(plan, workers, Path(folder) if passing else None, bars.counted, engine)
+        yield sampler_study.Study(
+            plan, workers, Path(folder) if passing else None, bars.counted, engine
+        )
 
 
 def path_of(path: Path | str | None) -> Path | None:
@@ -601,14 +595,14 @@ def run_and_report(
                 begin=partial(bars.begin, title),
             )
             result = CampaignRun(done, config.gates)
-            study = RunStudy(done, settings, replace(plan, against=None), available)
+            study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
             _note_studies(study, bars, check)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)
-            stop.add_note(f"go on with: {_resumption(settings, folder, where, config)}")
+            stop.add_note(f"continue with: {_resumption(settings, folder, where, config)}")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
@@ -629,20 +623,20 @@ def _resumption(
     return again("resume", folder, asdict(settings), **options)
 
 
-def _note_studies(study: RunStudy, bars: CampaignBars, check: Callable[[], None]) -> None:
+def _note_studies(study: run_study.RunStudy, bars: CampaignBars, check: Callable[[], None]) -> None:
     """Write the studies of a campaign that has just ended."""
 
     def on_part(title: str, done: int, total: int, unit: str) -> None:
         bars.counted(title, done, total, unit)
         check()
 
-    note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
-    note_shares(study, partial(on_part, "uniform starts", unit="cases"))
-    note_explanation(study)
+    counterfactuals.note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
+    share.note_shares(study, partial(on_part, "uniform starts", unit="cases"))
+    explanation.note_explanation(study)
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
-    """Warn with a `Notice` of POVs that are missing, not trained on the scenario, or see no VUT.
+    """Warn with a `Notice` of POVs that are missing, or not trained on the scenario.
 
     Args:
         settings: the settings of a new campaign.
@@ -661,13 +655,5 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Camp
         check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
         notice(
             f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"
-            f"{f': {check} says in what it differs' if name else ''}"
-        )
-    own, by_sumo = plan.povs.own, plan.vut.vut_type is not None
-    on_lane = OWN in settings.levels and settings.scenario.lane_m is not None
-    if on_lane and own is not None and own.vut_type is not None and not by_sumo:
-        # SUMO's drivers make room for a car next to them where its lane-change model asks them to.
-        notice(
-            f"until the VUT has merged, the POV {own.spec} keeps its speed: on an "
-            "acceleration lane SUMO's drivers see only a VUT that SUMO drives, too (sumo:MODEL)"
+            f"{f': {check} lists the differences' if name else ''}"
         )

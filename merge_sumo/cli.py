@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Group, Parameter, Token
 
 import merge_sumo as ms
 from merge_sumo import config as c
@@ -184,7 +184,7 @@ def campaign(
     *,
     resume: Annotated[
         Path | None,
-        Parameter(help="Go on with the campaign in this folder; --cases may be more."),
+        Parameter(help="Continue the campaign in this folder; --cases may be more."),
     ] = None,
     out: Annotated[
         Path | None, Parameter(help="New folder to write; runs/VUT-DATE by default.")
@@ -317,7 +317,7 @@ def compare(config: Options[c.Compare], *, json: Json = False) -> int:
 def simple(
     kind: type[Any], verb: str, group: Group | None = None, name: str = "", of: App = app
 ) -> None:
-    """Register a command that calls a verb and prints what it returns.
+    """Register a command that calls a verb and prints the result.
 
     Args:
         kind: the config of the command.
@@ -371,11 +371,6 @@ def execute(words: Sequence[str]) -> int:
     try:
         with notices_printed():
             return app(words) or 0
-    except UnusedCliTokensError as error:
-        unused = " ".join(map(quoted, error.unused_tokens or ()))
-        raise UserError(
-            f"too many arguments: {unused}; `merge-sumo {words[0]} --help` lists them"
-        ) from error
     except CycloptsError as error:
         token = getattr(error, "token", None)
         if token is not None and token.value.startswith("--"):

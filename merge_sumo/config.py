@@ -1,7 +1,7 @@
 """Settings of the verbs: one dataclass each, whose fields are keywords in Python and options.
 
 Shared fields stand in base classes. `None` stands for the default of the scenario, or, for a
-recorded campaign, for what the campaign was run with.
+recorded campaign, for the value of the campaign.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ class NoFailures(Campaign):
 
 @dataclass(frozen=True)
 class Resume(CampaignCalls):
-    """Go on with a campaign that was stopped; the same as `merge-sumo campaign --resume`.
+    """Continue a campaign that was stopped; the same as `merge-sumo campaign --resume`.
 
     The settings must be those of the campaign: `cases` may be more. A VUT, `pov` or `against` that
     is code is given again: a run folder names no code to run. Of an object only its name tells that
@@ -472,7 +472,7 @@ class Stress(Recorded):
 
 @dataclass(frozen=True)
 class Compare(Page):
-    """Compare recorded versions of a VUT: what broke, and what was fixed.
+    """Compare recorded versions of a VUT: broken and fixed cases.
 
     Everything is read from the records. Cases that two campaigns share are paired; where each has
     cases of its own, the shares of cases that pass are compared.
@@ -500,9 +500,9 @@ class Vuts(Policies):
 
 @dataclass(frozen=True)
 class CheckVut(Limits, Policies):
-    """Let a VUT drive a few cases, and print what is wrong with it and the cost of a step.
+    """Let a VUT drive a few cases, and print its faults and the cost of a step.
 
-    Says "nothing wrong" (exit code 0), or what is wrong in sentences (exit code 1).
+    Says "nothing wrong" (exit code 0), or names the faults in sentences (exit code 1).
 
     Example:  merge-sumo check-vut design1
     """

@@ -1,4 +1,4 @@
-"""What commands print: results on standard output, sentences for the user on standard error."""
+"""Printing: results on standard output, sentences for the user on standard error."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def flag_of(name: str) -> str:
 def prepare_streams() -> None:
     """Open closed standard streams to nothing, and write letters that a terminal lacks as escapes.
 
-    A file would get the number of a closed stream, and what is printed.
+    A file that is opened later would get the number of a closed stream, and its output.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -73,7 +73,7 @@ def show(line: object) -> None:
     try:
         print(printable(str(line)), flush=True)
     except OSError as error:
-        # What is left in the buffer goes nowhere, also when the interpreter ends.
+        # The rest of the buffer is dropped, also when the interpreter ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if error.errno == errno.EPIPE:
             raise Stopped(signal.SIGPIPE) from None

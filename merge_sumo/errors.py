@@ -18,7 +18,7 @@ class UserError(Exception):
         super().__init__(" ".join(sentence[:MOST_CHARACTERS].splitlines()))
 
     def _render_traceback_(self) -> list[str]:
-        """Return what a notebook shows: the sentence says what to do, and no line of ours helps."""
+        """Return the lines that a notebook shows: the sentence without a traceback."""
         return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", ())]
 
 
@@ -27,11 +27,11 @@ class ControllerError(UserError):
 
 
 class WorkersLostError(UserError):
-    """The cluster whose workers ran the cases is gone: what has run may be kept."""
+    """The cluster whose workers ran the cases is gone; finished cases may be kept."""
 
 
 class Notice(UserWarning):
-    """What a user should know of a result; the command line prints it as a sentence."""
+    """A warning about a result; the command line prints it as a sentence."""
 
 
 def notice(sentence: str, category: type[Warning] = Notice) -> None:

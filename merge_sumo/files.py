@@ -3,9 +3,6 @@
 What a user names as an output must not exist. It is written under a temporary name next to its
 place and renamed when it is whole, so a process that is killed leaves nothing that looks finished.
 Files of merge-sumo in a run folder may be written again, but not through links.
-
-Temporary folders are removed although the process that made them was killed. Each has a lock that
-ends with its process: the next process that makes one removes those whose lock is free.
 """
 
 from __future__ import annotations
@@ -13,18 +10,16 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import platform
 import re
 import secrets
 import shutil
 import stat
 import sys
 import tempfile
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
-from functools import cache, lru_cache
+from functools import lru_cache
 from itertools import count
 from pathlib import Path
 from typing import BinaryIO
@@ -43,11 +38,6 @@ LATEST = "latest"
 CACHE = "MERGE_SUMO_CACHE"
 DATED = re.compile(r"[\w.-]*-[0-9]{8}-[0-9]{6}(-[0-9]+)?")
 """The names that `dated` gives."""
-_HERE = hashlib.sha256(platform.node().encode(errors="replace")).hexdigest()[:8]
-"""This machine: a lock in a folder that several machines share may mean nothing to the others."""
-PREFIX = f"merge-sumo-{_HERE}-"
-YOUNG_S = 60.0
-"""Age, in s, from which on a folder without a lock is one of a process that is gone."""
 
 
 class TakenError(UserError):
@@ -76,12 +66,12 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
     Args:
         path: the file or folder; missing folders above it can be made.
         option: what names it in the message.
-        endings: those that a file may have, by which other programs know what it is.
+        endings: allowed endings of a file.
     """
     if endings and path.suffix not in endings:
         raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
     if path.name in ("", ".."):
-        raise UserError(f"{option} is {str(path)!r} or empty: write the name of what is to be made")
+        raise UserError(f"{option} is {str(path)!r} or empty: write a name")
     if os.path.lexists(path):
         raise _exists(path, option)
     try:
@@ -106,8 +96,8 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
 def check_own(*paths: Path) -> None:
     """Raise `UserError` where one of the paths exists and is neither a file nor a folder.
 
-    To be called before writing what was written before: in a received folder, a link leads
-    anywhere, and a pipe never answers.
+    To be called before a file is written again: in a received folder, a link leads anywhere, and a
+    pipe never answers.
     """
     for path in paths:
         try:
@@ -126,8 +116,8 @@ def check_ours(path: Path, mark: bytes = GENERATOR) -> None:
 
     Args:
         path: the file, which may not exist.
-        mark: what a file of merge-sumo of that name has in it unless it is empty; by default the
-            generator of a page.
+        mark: bytes that a file of merge-sumo of that name contains unless it is empty; by default
+            the generator of a page.
     """
     check_own(path)
     try:
@@ -247,7 +237,7 @@ def replace_own(path: Path, content: bytes, mark: bytes = b"") -> None:
     Args:
         path: the file.
         content: its bytes.
-        mark: what the older one has in it (`check_ours`).
+        mark: bytes that the older file contains (`check_ours`).
 
     Raises:
         UserError: something else is there, or it cannot be written.
@@ -440,49 +430,4 @@ class ScratchFolder(tempfile.TemporaryDirectory[str]):
 
     def __init__(self) -> None:
         """Make the folder; OSError where that cannot be."""
-        _remove_remains(tempfile.gettempdir())
-        super().__init__(prefix=PREFIX, ignore_cleanup_errors=True)
-        self._lock = _locked(Path(self.name))
-
-    def cleanup(self) -> None:
-        """Remove the folder."""
-        super().cleanup()
-        lock, self._lock = self._lock, None
-        if lock is not None:
-            os.close(lock)
-
-
-def _locked(folder: Path) -> int | None:
-    """Return the descriptor that holds the lock of a folder.
-
-    None where another process has it, this is not a folder, or the system has no such locks.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
-    descriptor = None
-    try:
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        if descriptor is not None:
-            os.close(descriptor)
-        return None
-    return descriptor
-
-
-@cache
-def _remove_remains(above: str) -> None:
-    """Remove the folders of ours whose process is gone, once in a process."""
-    with suppress(OSError):
-        for folder in Path(above).glob(f"{PREFIX}????????"):
-            found = folder.lstat()
-            # A young one may not have its lock yet.
-            young = time.time() - found.st_mtime < YOUNG_S
-            if young or found.st_uid != os.geteuid():
-                continue
-            lock = _locked(folder)
-            if lock is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(lock)
+        super().__init__(prefix="merge-sumo-", ignore_cleanup_errors=True)

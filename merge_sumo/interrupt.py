@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: the first finishes what is running, the second stops at once.
+"""SIGINT and SIGTERM: the first finishes the running batch, the second stops at once.
 
 After SIGTERM, systems send SIGKILL: the running batch has a few seconds to finish. Work without a
 batch stops at the first signal, in good order.
@@ -77,8 +77,8 @@ class Interrupt:
 def stopping_in_order() -> Iterator[None]:
     """Within `with`, a signal that would end this process raises `Stopped` instead.
 
-    So what was opened is closed first. SIGINT raises KeyboardInterrupt anyway; a signal that is
-    ignored or has a handler keeps it, and outside of the main thread nothing is changed.
+    So open files and processes are closed first. SIGINT raises KeyboardInterrupt anyway. A signal
+    that is ignored or has a handler keeps it. Outside of the main thread nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

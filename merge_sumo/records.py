@@ -75,7 +75,7 @@ def record_type(name: str, fields: Sequence[tuple[Any, ...]]) -> Any:
 
 
 def decode(content: bytes | str, kind: Any = Any) -> Any:
-    """Return JSON as a value of a type; `RecordError` where it is none."""
+    """Return JSON as a value of a type; `RecordError` where it is not one."""
     try:
         return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
@@ -84,7 +84,7 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
     except RecursionError as error:
         raise RecordError("it is nested too deeply") from error
     except (msgspec.DecodeError, ValueError) as error:
-        raise RecordError(f"it is no JSON ({error})") from error
+        raise RecordError(f"it is not JSON ({error})") from error
 
 
 def read_record(path: Path, kind: type[T]) -> T | None:
@@ -187,18 +187,18 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> list[T]:
 def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     """Return the text of a TOML file, and its record; `what` it holds stands in the sentences.
 
-    Raises `UserError` where it cannot be read or is no TOML.
+    Raises `UserError` where it cannot be read or is not TOML.
     """
     try:
         text = read_limited(path, MAX_TOML_BYTES).decode()
     except OSError as error:
         raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"the {what} {path} is no text in UTF-8") from error
+        raise UserError(f"the {what} {path} is not a text in UTF-8") from error
     try:
         return text, tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise UserError(f"the {what} {path} is no TOML: {error}") from error
+        raise UserError(f"the {what} {path} is not TOML: {error}") from error
 
 
 def check_toml_size(content: bytes, path: Path) -> None:
@@ -307,7 +307,7 @@ def read_arrays(file: Path | io.BytesIO, *names: str) -> dict[str, NDArray[Any]]
     Ours are not compressed, so that no file is more than it looks.
 
     Raises:
-        RecordError: there is none, or what is there is something else.
+        RecordError: the file is missing, or is not such a file.
     """
     try:
         with np.load(regular(file) if isinstance(file, Path) else file, allow_pickle=False) as data:

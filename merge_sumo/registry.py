@@ -1,6 +1,6 @@
 """Registries of samplers, controllers and measures, of this package and by entry points.
 
-A registry names what it holds without importing it: names of this package stand in the registry,
+A registry names its objects without importing them: names of this package stand in the registry,
 names of others in the metadata of installed packages. An object is imported when it is asked for.
 Only installed packages, which the user chose, are searched; the working folder is data.
 """

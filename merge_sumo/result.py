@@ -13,7 +13,7 @@ from merge_sumo.records import to_plain
 
 @singledispatch
 def lines_of(result: Result) -> list[str]:
-    """Return what a command prints of a result: `reports/text.py` says it of each study."""
+    """Return the lines of a result, as `reports/text.py` writes them for each study."""
     raise TypeError(f"{type(result).__name__} has no lines")
 
 
@@ -33,12 +33,12 @@ class Result:
         return True
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the object that `--json` prints."""
         record: dict[str, Any] = to_plain(self)
         return record | {name: to_plain(getattr(self, name)) for name in self.computed}
 
     def lines(self) -> list[str]:
-        """Return what a command prints."""
+        """Return the lines that a command prints."""
         return lines_of(self)
 
     def __str__(self) -> str:

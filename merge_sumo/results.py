@@ -1,4 +1,4 @@
-"""What the verbs return: campaigns, cases and studies, as lines, as JSON, and for a notebook."""
+"""Results of the verbs: campaigns and cases, as lines, as JSON, and for a notebook."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class CampaignRun(Result):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What `campaign.json` holds."""
+        """Content of `campaign.json`."""
         return self.run.record
 
     @property
@@ -132,7 +132,7 @@ class CampaignRun(Result):
 
     @cached_property
     def against(self) -> Comparison | None:
-        """What changed from the version that the campaign is against; None where it is none."""
+        """Changes from the version that the campaign is against; None without one."""
         return compare_against(self.run)
 
     @property
@@ -180,7 +180,7 @@ class CampaignRun(Result):
         return doubts(self.run.cases, self.run.criterion, self.run.settings.in_vain)
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `merge-sumo campaign --json` prints.
+        """Return the object that `merge-sumo campaign --json` prints.
 
         `contacts` counts failures in which bodies touch at or after the merge point; `shares` has
         the uniform starts of each level, of which `failures` fail and `without_verdict` are not
@@ -205,7 +205,7 @@ class CampaignRun(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return the headline, what else is to be known, and the path of the report."""
+        """Return the headline, remarks, and the path of the report."""
         run = self.run
         repeated = [
             f"{fact.name}: {fact.shown}"
@@ -238,7 +238,7 @@ class CampaignRun(Result):
         ]
 
     def remarks(self) -> list[str]:
-        """Return what decided whether the campaign passed: the gates, and whether it tested."""
+        """Return sentences on the gates, and one where no case could be judged."""
         untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
         return [*(gate.sentence for gate in self.gates), *untested]
 
@@ -272,14 +272,14 @@ class CaseRun(Result):
 
     @property
     def cause(self) -> str:
-        """What happened, in a sentence; for a failure also until when it was avoidable."""
+        """The course of the case in a sentence; for a failure also until when it was avoidable."""
         return cause(self.outcome, self.trajectory)
 
     def __repr__(self) -> str:
         return f"<case: {self.cause}>"
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `merge-sumo run --json` prints: outcome, motion, and signals of the VUT."""
+        """Return the object that `merge-sumo run --json` prints: outcome, motion, and signals."""
         record = {**self.outcome.to_record(), "motion": self.trajectory.whole.tolist()}
         left = {"signals": self.trajectory.signals, "in_vain": self.trajectory.in_vain}
         return record | {name: value for name, value in left.items() if value}

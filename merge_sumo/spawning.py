@@ -49,8 +49,8 @@ def without_cwd() -> Iterator[None]:
     """Let processes that are started meanwhile import nothing from the working directory.
 
     `multiprocessing` starts them by `python -c`, which looks there first: a `json.py` in a folder
-    that was received would run. In the process, `forget_safe_path` is due: what it starts in
-    turn may be a user's program.
+    that was received would run. The process calls `forget_safe_path`: the programs that it
+    starts in turn may be a user's.
     """
     if os.environ.get(SAFE_PATH):
         yield

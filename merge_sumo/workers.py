@@ -29,7 +29,7 @@ from merge_sumo.files import ScratchFolder
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 
 MAX_CHUNK = 500
-"""Items that a worker takes at a time; what bounds its memory."""
+"""Maximum number of items that a worker takes at a time; it bounds the memory."""
 DASK_TIMEOUT_S = 30.0
 CHUNKS_AHEAD = 16
 """Chunks for each worker that `Workers.run` submits before it collects the first."""
@@ -41,6 +41,20 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
+class SerialExecutor(Executor):
+    """Runs everything in this process, as it is submitted."""
+
+    def submit(self, function: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
+        """Run a function now; its exceptions are raised by this call."""
+        future: Future[R] = Future()
+        future.set_result(function(*args, **kwargs))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Release what this process kept from one chunk to the next."""
+        end_worker()
+
+
 @dataclass(slots=True)
 class Job(Generic[T, R]):
     """Chunks that were submitted together.
@@ -48,8 +62,8 @@ class Job(Generic[T, R]):
     Attributes:
         function: gives a result for each item of a chunk.
         chunks: the chunks.
-        lost: gives the result of an item that ended its worker each time.
-        futures: of the chunks, in their order; none in this process.
+        lost: gives the result of an item that ended its worker twice.
+        futures: of the chunks, in their order.
         retried: places of items that ran again, because a worker had died.
     """
 
@@ -74,7 +88,7 @@ class Workers(AbstractContextManager["Workers"]):
 
     def __init__(
         self,
-        open_executor: Callable[[int], Executor] | None = None,
+        open_executor: Callable[[int], Executor] = lambda _: SerialExecutor(),
         count: int = 1,
         *,
         died: type[Exception] = BrokenExecutor,
@@ -84,15 +98,15 @@ class Workers(AbstractContextManager["Workers"]):
         """Open an executor.
 
         Args:
-            open_executor: opens an executor of a number of workers; None for this process.
+            open_executor: opens an executor of a number of workers; by default in this process.
             count: number of workers.
-            died: what a future raises when its worker is dead.
-            gone: what a future raises when no worker can be reached.
+            died: exception of a future whose worker is dead.
+            gone: exceptions of a future when no worker can be reached.
             is_lost: returns whether the connection to all workers has ended.
         """
         self.count = count
         self._open, self._died, self._gone, self._is_lost = open_executor, died, gone, is_lost
-        self._executor = None if open_executor is None else open_executor(count)
+        self._executor = open_executor(count)
         self.on_close = ExitStack()
 
     def chunk_size(self, items: int) -> int:
@@ -105,13 +119,13 @@ class Workers(AbstractContextManager["Workers"]):
         chunks: Iterable[Sequence[T]],
         lost: Callable[[T], R],
     ) -> Job[T, R]:
-        """Submit chunks of items. In this process they run when they are collected.
+        """Submit chunks of items.
 
         Args:
             function: gives a result for each item of a chunk; it is found by its name in other
                 processes, and may run twice.
             chunks: the chunks.
-            lost: gives the result of an item that ends its worker whenever it runs.
+            lost: gives the result of an item that ends its worker twice.
 
         Returns:
             What `collect` takes.
@@ -120,8 +134,6 @@ class Workers(AbstractContextManager["Workers"]):
             WorkersLostError: no worker can be reached.
         """
         job = Job(function, list(chunks), lost)
-        if self._executor is None or self._open is None:
-            return job
         for chunk in job.chunks:
             try:
                 future = self._executor.submit(function, chunk)
@@ -139,21 +151,18 @@ class Workers(AbstractContextManager["Workers"]):
 
         Raises:
             WorkersLostError: no worker can be reached.
-            Exception: what the function raises.
+            Exception: any exception of the function.
         """
         results: list[R] = []
-        for number, chunk in enumerate(job.chunks):
-            if self._executor is None:
-                results += job.function(chunk)
-                continue
+        for chunk, future in zip(job.chunks, job.futures, strict=True):
             try:
                 # A cluster that goes away just now may leave a future without an end.
-                while not wait([job.futures[number]], timeout=POLL_S).done:
+                while not wait([future], timeout=POLL_S).done:
                     if self._is_lost():
                         raise WorkersLostError(LOST)
-                results += job.futures[number].result()
+                results += future.result()
             except self._died:
-                job.retried |= set(range(len(results), len(results) + len(chunk)))
+                job.retried.update(range(len(results), len(results) + len(chunk)))
                 results += self._retry(job, chunk)
             except self._gone as error:  # nothing is cancelled whose result is collected
                 raise WorkersLostError(LOST) from error
@@ -179,7 +188,7 @@ class Workers(AbstractContextManager["Workers"]):
             The results, in the order of the items.
         """
         size = chunk or self.chunk_size(len(items))
-        ahead = 1 if self._executor is None else CHUNKS_AHEAD * self.count
+        ahead = CHUNKS_AHEAD * self.count if self.count > 1 else 1
         jobs: deque[Job[T, R]] = deque()
         first = 0
         while jobs or first < len(items):
@@ -189,28 +198,23 @@ class Workers(AbstractContextManager["Workers"]):
             yield from self.collect(jobs.popleft())
 
     def _retry(self, job: Job[T, R], items: Sequence[T]) -> list[R]:
-        """Run items with nothing else in their worker; halve them where it dies."""
-        assert self._open is not None, "this process outlives its cases"  # noqa: S101
-        try:
+        """Run items one by one, with nothing else in their worker."""
+        results: list[R] = []
+        while len(results) < len(items):
             with self._open(1) as executor:
-                return list(executor.submit(job.function, items).result())
-        except self._gone as error:
-            raise WorkersLostError(LOST) from error
-        except self._died:
-            if len(items) == 1:
-                return [job.lost(items[0])]
-        half = len(items) // 2
-        return self._retry(job, items[:half]) + self._retry(job, items[half:])
+                try:
+                    for item in items[len(results) :]:
+                        results += executor.submit(job.function, [item]).result()
+                except self._died:
+                    results.append(job.lost(items[len(results)]))
+                except self._gone as error:
+                    raise WorkersLostError(LOST) from error
+        return results
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the executor; where the program is to stop at once, end the workers."""
+        """Close the executor; after an exception the workers end at once."""
         with self.on_close:
-            if isinstance(self._executor, LocalProcesses):
-                self._executor.end(at_once=kind is not None and not issubclass(kind, Exception))
-            elif self._executor is not None:
-                self._executor.shutdown(wait=kind is None)
-            else:
-                end_worker()
+            self._executor.shutdown(wait=kind is None)
 
 
 AnyWorkers = int | str | None
@@ -238,7 +242,7 @@ def open_workers(workers: AnyWorkers = None) -> Workers:
             "multiprocessing.Pool, starts no others"
         )
         count = 1
-    return Workers(None if count == 1 else LocalProcesses, count)
+    return Workers() if count == 1 else Workers(LocalProcesses, count)
 
 
 def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
@@ -266,7 +270,7 @@ def dask_workers(address: str) -> Workers:
             f"workers at {address} need Dask: run `pip install merge-sumo[dask]`"
         ) from error
     with ExitStack() as opened:
-        # What matters to a user is a sentence of ours.
+        # A user reads one sentence of merge-sumo, and not the log of the library.
         for name in ("distributed", "distributed.client", "tornado.application"):
             logger = logging.getLogger(name)
             opened.callback(logger.setLevel, logger.level)
@@ -306,18 +310,13 @@ class LocalProcesses(ProcessPoolExecutor):
         with _sigint_blocked(), without_main(), without_cwd():
             self.submit(int)  # with the first task they start
 
-    def end(self, *, at_once: bool) -> None:
-        """Wait for what runs, or end the workers `at_once`."""
-        if at_once:
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Let the workers end, or without `wait` kill them; remove their temporary files."""
+        if not wait:
             for process in list((self._processes or {}).values()):
                 process.kill()
-        self.shutdown(cancel_futures=True)
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the workers end; remove what they have left."""
-        super().shutdown(wait, cancel_futures=cancel_futures)
-        if wait:
-            self._scratch.cleanup()
+        super().shutdown(cancel_futures=True)
+        self._scratch.cleanup()
 
 
 _endings: list[Callable[[], None]] = []

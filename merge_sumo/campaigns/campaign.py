@@ -69,7 +69,7 @@ def run_campaign(
     Raises:
         UserError: if the plan cannot be carried out; if the folder of a new campaign exists; if
             something of a stopped one differs that decides outcomes: settings, versions, net,
-            policies. The sentence has the name of the field.
+            policies. The message names the field.
     """
     if resumes:
         check_own(folder / SCENARIOS, folder / AGAINST)
@@ -147,10 +147,9 @@ def _resumed(
         journal.earlier.keep(old, len(before.outcomes))
     open_simulators(plan, workers)
     journal.write_settings()
-    motion = SAMPLERS[settings.sampler].uses_predictions
-    history = before.episodes(motion=motion)
+    history = before.episodes()
     if old is not None:
-        for index, earlier in enumerate(old.episodes(motion=motion)):
+        for index, earlier in enumerate(old.episodes()):
             history[index] = replace(history[index], earlier=earlier)
     return journal, history
 
@@ -176,7 +175,7 @@ def _continued(settings: CampaignSettings, plan: SimulationPlan, before: Run) ->
     recorded, record = dict(before.record), record_of(settings, plan)
     # The content of policies decides outcomes, and not their folder.
     recorded["policies"] = record["policies"]
-    # What was loaded while it ran must be the same, too, although it is not loaded yet.
+    # Files that were loaded while it ran must be the same, although they are not loaded yet.
     for name in FILES:
         record[name] = files_now(recorded.get(name) or {}, record[name] or {}) or None
     for name in TALLIES:

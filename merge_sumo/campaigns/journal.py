@@ -1,4 +1,4 @@
-"""The writer of the folder of a campaign (`run.py`): one process, and whole groups of episodes.
+"""The writer of a campaign folder (`run.py`): one process, and whole groups of episodes.
 
 The trajectories of a group go first, so that every outcome on disk has its trajectory there.
 """
@@ -50,7 +50,7 @@ def to_line(outcome: Outcome) -> str:
 class Journal:
     """Writes a campaign's folder, as the only process that does; to be used in `with`.
 
-    A folder with settings is whole, and what was appended once stays.
+    A folder with settings is complete, and appended outcomes stay.
 
     Attributes:
         folder: the folder.
@@ -116,9 +116,8 @@ class Journal:
     def append(self, *groups: Sequence[Episode]) -> None:
         """Write groups and sync them to the disk.
 
-        What their episodes say of loaded files, of commands in vain, and of cases that ran again
-        goes into the settings. Raises `UserError` when they cannot be written; what was there
-        before stays.
+        Loaded files, commands without effect and retried cases are noted in the settings. Raises
+        `UserError` when the groups cannot be written; earlier groups stay.
         """
         if self.earlier is not None:
             earlier = []
@@ -152,11 +151,11 @@ class Journal:
             self.write_settings()
 
     def _note(self, episode: Episode) -> None:
-        """Note in the settings what an episode tells of them."""
+        """Note loaded files, commands without effect and retries of an episode in the settings."""
         noted = self.settings
         for name, files in zip(FILES, (episode.files, episode.pov_files), strict=True):
             if files:
-                noted[name] = files | (noted.get(name) or {})  # what was known stays
+                noted[name] = files | (noted.get(name) or {})  # the first hash of a file stays
         for command in episode.trajectory.in_vain:
             cases = noted.get(IN_VAIN, {})
             noted[IN_VAIN] = cases | {command: cases.get(command, 0) + 1}
@@ -164,7 +163,7 @@ class Journal:
             noted[RAN_AGAIN] = noted.get(RAN_AGAIN, 0) + 1
 
     def write_settings(self) -> None:
-        """Write the settings in the place of those that were there, all or nothing."""
+        """Replace `campaign.json`, all or nothing."""
         if self.earlier is not None:
             self.earlier.write_settings()
         replace_own(self.folder / SETTINGS, to_json(self.settings, indent=2))

@@ -82,8 +82,7 @@ class SearchLoop:
             draws: runs of each case that the sampler proposes. All are in one group.
             in_flight: most cases in flight; by default one group.
             stop: whether the outcomes with a verdict end the search.
-            history: whole groups that ran before, in order. Only a sampler that uses predictions
-                needs their motions.
+            history: whole groups that ran before, in order.
         """
         self._sampler, self._plan, self._cases, self._stop = sampler, plan, cases, stop
         self._workers = Workers() if workers is None else workers

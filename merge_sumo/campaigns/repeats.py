@@ -66,7 +66,7 @@ def repeat(
 ) -> list[Repeat]:
     """Run some cases of a campaign again, and write the comparison to `repeats.jsonl`.
 
-    Cases whose trajectory is lost, and cases that end in an error now, are left out.
+    Cases that end in an error now are left out.
 
     Args:
         run: the campaign.
@@ -78,15 +78,13 @@ def repeat(
         A comparison for each case, by index.
     """
     chosen = chosen_again(run.outcomes, settings)
-    recorded = run.trajectories(outcome.index for outcome in chosen)
-    again = [outcome for outcome in chosen if outcome.index in recorded]
-    if not again:
+    if not chosen:
         return []
     found = []
-    job = submit_cases(plan, [outcome.case for outcome in again], workers)
-    for outcome, ran in zip(again, workers.collect(job), strict=True):
+    job = submit_cases(plan, [outcome.case for outcome in chosen], workers)
+    for outcome, ran in zip(chosen, workers.collect(job), strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(repeat_of(outcome, recorded[outcome.index], ran))
+            found.append(repeat_of(outcome, run.trajectory(outcome.index), ran))
     found.sort(key=lambda one: one.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
     return found
@@ -153,12 +151,12 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 
 def read_repeats(run: Run) -> list[Repeat]:
-    """Return what a folder says of cases that ran twice; `UserError` for a wrong line."""
+    """Read the comparisons of a campaign; `UserError` for a wrong line."""
     return read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
 
 
 def unrepeatable(found: Iterable[Repeat]) -> str | None:
-    """Return how many cases did not repeat, and what that means; None where each did."""
+    """Return a sentence on the cases that did not repeat; None where each did."""
     known = list(found)
     differing = [one for one in known if not one.same]
     if not differing:

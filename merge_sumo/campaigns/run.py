@@ -47,7 +47,7 @@ RAN_AGAIN = "ran_again"
 IN_VAIN = "in_vain"
 """Key of `campaign.json`: for each command of the VUT without effect, the number of cases."""
 TALLIES = (RAN_AGAIN, IN_VAIN)
-"""Counted as cases end: these keys are no settings."""
+"""Keys of `campaign.json` that count as cases end, and are not settings."""
 FILES = ("vut_files", "pov_files")
 """Keys of `campaign.json`: files that the VUT and the user's own POV have loaded."""
 FARTHEST = 1e9
@@ -238,15 +238,9 @@ class Run:
                 known[index] = self.trajectory(index)
         return known
 
-    def episodes(self, *, motion: bool = True) -> list[Episode]:
-        """Return all cases in order; without `motion` their trajectories have none.
-
-        Raises as `trajectory` does.
-        """
-        if motion:
-            return [Episode(one, self.trajectory(one.index)) for one in self.outcomes]
-        none = np.empty((0, self.scenario.vehicles, 3))
-        return [Episode(o, Trajectory(o.case, none, o.measures.end)) for o in self.outcomes]
+    def episodes(self) -> list[Episode]:
+        """Return all cases in order. Raises as `trajectory` does."""
+        return [Episode(outcome, self.trajectory(outcome.index)) for outcome in self.outcomes]
 
     def earlier(self) -> Run | None:
         """Return the run of the version that this campaign is against; None where there is none.

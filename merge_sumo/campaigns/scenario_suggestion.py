@@ -1,4 +1,4 @@
-"""What a road suggests for a scenario on it, and what to know of a scenario before it is run."""
+"""A suggested scenario for a road, and warnings about a scenario before it is run."""
 
 from __future__ import annotations
 
@@ -51,25 +51,25 @@ def kind_of_merge(road: Corridor) -> list[str]:
             else "ramp and mainline have no lanes side by side before it"
         )
         return [f"kind: merge at the point M, because {why}"]
-    beside = (
-        f"{' '.join(lane.lanes)} of the ramp runs beside {' '.join(lane.beside)} of the mainline "
+    lanes = (
+        f"{' '.join(lane.lanes)} of the ramp runs next to {' '.join(lane.beside)} of the mainline "
         f"for {lane.length_m:.1f} m"
     )
     if road.lane_m is not None:
         mark = ", and the net marks it" if lane.is_marked else ""
-        lines = [f"kind: acceleration lane, because {beside}{mark}; `point` makes M a point"]
+        lines = [f"kind: acceleration lane, because {lanes}{mark}; `point` makes M a point"]
     elif lane.gives_a_choice:
-        lines = [f"kind: merge at the point M, as asked for, although {beside}"]
+        lines = [f"kind: merge at the point M, as asked for, although {lanes}"]
     else:
         why = (
             f"more than {MAX_LANE_M:g} m"
             if lane.length_m > MAX_LANE_M
             else f"less than {MIN_LANE_M:g} m, and the net does not mark it"
         )
-        lines = [f"kind: merge at the point M, because {beside}: {why}"]
+        lines = [f"kind: merge at the point M, because {lanes}: {why}"]
     if lane.exits:
         lines.append(
-            f"weaving: the lane goes on to {' and '.join(lane.exits)}; the VUT has to leave it "
+            f"weaving: the lane continues to {' and '.join(lane.exits)}; the VUT has to leave it "
             "before, and traffic that leaves there is not simulated"
         )
     return lines
@@ -127,36 +127,35 @@ def limit_at(path: LanePath, x_m: float) -> float:
 
 
 def about(road: Corridor) -> list[str]:
-    """Return what was found of a road, in lines."""
+    """Describe a road in lines."""
     lines = [f"net: {road.path.name}"]
-    paths = [
-        ("mainline", road.mainline, road.mainline_edges),
-        ("ramp", road.ramp, road.ramp_edges),
-    ]
+    paths = {
+        "mainline": (road.mainline, road.mainline_edges),
+        "ramp": (road.ramp, road.ramp_edges),
+    }
     if road.is_one_path:
-        paths = [("lane of all vehicles", road.mainline, road.mainline_edges)]
-    for name, path, edges in paths:
-        # Those after M, too: all drive on there.
-        limits = ", ".join(
-            f"{limit:g} m/s from {start_m:.0f} m" for start_m, limit in path.speed_limits_mps()
+        paths = {"lane of all vehicles": paths["mainline"]}
+    for name, (path, edges) in paths.items():
+        limits = []  # those after M, too: all drive on there
+        for start_m, limit_mps in path.speed_limits_mps():
+            limits.append(f"{limit_mps:g} m/s from {start_m:.0f} m")
+        lines.append(
+            f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; "
+            f"limits: {', '.join(limits)}"
         )
-        lines.append(f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; limits: {limits}")
     m = road.lane_point(0.0, on_ramp=road.lane_m is None)
+    merge = f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"
     if road.is_one_path:
-        return [*lines, f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"]
+        return [*lines, merge]
     if road.lane_m is not None and (lane := road.acceleration_lane) is not None:
         begin_m, end_m = road.lane_m
         ends = f"from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
         if begin_m > lane.begin_m + SAME_M:
             ends += f", used from {begin_m:.1f} m on"
         share = -begin_m / (end_m - begin_m)
-        return [
-            *lines,
-            f"acceleration lane: {' '.join(lane.lanes)}, {ends}",
-            f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), where a merge is expected, at a "
-            f"share of {share:.2f} of the acceleration lane",
-        ]
-    lines.append(f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f}), junction {road.junction_type}")
+        merge += f", where a merge is expected, at a share of {share:.2f} of the acceleration lane"
+        return [*lines, f"acceleration lane: {' '.join(lane.lanes)}, {ends}", merge]
+    lines.append(f"{merge}, junction {road.junction_type}")
     yields = road.mainline_approach.yields, road.ramp_approach.yields
     first = {(True, False): "the ramp goes", (False, True): "the mainline goes"}
     lines.append(f"right of way: {first.get(yields, 'neither road goes')} first")
@@ -166,7 +165,7 @@ def about(road: Corridor) -> list[str]:
 
 
 def lane_warnings(scenario: Scenario, road: Corridor) -> list[str]:
-    """Return what a scenario leaves out of a road's acceleration lane, in sentences."""
+    """Return sentences on an acceleration lane that a scenario does not use, or only in part."""
     lane = road.acceleration_lane
     if lane is None or not lane.gives_a_choice:
         return []
@@ -196,8 +195,8 @@ def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
     """Return the differences of a scenario from the training of the learned drivers, in sentences.
 
     `policies` is the folder of these drivers, by default of the shipped ones for the scenario. They
-    measure in the units of the scenario that they play, so what counts is what its numbers are like
-    in the one that they were trained for. Outside, levels 1 and 2 are extrapolations.
+    measure in the units of the scenario that they play, so its numbers are compared after a
+    conversion into the units of training. Outside, levels 1 and 2 are extrapolations.
     """
     folder = policies or policies_of(scenario)
     trained = {scenario_of(entry) for entry in read_manifest(folder).values()}

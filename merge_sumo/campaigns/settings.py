@@ -171,7 +171,7 @@ class CampaignSettings(SharedSettings):
 
 
 def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:
-    """Return what `campaign.json` holds: everything that decides the outcomes."""
+    """Return the content of `campaign.json`: everything that decides the outcomes."""
     folder = None if settings.policies is None else policies_name(plan.povs.policies)
     return {
         **to_plain(settings),
@@ -216,7 +216,7 @@ def settings_of(
 
     Args:
         folder: the folder, for messages.
-        recorded: what its `campaign.json` says.
+        recorded: content of its `campaign.json`.
         overrides: settings that replace recorded ones.
         resumes: whether the campaign continues: else it has no earlier version.
 

@@ -41,8 +41,11 @@ class Played(Workers):
     """Workers that play their cases without SUMO."""
 
     def __init__(self, count: int) -> None:
-        super().__init__(None, count)
+        super().__init__()
         self.count = count
+
+    def submit(self, function, chunks, lost) -> Job[Any, Any]:
+        return Job(function, list(chunks), lost)
 
     def collect(self, job: Job[Any, Any]) -> list[Any]:
         return [played(case) for chunk in job.chunks for case in chunk]

@@ -21,9 +21,8 @@ from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
 from merge_sumo import testing
-from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.again import again, command
-from merge_sumo.errors import Notice, UserError
+from merge_sumo.errors import Notice
 from merge_sumo.interrupt import Stopped
 from merge_sumo.road.scenario_file import to_toml
 from merge_sumo.scenario.scenario import US23
@@ -45,17 +44,6 @@ class MyVut:
         self.brakes = self.brakes or (seen.x_vut_m > -60.0 and abs(gap_m) < 15.0)
         return -2.0 if self.brakes and seen.v_vut_mps > 10.0 else self.gain
 """
-CLIENT = """
-import sys, traci
-
-traci.init(int(sys.argv[1]))
-while traci.simulation.getMinExpectedNumber() > 0:
-    traci.simulationStep()
-    if "vut" in traci.vehicle.getIDList():
-        traci.vehicle.setSpeed("vut", min(traci.vehicle.getSpeed("vut") + 0.1, 28.0))
-traci.close()
-"""
-TRACI = f"traci:{sys.executable} client.py {{port}}"
 FEW = {"probability": ["--cases", "8"], "campaign": ["--cases", "4", "--level", "0"]}
 """Options with which the commands of the longest verbs take seconds."""
 A_COMMAND = re.compile(r"(?:PYTHONPATH=\S+ )?(?:merge-sumo|ms\.\w+\(|&& merge-sumo).*")
@@ -84,9 +72,8 @@ def commands_on(page: Path, index: int) -> Iterator[str]:
 
 @pytest.fixture
 def place(tmp_path, monkeypatch) -> Path:
-    """Work in a folder with controllers of a person's own."""
+    """Work in a folder with a controller of the user's own."""
     (tmp_path / "my_vut.py").write_text(SOURCE)
-    (tmp_path / "client.py").write_text(CLIENT)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_vut", raising=False)  # of another test
     monkeypatch.syspath_prepend(tmp_path)  # before folders of other tests
@@ -119,34 +106,32 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
     assert said.code == 0, said.err
     run = ms.open_run(RUN)
     worst = run.failures[0]["index"]
-    found = {*commands_in(said.out), *commands_in(said.err)}
+    found = set(commands_in(said.out))
     assert any(f"replay {shlex.quote(RUN)}" in one for one in found)
     on_page = set(commands_on(run.report_file, worst))
     (explain,) = (one for one in on_page if " explain " in one)
     assert " && merge-sumo report " in explain
     on_page.remove(explain)  # it runs here
-    explained, report = explain.split(" && ")
-    found.add(report)
-    others = [
-        explained,
-        f"{again('rerun', run.folder, run.settings, [worst])}",
+    found |= on_page
+    for line in (
+        explain.split(" && ")[0],
+        again("rerun", run.folder, run.settings, [worst]),
         f"merge-sumo rerun {shlex.quote(RUN)} 0 1 2 --vut fsm -q",
-    ]
-    for line in others:
+    ):
         said = command_line(*shlex.split(line)[1:])
         assert said.code != BAD_USE, said.err
         found |= {*commands_in(said.out), *commands_in(said.err)}
-    stopped: dict[str, Any] = {"level": 0, "cases": 4, "batch": 2, "seed": 1, "progress": False}
 
     def stop() -> None:
         raise Stopped(signal.SIGINT)
 
-    with pytest.raises(Stopped):
+    stopped: dict[str, Any] = {"level": 0, "cases": 4, "batch": 2, "seed": 1, "progress": False}
+    with pytest.raises(Stopped) as raised:
         ms.campaign(vut, **stopped, out="stopped", check=stop)
+    resume = set(commands_in("\n".join(raised.value.__notes__)))
     ms.report("stopped")
-    resume = {one for one in commands_on(Path("stopped", "report.html"), 0) if "--resume" in one}
-    assert len(resume) == 1
-    return found | on_page | resume | {again("run", run.folder, run.settings, worst)}
+    assert resume == {c for c in commands_on(Path("stopped", "report.html"), 0) if "--resume" in c}
+    return found | resume | {again("run", run.folder, run.settings, worst)}
 
 
 @pytest.mark.parametrize(
@@ -163,15 +148,6 @@ def test_runs_of_a_controller(vut, options, command_line, runs):
     rule = ("--level", "0", "--fail-when", "dx_m > 0")
     search = ("merge-sumo", "campaign", "--vut", "fsm", "--against", vut, *rule, *options)
     assert shlex.join(search) in found
-    runs(found)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("place")
-def test_runs_of_a_traci_client(command_line, runs):
-    found = printed(TRACI, command_line)
-    measure = f"merge-sumo probability {shlex.quote(RUN)} --vut {shlex.quote(TRACI)}"
-    assert measure in found
     runs(found)
 
 
@@ -241,27 +217,9 @@ class TestACommand:
         )
         assert done.returncode == 1, done.stderr
 
-    @pytest.mark.usefixtures("place")
-    def test_goes_on_where_a_disk_was_full(self, monkeypatch, runs):
-        few: dict[str, Any] = {"level": 0, "cases": 20, "batch": 10, "seed": 1, "progress": False}
-        writes = journal._write_all
-
-        def full(file: Any, content: bytes) -> None:
-            if file.seek(0, os.SEEK_END):
-                raise OSError("No space left on device")
-            writes(file, content)
-
-        monkeypatch.setattr(journal, "_write_all", full)
-        with pytest.raises(UserError) as error:
-            ms.campaign("my_vut.py:MyVut", **few, out="run")
-        monkeypatch.setattr(journal, "_write_all", writes)
-        found = set(commands_in(str(error.value)))
-        assert found == {"merge-sumo campaign --resume run --vut my_vut.py:MyVut"}
-        runs(found)
-
     @pytest.mark.parametrize("file", ["mine.toml", "elsewhere.toml"])
     @pytest.mark.usefixtures("place")
-    def test_on_a_scenario_names_its_file_or_is_left_out(self, file, runs):
+    def test_on_a_scenario_names_its_file_or_is_left_out(self, file):
         scenario = replace(US23, name="mine", v_pov0_mps=(12.0, 20.0))
         Path(file).write_text(to_toml(scenario, []))
         few: dict[str, Any] = {"level": 1, "cases": 4, "seed": 1, "progress": False}
@@ -269,17 +227,6 @@ class TestACommand:
             ms.campaign("design1", scenario=scenario, **few, out="run")
         found = set(commands_in("\n".join(str(one.message) for one in noticed)))
         assert found == ({"merge-sumo scenario check mine.toml"} if file == "mine.toml" else set())
-        runs(found)
-
-    def test_writes_a_page_that_is_not_there_yet(self, place, command_line):
-        few = ("--level", 0, "--cases", 12, "--seed", 1, "-q")
-        assert command_line("campaign", "--vut", "design1", *few, "--out", "run")[0] == 0
-        (place / "changes.html").write_text("mine")
-        said = command_line("rerun", "run", "--vut", "fsm", "-q")
-        (page,) = (one for one in commands_in(said.out) if "changes" in one)
-        assert page.endswith(" --out changes-2.html")
-        assert command_line(*shlex.split(page)[1:], "-q")[0] != BAD_USE
-        assert (place / "changes.html").read_text() == "mine"
 
 
 def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):

@@ -41,4 +41,4 @@ def test_sigterm_ends_a_controller_that_takes_seconds_a_step(tmp_path):
     process.send_signal(signal.SIGTERM)
     said = process.communicate(timeout=20)[1]
     assert process.returncode == 128 + signal.SIGTERM
-    assert "go on with: merge-sumo campaign --resume run" in said
+    assert "continue with: merge-sumo campaign --resume run" in said

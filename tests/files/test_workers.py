@@ -254,7 +254,7 @@ class TestADaskCluster:
         *before, last = err.splitlines()
         assert last == (
             "merge-sumo: lost the connection to the Dask workers; check the cluster; "
-            f"go on with: merge-sumo campaign --resume run --gate 'fmc>0.5' --workers {address}"
+            f"continue with: merge-sumo campaign --resume run --gate 'fmc>0.5' --workers {address}"
         )
         assert all(line.startswith(("design1 v level 0", "cases: ", "so far")) for line in before)
 
@@ -266,7 +266,7 @@ class TestADaskCluster:
         keywords |= {"cases": 20_000, "out": folder, "workers": address}
         with pytest.raises(WorkersLostError) as lost:
             api.campaign("design1", on_case=lambda _: scheduler.kill(), **keywords)
-        note = f"go on with: merge-sumo campaign --resume {folder} --workers {address}"
+        note = f"continue with: merge-sumo campaign --resume {folder} --workers {address}"
         assert lost.value.__notes__ == [note]
         assert lost.value._render_traceback_()[-1] == note
 

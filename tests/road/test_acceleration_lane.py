@@ -98,7 +98,7 @@ class TestAScenario:
         )
         (kind,) = (line for line in lines if line.startswith("kind"))
         assert kind == (
-            "kind: acceleration lane, because acc_0 of the ramp runs beside acc_1 of the mainline "
+            "kind: acceleration lane, because acc_0 of the ramp runs next to acc_1 of the mainline "
             "for 215.4 m, and the net marks it; `point` makes M a point"
         )
         checked = api.check_scenario(scenario)

@@ -76,7 +76,7 @@ class TestAFile:
 
     @pytest.mark.parametrize(
         ("content", "said"),
-        [(b"x = [", "is no TOML"), (b"\xff", "no text in UTF-8"), (None, "No such file")],
+        [(b"x = [", "is not TOML"), (b"\xff", "not a text in UTF-8"), (None, "No such file")],
     )
     def test_that_is_none_is_refused(self, tmp_path, content, said):
         if content is not None:
