@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import resource
 from dataclasses import replace
@@ -92,16 +91,6 @@ class TestReading:
         with pytest.raises(UserError) as error:
             read(b"".join(lines[index] for index in order))
         assert_sentence(error, f"line {line} ")
-
-    @pytest.mark.parametrize(
-        ("field", "value"),
-        [("index", True), ("level", 4), ("svo_rad", 0.3), ("end", "ARRIVED"), ("score", math.nan)],
-    )
-    def test_refuses_a_value_of_the_wrong_type(self, field, value):
-        record = {**episode(0).outcome.to_record(), field: value}
-        with pytest.raises(UserError) as error:
-            read(json.dumps(record).encode() + b"\n")
-        assert_sentence(error, "line 1")
 
 
 class TestAJournal:

@@ -6,13 +6,12 @@ import os
 import shlex
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
 import pytest
 from conftest import require
-from support.calling import Said, assert_refused
+from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.again import again
@@ -38,10 +37,9 @@ FEW: Final[dict[str, Any]] = {
     "fail_when": "t_end_s > 2",
 }
 """Settings of a campaign in which every case fails."""
-Call = Callable[..., Said]
 
 
-def project(folder: Path) -> Path:
+def project(folder):
     """Make a folder with a VUT that leaves a file where it is loaded."""
     folder.mkdir()
     (folder / "my_vut.py").write_text(VUT)
@@ -49,7 +47,7 @@ def project(folder: Path) -> Path:
     return folder
 
 
-def ran(folder: Path) -> bool:
+def ran(folder):
     """Return whether the VUT was loaded since this was asked last."""
     found = (folder / "it-ran").exists()
     (folder / "it-ran").unlink(missing_ok=True)
@@ -57,7 +55,7 @@ def ran(folder: Path) -> bool:
 
 
 @pytest.fixture
-def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def mine(tmp_path, monkeypatch):
     """Return a project in which a campaign has run, of 6 of 12 cases."""
     folder = project(tmp_path / "mine")
     monkeypatch.chdir(folder)
@@ -68,7 +66,7 @@ def mine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-def verbs(run: Path, out: Path) -> list[tuple[object, ...]]:
+def verbs(run, out):
     """Return the commands that drive by the controller of a recorded campaign."""
     return [
         ("campaign", "--resume", run, "--cases", 12, "-q"),
@@ -80,9 +78,7 @@ def verbs(run: Path, out: Path) -> list[tuple[object, ...]]:
 
 
 class TestARunFolder:
-    def test_has_no_code_run_by_any_command(
-        self, mine: Path, tmp_path: Path, command_line: Call
-    ) -> None:
+    def test_has_no_code_run_by_any_command(self, mine, tmp_path, command_line):
         for command in verbs(mine / "run", tmp_path):
             said = command_line(*command)
             assert_refused(said, "a run folder names no code to run: name it again with --vut")
@@ -92,11 +88,11 @@ class TestARunFolder:
 
     def test_works_elsewhere_with_its_controller_named_again(
         self,
-        mine: Path,
-        tmp_path: Path,
-        command_line: Call,
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
+        mine,
+        tmp_path,
+        command_line,
+        monkeypatch,
+    ):
         """As in CI, where another machine has another checkout."""
         run_campaign(campaign_settings(**FEW, cases=12), Path("whole"))
         there = project(tmp_path / "there")
@@ -112,7 +108,7 @@ class TestARunFolder:
         expected = (mine / "whole" / OUTCOMES).read_bytes()
         assert Path("results", OUTCOMES).read_bytes() == expected
 
-    def test_has_no_pov_and_no_earlier_version_run(self, mine: Path, command_line: Call) -> None:
+    def test_has_no_pov_and_no_earlier_version_run(self, mine, command_line):
         Path("pov.py").write_text(VUT)
         of_pov = {"vut": "design2", "pov": "pov.py:Vut", "levels": (3,)}
         for name, given in (("pov", of_pov), ("against", {"vut": "design2", "against": SPEC})):
@@ -127,9 +123,7 @@ class TestARunFolder:
 
 class TestAChangedController:
     @pytest.mark.parametrize("file", ["my_vut.py", "helper.py"])
-    def test_begins_a_new_campaign_and_is_noticed(
-        self, mine: Path, file: str, command_line: Call
-    ) -> None:
+    def test_begins_a_new_campaign_and_is_noticed(self, mine, file, command_line):
         before = (mine / "run" / OUTCOMES).read_bytes()
         (mine / file).write_text((mine / file).read_text() + "# changed\n")
         said = command_line("campaign", "--resume", "run", "--vut", SPEC, "--cases", 12, "-q")
@@ -140,7 +134,7 @@ class TestAChangedController:
         code, _, err = command_line("rerun", "run", 0, "--vut", SPEC, "-q")
         assert (code, err) == (0, "")
 
-    def test_is_known_by_its_files_wherever_they_are(self, mine: Path, tmp_path: Path) -> None:
+    def test_is_known_by_its_files_wherever_they_are(self, mine, tmp_path):
         recorded = Run(mine / "run").record["vut_files"]
         assert set(recorded) == {"my_vut.py", "helper.py"}
         there = project(tmp_path / "there")
@@ -152,9 +146,7 @@ class TestAChangedController:
 
 
 class TestCodeThatOthersMayWrite:
-    def test_is_not_run(
-        self, mine: Path, command_line: Call, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_is_not_run(self, mine, command_line, monkeypatch):
         monkeypatch.syspath_prepend(mine)  # before folders of other tests
         (mine / "my_vut.py").chmod(0o666)
         (mine / "link.py").symlink_to(mine / "my_vut.py")
@@ -164,7 +156,7 @@ class TestCodeThatOthersMayWrite:
             assert_refused(said, "is not run: others can write it", "chmod go-w")
         assert not ran(mine)
 
-    def test_of_another_user_is_not_run(self, mine: Path) -> None:
+    def test_of_another_user_is_not_run(self, mine):
         require(os.geteuid() == 0, "needs root to give a file away")
         os.chown(mine / "my_vut.py", 12345, 12345)
         with pytest.raises(UserError, match=r"my_vut\.py is not run: it belongs to the user 12345"):
@@ -173,7 +165,7 @@ class TestCodeThatOthersMayWrite:
 
 
 @pytest.mark.parametrize("spec", ["design2?a_brake_mps2=-4", "sumo:IDM", "traci", "traci:8813"])
-def test_names_no_code(spec: str) -> None:
+def test_names_no_code(spec):
     assert not names_code(spec)
 
 
@@ -189,5 +181,5 @@ def test_names_no_code(spec: str) -> None:
         "here:Object",
     ],
 )
-def test_names_code(spec: str) -> None:
+def test_names_code(spec):
     assert names_code(spec)
