@@ -49,7 +49,7 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
         ("arguments", "parts"),
         [
             (("--vut", "design9"), ("'design9'", "design1", "level0")),
-            (("--level", "3"), ("'3'", "0, 1, 2, several")),
+            (("--level", "3"), ("'3'", "0, 1, 2, all")),
             (("--cases", "0"), ("--cases is 0",)),
             (("--gate", "failure"), ("choose failures",)),
             (("--workers", "two"), ("'two'", "tcp://HOST:PORT")),
