@@ -236,7 +236,7 @@ class _Search:
                 levels[level_name(level)] = self._stated[other] = self._passes(plan, [other])[0]
         start = []
         for c in coordinates(case.scenario, (case.level,)):
-            value, bounds = getattr(case, c.field), (c.dimension.low, c.dimension.high)
+            value, bounds = getattr(case, c.field), (c.low, c.high)
             axis = _axis(c.field, value, *bounds, c.digits, START_STEPS)
             start.append(self._searched(axis, self._with_start))
         parameters = []

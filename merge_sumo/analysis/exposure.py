@@ -27,7 +27,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
 from merge_sumo.records import Record, convert, decode, read_toml, record_type, to_plain
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import Dimension, Scenario
+from merge_sumo.scenario.scenario import Coordinate, Scenario
 
 Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[
@@ -53,18 +53,18 @@ class _Shape(Record, frozen=True):
         below, up_to = self.law(low, high).cdf([low, high]).tolist()
         return below, up_to
 
-    def quantiles(self, d: Dimension, chances: FloatArray) -> FloatArray:
+    def quantiles(self, d: Coordinate, chances: FloatArray) -> FloatArray:
         """Return the values, (n,), at chances, (n,), in the unit of a coordinate."""
         low, high = self.bounds(d)
         below, up_to = self.ends(low, high)
         values = self.law(low, high).ppf(below + chances * (up_to - below))
         return np.clip(np.asarray(values, dtype=np.float64), low, high)
 
-    def bounds(self, d: Dimension) -> tuple[float, float]:
+    def bounds(self, d: Coordinate) -> tuple[float, float]:
         """Return the bounds at which it is cut off."""
         return d.low if self.low is None else self.low, d.high if self.high is None else self.high
 
-    def check(self, d: Dimension) -> None:
+    def check(self, d: Coordinate) -> None:
         """Raise `UserError` where it is not within the pool, or has no probability there."""
         low, high = self.bounds(d)
         if not d.low <= low < high <= d.high:

@@ -21,7 +21,7 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import COORDINATES, DT_S
+from merge_sumo.scenario.scenario import DT_S, IMPERFECTIONS
 from merge_sumo.simulation.plan import SimulationPlan
 
 Index = Annotated[int, Meta(ge=0)]
@@ -128,7 +128,7 @@ ERROR_X_M = 0.5
 ERROR_V_MPS = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
 ERRORS_BY_UNIT = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
-OF_VUT = {"v_vut0_mps", *COORDINATES}
+OF_VUT = {"v_vut0_mps", *(coordinate.field for coordinate in IMPERFECTIONS)}
 """Coordinates that do not belong to another car."""
 CAR_LENGTH_M = 5.0
 DRAWS = 5
@@ -184,7 +184,7 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
     values: dict[str, Any] = {}
     for dimension in case.scenario.dimensions(case.level):
         name = dimension.field
-        most = ERRORS_BY_UNIT.get(case.scenario.notation[name].unit, 0.0)
+        most = ERRORS_BY_UNIT.get(dimension.unit, 0.0)
         if most and name not in OF_VUT:
             value = getattr(case, name) + rng.uniform(-most, most)
             values[name] = min(max(value, dimension.low), dimension.high)

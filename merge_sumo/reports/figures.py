@@ -175,8 +175,8 @@ def _pool_axes(axes: Axes, level: int) -> None:
     x, y, *_ = US23.dimensions(level)
     axes.set_xlim(x.low, x.high)
     axes.set_ylim(y.low, y.high)
-    axes.set_xlabel(US23.notation[x.field].symbol)
-    axes.set_ylabel(US23.notation[y.field].symbol)
+    axes.set_xlabel(x.symbol)
+    axes.set_ylabel(y.symbol)
     axes.locator_params(axis="x", nbins=5)
 
 

@@ -57,9 +57,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     axes = []
     for c in model.coordinates:
         # Cases are shown in full this near to the reader's place in a third coordinate.
-        near = (c.dimension.high - c.dimension.low) / 16.0
+        near = (c.high - c.low) / 16.0
         axis = {"name": c.name, "unit": c.unit, "digits": c.digits, "near": near}
-        axes.append(axis | to_plain(c.dimension))
+        axes.append(axis | {"field": c.field, "low": c.low, "high": c.high})
     return {
         "dt": DT_S,
         "crash_m": scenario.dx_crash_m,

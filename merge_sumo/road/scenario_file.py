@@ -32,7 +32,7 @@ def shipped_scenarios() -> list[str]:
 def named_scenario(name: str) -> Scenario:
     """Return the scenario of a name or of a file; `UserError` where there is none.
 
-    What is wrong in a file is told with its line.
+    An error in a file is reported with its line.
     """
     if name == US23.name:
         return US23

@@ -1,8 +1,8 @@
 """XML files of others, read as data: without entities and document types, and within limits.
 
 SUMO's files can name other files, devices and addresses, and SUMO reads and writes all of them. So
-SUMO gets no file that was received: replays and campaigns write their own net from what is read
-here, and where SUMO has to have the whole net it gets `harmless_net`.
+SUMO gets no file that was received: replays and campaigns write their own net from the data read
+here, and where SUMO needs the whole net it gets `harmless_net`.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element
         raise UserError(f"{name} declares a document type or an entity: remove the declaration")
     elements = etree.iterparse(
         io.BytesIO(content),
-        # Another encoding, as the file may declare, could hide what is looked for above.
+        # Another encoding, as the file may declare, could hide a declaration from the search above.
         encoding="utf-8",
         remove_comments=True,
         remove_pis=True,

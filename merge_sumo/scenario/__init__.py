@@ -1,1 +1,1 @@
-"""A road with its cars, a case to play on it, and what happened."""
+"""A road with its cars, a case, and the motion in its episode."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any
 
@@ -30,22 +30,24 @@ from merge_sumo.scenario.imperfection import (
 )
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
-    COORDINATES,
+    IMPERFECTIONS,
     LEVELS,
     OWN,
     SVO,
     US23,
     V_VUT0_MPS,
-    Dimension,
+    Coordinate,
     Scenario,
 )
 
 FloatArray = NDArray[np.float64]
-_IMPERFECTIONS = attrgetter(*COORDINATES)
-_NONE = (None,) * len(COORDINATES)
+_IMPERFECT_FIELDS = [coordinate.field for coordinate in IMPERFECTIONS]
+_imperfections = attrgetter(*_IMPERFECT_FIELDS)
+_NONE = (None,) * len(IMPERFECTIONS)
 _PERFECT = (PERFECT_SENSING, PERFECT_ACTUATION)
 MOST_DRAWS = 2**32
 """Draws of a case: their numbers have 4 bytes."""
+MOST_SVO_RAD = math.nextafter(SVO.high, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -53,7 +55,7 @@ class Case:
     """One test case, a point of a scenario.
 
     Raises `UserError` for values with which the scenario cannot be set up. Values outside the
-    pool are allowed: a user may want to look at one.
+    pool are allowed.
 
     Attributes:
         level: level of the POV.
@@ -63,10 +65,15 @@ class Case:
         v_vut0_mps: speed of the VUT at the start.
         headway_ahead_s: time headway of the car ahead of the POV; None without traffic.
         headway_behind_s: that of the car behind it.
-        draw: which draw of what is random in its episode; no coordinate of the pool.
+        draw: number of the draw of random values in its episode; not a coordinate of the pool.
         scenario: the scenario.
 
     The others are numbers for ranges of the scenario's `sense` and `act`; None where it has none.
+
+    Example:
+        >>> case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+        >>> case.starts()
+        [(-250.0, 30.0), (-182.0, 18.0)]
     """
 
     level: int
@@ -97,25 +104,23 @@ class Case:
         if (self.svo_rad is None) == (self.level == 2):
             raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
         reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps
-        if not -reach_m <= self.x_pov0_m <= 0.0:
-            raise UserError(f"x_pov0_m is {self.x_pov0_m}: choose between {-reach_m:g} and 0")
-        for name, v_mps in (("v_pov0_mps", self.v_pov0_mps), ("v_vut0_mps", self.v_vut0_mps)):
-            if not 0.0 <= v_mps <= most_mps:
-                raise UserError(f"{name} is {v_mps}: choose between 0 and {most_mps:g}")
+        for name, value, low, high in (
+            ("x_pov0_m", self.x_pov0_m, -reach_m, 0.0),
+            ("v_pov0_mps", self.v_pov0_mps, 0.0, most_mps),
+            ("v_vut0_mps", self.v_vut0_mps, 0.0, most_mps),
+            ("svo_rad", self.svo_rad or 0.0, SVO.low, MOST_SVO_RAD),
+            ("draw", self.draw, 0, MOST_DRAWS - 1),
+        ):
+            if not low <= value <= high:
+                raise UserError(f"{name} is {value}: choose between {low:g} and {high:g}")
         self._check_imperfections()
         self._check_headways()
-        if not 0 <= self.draw < MOST_DRAWS:
-            raise UserError(f"draw is {self.draw}: choose 0 or more, and less than {MOST_DRAWS}")
-        if self.svo_rad is not None and not 0.0 <= self.svo_rad < math.pi / 2:
-            raise UserError(f"svo_rad is {self.svo_rad}: choose between 0 and below pi/2")
 
     def _check_headways(self) -> None:
         """Raise `UserError` where a car would start too far away or in another."""
         reach_m, least_m = self.scenario.reach_m, self.scenario.pov_length_m
-        for name, headway_s, side in (
-            ("headway_ahead_s", self.headway_ahead_s, 1.0),
-            ("headway_behind_s", self.headway_behind_s, -1.0),
-        ):
+        for name, side in (("headway_ahead_s", 1.0), ("headway_behind_s", -1.0)):
+            headway_s = getattr(self, name)
             if (headway_s is not None) != (self.scenario.vehicles > 2):
                 raise UserError(f"{name} belongs to traffic: give it there, and only there")
             if headway_s is None:
@@ -147,32 +152,32 @@ class Case:
 
     @property
     def start(self) -> Case:
-        """The case at its first draw: what its runs have in common."""
+        """The case at its first draw."""
         return self if self.draw == 0 else replace(self, draw=0)
 
     @property
     def seed(self) -> int:
-        """A number that the case alone decides: seeds what is drawn at random in its episode."""
+        """The seed of all random numbers of its episode; it follows from the case."""
         return self._hashed((self.level, self.svo_rad, self.starts()))
 
     @property
     def told_seed(self) -> int:
-        """The same for a controller, by what it is told: neither level nor orientation decide."""
+        """The seed for a controller, which knows neither level nor orientation."""
         return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
     def _hashed(self, known: object) -> int:
-        """Return a number below 2**32 for each draw, other than those of further draws."""
+        """Return a number below 2**32, another one for each draw."""
         first = zlib.crc32(repr(known).encode())
-        # A CRC goes on from another one, and differs for different bytes of the same number.
+        # A CRC continues from another one, and differs for different bytes of the same number.
         return first if self.draw == 0 else zlib.crc32(self.draw.to_bytes(4, "little"), first)
 
     def _check_imperfections(self) -> None:
         """Raise `UserError` where a number is missing for a range, or there without one."""
-        given, scenario = _IMPERFECTIONS(self), self.scenario
+        given, scenario = _imperfections(self), self.scenario
         if given == _NONE and (scenario.sense, scenario.act) == _PERFECT:
             return
         wanted = scenario.imperfect_fields
-        for name, value in zip(COORDINATES, given, strict=True):
+        for name, value in zip(_IMPERFECT_FIELDS, given, strict=True):
             if (value is not None) != (name in wanted):
                 raise UserError(f"{name} belongs to a range of the scenario: give it there alone")
         if wanted:
@@ -182,10 +187,9 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ToldCase(Case):
-    """What the driver of a vehicle may know of a case: where vehicles start, and own limits.
+    """The part of a case that the driver of a vehicle knows: where vehicles start, and own limits.
 
-    It is made of a case that was checked, so it is not checked again: a sensor may show a car
-    anywhere.
+    It is not checked: a sensor may show a car anywhere.
     """
 
     x_pov0_m: float = math.nan
@@ -217,16 +221,19 @@ def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> Flo
     """Return the cases of one level as points, (n, d), with the pool's box as the unit cube.
 
     Args:
-        cases: the cases; without any, d is that of the scenario.
+        cases: the cases, of one scenario.
         level: the level of all of them.
-        scenario: their scenario.
+        scenario: gives d where there are no cases.
+
+    Returns:
+        The points.
     """
-    rows, known, dims = [], scenario, scenario.dimensions(level)
-    for case in cases:
-        if case.scenario is not known:
-            known, dims = case.scenario, case.scenario.dimensions(level)
-        rows.append([(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims])
-    return np.array(rows, dtype=np.float64) if rows else np.empty((0, len(dims)))
+    cases = list(cases)
+    dims = (cases[0].scenario if cases else scenario).dimensions(level)
+    points = np.empty((len(cases), len(dims)))
+    for row, case in enumerate(cases):
+        points[row] = [(getattr(case, d.field) - d.low) / (d.high - d.low) for d in dims]
+    return points
 
 
 def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Case]:
@@ -244,59 +251,32 @@ def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Cas
         values: dict[str, Any] = {"v_vut0_mps": v_vut0_mps}
         values |= {d.field: d.low + u * (d.high - d.low) for d, u in zip(dims, row, strict=True)}
         if level == 2:
-            values["svo_rad"] = min(values["svo_rad"], math.nextafter(SVO.high, 0.0))
+            values["svo_rad"] = min(values["svo_rad"], MOST_SVO_RAD)
         cases.append(Case(level=level, scenario=scenario, **values))
     return cases
 
 
-@dataclass(frozen=True, slots=True)
-class Coordinate:
-    """A coordinate of a pool: its bounds, and how a value of it is written."""
-
-    dimension: Dimension
-    name: str
-    unit: str
-    digits: int
-
-    @property
-    def field(self) -> str:
-        """Name of the field of a case."""
-        return self.dimension.field
-
-    def of(self, case: Case) -> float | None:
-        """Return the value of a case; None where its level has no such coordinate."""
-        value: float | None = getattr(case, self.field)
-        return value
-
-    def share(self, case: Case) -> float:
-        """Return where a case is between the bounds, from 0 to 1; 0 where it has no value."""
-        low, high = self.dimension.low, self.dimension.high
-        return ((self.of(case) or low) - low) / (high - low)
-
-    def text(self, case: Case) -> str:
-        """Return the value as it stands in a table; empty where there is none."""
-        value = self.of(case)
-        return "" if value is None else f"{value:.{self.digits}f}"
-
-
 def coordinates(scenario: Scenario, levels: Sequence[int] = LEVELS) -> tuple[Coordinate, ...]:
     """Return the coordinates that a scenario has at any of some levels, in the pool's order."""
-    most = max((scenario.dimensions(level) for level in levels), key=len)
-    return tuple(Coordinate(d, *astuple(scenario.notation[d.field])[:3]) for d in most)
+    return max((scenario.dimensions(level) for level in levels), key=len)
 
 
 def described(case: Case) -> str:
     """Return the coordinates of a case in one line."""
-    return ", ".join(
-        f"{c.name} {c.text(case)} {c.unit}" for c in coordinates(case.scenario, (case.level,))
-    )
+    texts = []
+    for c in coordinates(case.scenario, (case.level,)):
+        texts.append(f"{c.name} {c.text(case)} {c.unit}")
+    return ", ".join(texts)
 
 
 def outside_of_the_pool(case: Case) -> list[str]:
-    """Return in sentences which coordinates of a case are outside of the pool."""
-    return [
-        f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.dimension.low:g} to "
-        f"{c.dimension.high:g} {c.unit}: no campaign runs such a case"
-        for c in coordinates(case.scenario, (case.level,))
-        if (value := c.of(case)) is not None and not c.dimension.low <= value <= c.dimension.high
-    ]
+    """Return a sentence for each coordinate of a case that is outside of the pool."""
+    sentences = []
+    for c in coordinates(case.scenario, (case.level,)):
+        value = c.of(case)
+        if value is not None and not c.low <= value <= c.high:
+            sentences.append(
+                f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.low:g} to {c.high:g} "
+                f"{c.unit}: no campaign runs such a case"
+            )
+    return sentences

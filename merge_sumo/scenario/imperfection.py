@@ -1,4 +1,4 @@
-"""What lies between a controller and the road: how the VUT senses other cars, and how it obeys.
+"""What lies between a controller and the road: sensing of other cars, and obedience of the VUT.
 
 Both are values of a scenario. Zero, which is the default, is perfect: the VUT knows the state of
 every car in the step in which it is asked, and its acceleration acts at once. A range makes a
@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
-from typing import Any, Self, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self, TypeVar
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import either, meant
@@ -21,30 +21,31 @@ Amount = float | Bounds
 
 
 class Imperfection:
-    """What `Sensing` and `Actuation` have in common: numbers in their ranges, by name."""
+    """The base of `Sensing` and `Actuation`: numbers in their ranges, by name."""
 
     __slots__ = ()
+    possible: ClassVar[dict[str, Bounds]]
+    """Lowest and highest numbers, by field."""
 
     def __post_init__(self) -> None:
         """Check the numbers; raises `UserError`."""
         for field, value in self._given():
-            low, high = RANGES[type(self)][field]
+            low, high = self.possible[field]
             numbers = value if isinstance(value, tuple) else (value,)
-            if not all(math.isfinite(x) and low <= x <= high for x in numbers):
-                raise UserError(f"{field} is {_in_words(value)}: choose {low:g} to {high:g}")
-            if isinstance(value, tuple) and not value[0] < value[1]:
-                raise UserError(
-                    f"{field} is {_in_words(value)}: the first number of a range must be the lower"
-                )
+            text = "..".join(f"{x:g}" for x in numbers)
+            if not all(low <= x <= high for x in numbers):
+                raise UserError(f"{field} is {text}: choose {low:g} to {high:g}")
+            if len(numbers) == 2 and not numbers[0] < numbers[1]:
+                raise UserError(f"{field} is {text}: the first number of a range must be the lower")
 
     def _given(self) -> Iterator[tuple[str, Amount]]:
-        """Yield (field, value) of what is not left out."""
-        for field in fields(self):  # type: ignore[arg-type]
-            if (value := getattr(self, field.name)) is not None:
-                yield field.name, value
+        """Yield (field, value) of all that have one."""
+        for field in self.possible:
+            if (value := getattr(self, field)) is not None:
+                yield field, value
 
     def to_record(self) -> dict[str, Any]:
-        """Return what is imperfect, as JSON keeps it."""
+        """Return the imperfect numbers, as JSON keeps them."""
         default = type(self)()
         return {name: v for name, v in self._given() if v != getattr(default, name)}
 
@@ -52,11 +53,6 @@ class Imperfection:
     def is_perfect(self) -> bool:
         """Whether it changes nothing, in any case."""
         return not self.to_record()
-
-    @property
-    def text(self) -> str:
-        """What is imperfect, as it is written after an option; empty where nothing is."""
-        return ",".join(f"{name}={_in_words(value)}" for name, value in self.to_record().items())
 
     @property
     def ranged(self) -> tuple[str, ...]:
@@ -71,24 +67,22 @@ class Imperfection:
 
     @classmethod
     def parsed(cls, text: str, option: str) -> Self:
-        """Return the text of an option: "delay_s=0.3,noise_x_m=0..0.5".
+        """Return an imperfection from the text of an option.
 
-        Raises `UserError`, with the option's name, for what it does not have.
+        Args:
+            text: as in "delay_s=0.3,noise_x_m=0..0.5".
+            option: its name, for messages.
+
+        Raises:
+            UserError: a name is unknown, or a number is missing or wrong.
         """
-        known = [field.name for field in fields(cls)]  # type: ignore[arg-type]
-        parts = [part for part in map(str.strip, text.split(",")) if part]
-        if not parts:
-            raise UserError(f"{option} is empty: give NAME=NUMBER, with a name of {either(known)}")
+        known = list(cls.possible)
         values: dict[str, Amount] = {}
-        for part in parts:
-            name, equals, number = part.partition("=")
-            if name not in known:
-                hint = meant(name, known) or f"choose from {', '.join(known)}"
-                raise UserError(f"{option}: {name!r:.60} is unknown: {hint.strip()}")
-            if name in values:
-                raise UserError(f"{option}: {name} is given twice")
-            if not equals:
-                raise UserError(f"{option}: {name} has no number: give {name}=NUMBER")
+        for part in text.split(","):
+            name, _, number = part.strip().partition("=")
+            if name not in known or name in values:
+                hint = meant(name, known) or f"give NAME=NUMBER, with a name of {either(known)}"
+                raise UserError(f"{option}: {name!r:.60} is unknown or given twice: {hint.strip()}")
             low, dots, high = number.partition("..")
             try:
                 values[name] = (float(low), float(high)) if dots else float(low)
@@ -102,11 +96,6 @@ class Imperfection:
             raise UserError(f"{option}: {error}") from error
 
 
-def _in_words(value: Amount) -> str:
-    """Return a number or a range as it is written after an option."""
-    return "..".join(f"{x:g}" for x in (value if isinstance(value, tuple) else (value,)))
-
-
 Kind = TypeVar("Kind", bound=Imperfection)
 
 
@@ -115,13 +104,22 @@ class Sensing(Imperfection):
     """How the VUT senses the other cars; its own state it knows.
 
     Attributes:
-        delay_s: age of what it sees.
+        delay_s: age of the states that it sees.
         noise_x_m: standard deviation of the error of a position, drawn again in each step.
         noise_v_mps: standard deviation of the error of a speed.
         dropout: share of the steps in which nothing new arrives of a car; the last state is kept.
         range_m: a car farther away than this, between front bumpers, is not seen.
         occluded_until_m: no car is seen while the VUT is before this place.
     """
+
+    possible: ClassVar[dict[str, Bounds]] = {
+        "delay_s": (0.0, 5.0),
+        "noise_x_m": (0.0, 100.0),
+        "noise_v_mps": (0.0, 100.0),
+        "dropout": (0.0, 1.0),
+        "range_m": (1.0, 5000.0),
+        "occluded_until_m": (-5000.0, 2000.0),
+    }
 
     delay_s: Amount = 0.0
     noise_x_m: Amount = 0.0
@@ -147,23 +145,17 @@ class Actuation(Imperfection):
         power_w_per_kg: power over mass; above the speed P / (m a) it limits the acceleration.
     """
 
+    possible: ClassVar[dict[str, Bounds]] = {
+        "lag_s": (0.0, 5.0),
+        "delay_s": (0.0, 5.0),
+        "power_w_per_kg": (1.0, 1000.0),
+    }
+
     lag_s: Amount = 0.0
     delay_s: Amount = 0.0
     power_w_per_kg: Amount | None = None
 
 
-RANGES: dict[type, dict[str, Bounds]] = {
-    Sensing: {
-        "delay_s": (0.0, 5.0),
-        "noise_x_m": (0.0, 100.0),
-        "noise_v_mps": (0.0, 100.0),
-        "dropout": (0.0, 1.0),
-        "range_m": (1.0, 5000.0),
-        "occluded_until_m": (-5000.0, 2000.0),
-    },
-    Actuation: {"lag_s": (0.0, 5.0), "delay_s": (0.0, 5.0), "power_w_per_kg": (1.0, 1000.0)},
-}
-"""What the numbers can be, by field."""
 PERFECT_SENSING = Sensing()
 PERFECT_ACTUATION = Actuation()
 

@@ -1,8 +1,8 @@
-"""Scenarios as values: where vehicles start, what they can do, what is too near.
+"""Scenarios as values: starts and limits of the vehicles, and which gaps are too small.
 
 A `Scenario` is a merge from a ramp. Each path has its own coordinate: the distance of the front
 bumper along its lanes from the merge point M, in metres, negative before M. A case is a point of a
-scenario and knows which: drivers, rollout and score take what holds for it from the case. `US23` is
+scenario and holds it: drivers, rollout and score take its limits from the case. `US23` is
 the paper's: Wang et al., sections VI and VII and Table I.
 """
 
@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from msgspec import Meta
 
@@ -55,7 +55,7 @@ Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in 
 
 
 def level_name(level: int) -> str:
-    """Return a level as people write it."""
+    """Return the name of a level in texts."""
     return "own" if level == OWN else str(level)
 
 
@@ -70,39 +70,65 @@ def names_of_levels(asked: AnyLevels) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True)
-class Dimension:
-    """One continuous coordinate of the pool: the name of a `Case` field and its bounds."""
+class Coordinate:
+    """A coordinate of the pool: a field of `Case`, its notation and its bounds.
+
+    Attributes:
+        field: name of the field.
+        name: its name in texts.
+        unit: its unit.
+        digits: digits after the point.
+        symbol: its label in figures of the paper's scenario.
+        low: lower bound.
+        high: upper bound.
+    """
 
     field: str
-    low: float
-    high: float
-
-
-@dataclass(frozen=True, slots=True)
-class Notation:
-    """How people write a coordinate: name, unit, digits after the point, and in formulas."""
-
     name: str
     unit: str
     digits: int
-    symbol: str
+    symbol: str = ""
+    low: float = 0.0
+    high: float = 1.0
+
+    def of(self, case: Any) -> float | None:
+        """Return the value of a case; None where its level has no such coordinate."""
+        value: float | None = getattr(case, self.field)
+        return value
+
+    def share(self, case: Any) -> float:
+        """Return where a case is between the bounds, from 0 to 1; 0 where it has no value."""
+        return ((self.of(case) or self.low) - self.low) / (self.high - self.low)
+
+    def text(self, case: Any) -> str:
+        """Return the value of a case for a table; empty where there is none."""
+        value = self.of(case)
+        return "" if value is None else f"{value:.{self.digits}f}"
 
 
-COORDINATES = {
-    "sense_delay_s": Notation("sensing delay", "s", 2, "sensing delay (s)"),
-    "sense_noise_x_m": Notation("noise of x", "m", 2, "noise of $x$ (m)"),
-    "sense_noise_v_mps": Notation("noise of v", "m/s", 2, "noise of $v$ (m/s)"),
-    "sense_dropout": Notation("dropout", "", 2, "dropout"),
-    "sense_range_m": Notation("range", "m", 1, "range (m)"),
-    "sense_occluded_until_m": Notation("occluded until", "m", 1, "occluded until (m)"),
-    "act_lag_s": Notation("actuator lag", "s", 2, "actuator lag (s)"),
-    "act_delay_s": Notation("actuator delay", "s", 2, "actuator delay (s)"),
-    "act_power_w_per_kg": Notation("power", "W/kg", 1, "power (W/kg)"),
-}
-"""Coordinates of the pool, by the fields of a case: `SENSE` or `ACT`, and the field of those."""
-
-SVO = Dimension("svo_rad", 0.0, math.pi / 2)
+SVO = Coordinate("svo_rad", "psi", "rad", 2, "$\\psi$ (rad)", 0.0, math.pi / 2)
 """psi in [0, pi/2): the upper end itself is outside the pool."""
+IMPERFECTIONS = (
+    Coordinate("sense_delay_s", "sensing delay", "s", 2),
+    Coordinate("sense_noise_x_m", "noise of x", "m", 2),
+    Coordinate("sense_noise_v_mps", "noise of v", "m/s", 2),
+    Coordinate("sense_dropout", "dropout", "", 2),
+    Coordinate("sense_range_m", "range", "m", 1),
+    Coordinate("sense_occluded_until_m", "occluded until", "m", 1),
+    Coordinate("act_lag_s", "actuator lag", "s", 2),
+    Coordinate("act_delay_s", "actuator delay", "s", 2),
+    Coordinate("act_power_w_per_kg", "power", "W/kg", 1),
+)
+"""Numbers of `SENSE` or `ACT`, by the fields of a case."""
+COORDINATES = (
+    Coordinate("x_pov0_m", "x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
+    Coordinate("v_pov0_mps", "v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
+    Coordinate("v_vut0_mps", "v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
+    Coordinate("headway_ahead_s", "headway ahead", "s", 2),
+    Coordinate("headway_behind_s", "headway behind", "s", 2),
+    *IMPERFECTIONS,
+)
+"""Coordinates of the pool in order, without the SVO: a scenario has those with a range."""
 
 POV = 0
 VUT = 1
@@ -157,7 +183,7 @@ RANGES: dict[str, Bounds] = {
     "v_start_max_mps": _SPEED_MPS,
     "lane_m": (-2000.0, 2000.0),
 }
-"""What a road and its cars can have, by field: 360 km/h, 2 g, 5 km. Beyond, nothing is computed."""
+"""Possible numbers of a road and its cars, by field: up to 360 km/h, 2 g, 5 km."""
 
 V_VUT0_MPS = 18.0
 """Speed at which the paper's VUT starts."""
@@ -167,10 +193,15 @@ V_VUT0_MPS = 18.0
 class Scenario:
     """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
 
-    Raises `UserError` for numbers that make no scenario.
+    Raises `UserError` for impossible numbers.
+
+    Example:
+        >>> slow = dataclasses.replace(US23, name="slow", v_pov0_mps=(15.0, 25.0))
+        >>> slow.dimensions(0)[1].high
+        25.0
 
     Attributes:
-        name: how people call it.
+        name: its name.
         net: the SUMO net; None for the shipped one.
         x_vut0_m: where the VUT starts.
         v_vut0_mps: how fast the VUT is then, unless a campaign says otherwise: it is observed, not
@@ -205,21 +236,9 @@ class Scenario:
         headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
         lane_m: where the acceleration lane begins and ends, around M, which is where a merge is
             expected; None where M is the only place to merge.
-        lane_end: what the end of that lane does to a VUT that has not merged: "merge" moves it to
-            the mainline, "stop" brakes it to a stand before the end.
+        lane_end: the effect of the end of that lane on a VUT that has not merged: "merge" moves it
+            to the mainline, "stop" brakes it to a stand before the end.
     """
-
-    notation: ClassVar[Mapping[str, Notation]] = {
-        "x_pov0_m": Notation("x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
-        "v_pov0_mps": Notation("v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
-        "v_vut0_mps": Notation("v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
-        "headway_ahead_s": Notation("headway ahead", "s", 2, "headway ahead (s)"),
-        "headway_behind_s": Notation("headway behind", "s", 2, "headway behind (s)"),
-        **COORDINATES,
-        "svo_rad": Notation("psi", "rad", 2, "$\\psi$ (rad)"),
-    }
-    """The coordinates of the pool, in order: fields of a case. A field of the scenario of the same
-    name says by its range whether it is one; the SVO is one at level 2."""
 
     name: str = "us23"
     net: str | None = None
@@ -259,8 +278,6 @@ class Scenario:
         for name, (low, high) in RANGES.items():
             value = getattr(self, name)
             for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not math.isfinite(number):
-                    raise UserError(f"{name} is {value}: it must be finite")
                 if number is not None and not low <= number <= high:
                     raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
         for name, fits, wanted in self._checks():
@@ -269,12 +286,15 @@ class Scenario:
 
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
         """Yield (field, whether it fits with the others, what would)."""
-        x_m, v_mps, v_vut0 = self.x_pov0_m, self.v_pov0_mps, self.bounds("v_vut0_mps")
-        reach = f"metres before M, -{self.reach_m:g} to 0, low < high"
-        most = f"between 0 and {self.v_start_max_mps:g}"
-        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, reach
-        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1], "from 0 up, low < high"
-        yield "v_pov0_mps", v_mps[1] <= self.v_start_max_mps, most
+        x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
+        slow_mps, fast_mps = self.bounds("v_vut0_mps")
+        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
+        speeds = f"between 0 and {self.v_start_max_mps:g}, low < high"
+        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, before
+        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1] <= self.v_start_max_mps, speeds
+        is_range = slow_mps < fast_mps or not isinstance(self.v_vut0_mps, tuple)
+        fits = 0.0 <= slow_mps <= fast_mps <= self.v_start_max_mps
+        yield "v_vut0_mps", fits and is_range, speeds
         has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
         yield "headway_behind_s", has_both, "both headways, or none"
         shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
@@ -284,13 +304,10 @@ class Scenario:
             yield name, headway_s is None or shortest_s <= headway_s[0] < headway_s[1], apart
         near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
         yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
-        begin_m, end_m = self.lane_m or (0.0, 0.0)
+        begin_m, end_m = self.lane_m or (0.0, 1.0)
         around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
-        fits = self.lane_m is None or self.x_vut0_m <= begin_m <= 0.0 < end_m
-        yield "lane_m", fits, around
-        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, reach
-        yield "v_vut0_mps", 0.0 <= v_vut0[0] <= v_vut0[1] <= self.v_start_max_mps, most
-        yield "v_vut0_mps", self.v_vut0_mps != (v_vut0[0], v_vut0[0]), "low < high"
+        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, before
+        yield "lane_m", self.x_vut0_m <= begin_m <= 0.0 < end_m, around
         yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
         for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
             yield name, getattr(self, name) > 0.0, "above 0"
@@ -299,12 +316,12 @@ class Scenario:
         yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
 
     def to_record(self) -> dict[str, Any]:
-        """Return the scenario as JSON keeps it; what is perfect, or of no lane, is left out."""
+        """Return the scenario as JSON keeps it, without perfect sensing and without a lane."""
         record = asdict(self)
         for name, imperfection in ((SENSE, self.sense), (ACT, self.act)):
             del record[name]
-            if not imperfection.is_perfect:
-                record[name] = imperfection.to_record()
+            if imperfect := imperfection.to_record():
+                record[name] = imperfect
         if self.lane_m is None:
             del record["lane_m"], record["lane_end"]
         return record
@@ -325,13 +342,13 @@ class Scenario:
         return "M" if self.lane_m is None else "the merge"
 
     def said(self, text: str) -> str:
-        """Return a text of this package, written with M, as it is true of this scenario."""
+        """Return a text with M, where M is only expected with "the merge" in its place."""
         if self.lane_m is None:
             return text
         return re.sub(r"\bM\b", self.place, text)
 
     def bounds(self, name: str) -> Bounds:
-        """Return the bounds of a number that may be a range; twice the number where it is none."""
+        """Return the bounds of a number that may be a range: both are the number if it is not."""
         value = getattr(self, name)
         return value if isinstance(value, tuple) else (value, value)
 
@@ -363,31 +380,31 @@ class Scenario:
         ahead_m = self.reach_m if self.vehicles > 2 else 0.0
         return max(far_m, ROOM_AFTER_M) + ahead_m
 
-    def dimensions(self, level: int) -> tuple[Dimension, ...]:
+    def dimensions(self, level: int) -> tuple[Coordinate, ...]:
         """Return the continuous coordinates of the pool at a level: those that have a range.
 
         At level 2 the POV's orientation is the last one.
         """
         ranges = []
-        for name in self.notation:
-            owner, field = self, name
-            if name in COORDINATES:
-                part, _, field = name.partition("_")
+        for coordinate in COORDINATES:
+            owner, field = self, coordinate.field
+            if coordinate in IMPERFECTIONS:
+                part, _, field = field.partition("_")
                 owner = getattr(self, part)
-            value = getattr(owner, field, None)
+            value = getattr(owner, field)
             if isinstance(value, tuple):
-                ranges.append(Dimension(name, *value))
+                ranges.append(replace(coordinate, low=value[0], high=value[1]))
         return (*ranges, SVO) if level == 2 else tuple(ranges)
 
     @property
     def imperfect_fields(self) -> tuple[str, ...]:
         """Fields of a case that are ranges of `sense` and `act`."""
-        sensed = [f"{SENSE}_{field}" for field in self.sense.ranged]
-        return (*sensed, *(f"{ACT}_{field}" for field in self.act.ranged))
+        fields = (coordinate.field for coordinate in self.dimensions(0))
+        return tuple(field for field in fields if field.startswith((SENSE, ACT)))
 
     @property
     def case_fields(self) -> tuple[str, ...]:
-        """Fields of a case besides its level that say where it is in the scenario."""
+        """Fields of a case, without its level, that are its place in the scenario."""
         headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
         own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
         return (*own, *headways, *self.imperfect_fields)
@@ -408,11 +425,11 @@ US23 = Scenario()
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """How large a scenario is next to the paper's, of which all units are 1.
+    """The size of a scenario relative to the paper's, of which all units are 1.
 
-    A driver that measures in these units sees the same numbers in merges that are alike. Where
-    lengths, speeds and accelerations are all the same multiple of the paper's, all else is equal,
-    to the last bit if that is a power of two.
+    A driver that measures in these units sees the same numbers in similar merges. Where lengths,
+    speeds and accelerations are all the same multiple of the paper's, all else is equal, to the
+    last bit if that is a power of two.
     """
 
     length: float  # of the way of the VUT to M

@@ -1,7 +1,7 @@
 """Signals: named numbers and words that a controller leaves for each step, such as its mode.
 
-They decide nothing. They are kept with the motion of a case, drawn next to it, and exported. Names
-and words come from the user's code: they are bounded, and made printable.
+They are kept with the motion of a case, drawn next to it, and exported. Names and words come from
+the user's code: they are bounded, and made printable.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.printable import printable
 
 Left = dict[str, float | str]
-"""What is left at one step, by name."""
+"""Values of one step, by name."""
 Signals = dict[str, tuple[float | str | None, ...]]
 """By name, a value for each row of the motion of a case; None where none was left."""
 
 MOST_NAMES = 8
-"""Signals of a case; what else is left is dropped."""
+"""Number of signals of a case; others are dropped."""
 CHARACTERS = 40
 """Of a name, and of a word."""
 
@@ -90,7 +90,7 @@ SignalRuns = Annotated[
     dict[str, tuple[tuple[Annotated[int, Meta(ge=1)], float | str | None], ...]],
     Meta(min_length=1, max_length=MOST_NAMES),
 ]
-"""What `to_record` returns, as JSON has it."""
+"""The result of `to_record`, as JSON has it."""
 
 
 def from_runs(runs: SignalRuns, rows: int) -> Signals:

@@ -1,4 +1,4 @@
-"""What happened in one episode."""
+"""The motion of all vehicles in one episode."""
 
 from __future__ import annotations
 
@@ -54,13 +54,15 @@ class Trajectory:
     vehicles POV, VUT and, in traffic, the cars ahead of and behind the POV; their x, v and a in m,
     m/s and m/s2. The acceleration of a step acts from it to the next; it is 0 in the last one.
 
-    `end` is MERGED whenever the VUT arrived at M: how near the bodies came is its severity
-    (`severity.py`), and whether that is a failure is the criterion's. `error` says what the VUT or
-    the simulation did wrong, in a case that MERGED after M. `clipped_steps` counts the answers of
-    the VUT that were outside the limits of acceleration and were clipped. `after` is the motion
-    after M where the scenario has it followed up, its first row that of the merge. `signals` are
-    what the VUT left for each row of both, where it left any. `in_vain` names the commands of the
-    VUT that were accepted, and changed nothing.
+    Attributes:
+        case: the case.
+        motion: up to M.
+        end: MERGED whenever the VUT arrived at M, also after a contact.
+        error: the fault of the VUT or of the simulation; after M in a case that MERGED.
+        clipped_steps: number of answers of the VUT that were clipped to its limits.
+        after: the motion after M where the scenario has a follow-up, from the row of the merge on.
+        signals: those of the VUT for each row of both.
+        in_vain: commands of the VUT that were accepted, and changed nothing.
     """
 
     case: Case

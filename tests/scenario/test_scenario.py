@@ -49,7 +49,7 @@ class TestAFile:
             ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': did you mean x_pov0_m"),
             ("v_vut0_mps = 99", "v_vut0_mps is 99.0: choose between 0 and 45"),
-            ("v_vut0_mps = nan", "v_vut0_mps is nan: it must be finite"),
+            ("v_vut0_mps = nan", "v_vut0_mps is nan: choose 0 to 100"),
             ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose -20 to 0"),
             ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
