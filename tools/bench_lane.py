@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 from measuring import append_record, benchmark_parser
 
+from merge_sumo.drivers import lane
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
@@ -104,7 +105,7 @@ def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
         pov = LanePov(Level0Pov(len(cases)))
-        pov.follow_mps2 = follow  # type: ignore[assignment]
+        lane.acc_mps2 = follow  # type: ignore[assignment]
         merges = played(cases, pov, MergesAt(len(cases), 0.0))
         easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]
         hard = [one for one in easy if one.after is not None and one.after[:, 0, 2].min() < -3.0]

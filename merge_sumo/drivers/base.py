@@ -52,21 +52,17 @@ class Scene(NamedTuple):
     @property
     def x_vut_m(self) -> FloatArray:
         """Positions of the VUT, (K,)."""
-        x_m: FloatArray = self.x_m[VUT]
-        return x_m
+        return np.asarray(self.x_m[VUT])
 
     @property
     def v_vut_mps(self) -> FloatArray:
         """Speeds of the VUT, (K,)."""
-        v_mps: FloatArray = self.v_mps[VUT]
-        return v_mps
+        return np.asarray(self.v_mps[VUT])
 
     def _facing_of(self, values: FloatArray) -> FloatArray:
         if self.facing is None:
-            of_pov: FloatArray = values[POV]
-            return of_pov
-        faced: FloatArray = values[self.facing, np.arange(values.shape[1])]
-        return faced
+            return np.asarray(values[POV])
+        return values[self.facing, np.arange(values.shape[1])]
 
     def of_mainline(self) -> Scene:
         """Return the scene for the driver of all C cars of the mainline.

@@ -34,8 +34,7 @@ def safe_speed_mps(
     """
     lag = decel_mps2 * tau_s
     room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
-    speed: FloatArray = np.sqrt(lag * lag + v_leader_mps * v_leader_mps + room) - lag
-    return speed
+    return np.sqrt(lag * lag + v_leader_mps * v_leader_mps + room) - lag
 
 
 def keep_safe(a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> None:
@@ -68,5 +67,4 @@ def car_met(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[n
     distance_m = np.maximum(-x_m[VUT], 0.0)
     gaps_m = np.abs(x_m + v_mps * level0_time_to(distance_m, v_mps[VUT], scenario))
     gaps_m[VUT] = np.inf
-    met: NDArray[np.int64] = gaps_m.argmin(axis=0)
-    return met
+    return np.asarray(gaps_m.argmin(axis=0))

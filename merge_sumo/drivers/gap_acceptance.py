@@ -66,8 +66,7 @@ class GapAcceptanceVut(Level0Vut):
         self._goes |= (later_s >= design.lead_s) | (later_s <= -design.lag_s)
         self._goes |= needed > -self.scenario.a_min_mps2
         waits = np.where(needed >= design.brake_mps2, -needed, 0.0)
-        answer: FloatArray = np.where(self._goes, super().act(scene), waits)
-        return answer
+        return np.where(self._goes, super().act(scene), waits)
 
 
 VUTS = {"roundabout": BuiltInVut(GapAcceptanceVut, ROUNDABOUT)}

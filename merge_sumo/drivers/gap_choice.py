@@ -88,8 +88,7 @@ class GapChoiceVut(Level0Vut):
         behind = x_m[VUT] - self.scenario.vut_length_m - x_m >= headway_s * v_mps
         suffices = np.where(x_m >= x_m[VUT], ahead, behind)
         suffices[VUT] = True
-        accepted: NDArray[np.bool_] = suffices.all(axis=0)
-        return accepted
+        return np.asarray(suffices.all(axis=0))
 
     def _following_mps2(self, scene: Scene) -> FloatArray:
         """Return the acceleration of ACC behind the car ahead, (K,)."""

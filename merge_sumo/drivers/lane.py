@@ -42,8 +42,7 @@ def idm_mps2(
     closing = v_mps * (v_mps - v_leader_mps) / (2.0 * np.sqrt(A_MPS2 * B_MPS2))
     wanted_m = 2.0 + np.maximum(v_mps * 1.0 + closing, 0.0)
     free = 1.0 - (v_mps / np.maximum(v_desired_mps, 0.1)) ** 4
-    acceleration: FloatArray = A_MPS2 * (free - (wanted_m / gap_m) ** 2)
-    return acceleration
+    return np.asarray(A_MPS2 * (free - (wanted_m / gap_m) ** 2))
 
 
 def acc_mps2(
@@ -117,8 +116,7 @@ def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
     By eq. (4) braking at b from a speed v takes v^2 / (2 b) + v dt / 2.
     """
     half = 0.5 * brake_mps2 * DT_S
-    speed: FloatArray = np.sqrt(half**2 + 2.0 * brake_mps2 * np.maximum(room_m, 0.0)) - half
-    return speed
+    return np.sqrt(half**2 + 2.0 * brake_mps2 * np.maximum(room_m, 0.0)) - half
 
 
 class LanePov(DriverWrapper):
@@ -129,9 +127,6 @@ class LanePov(DriverWrapper):
     every car does so, and a car behind the VUT follows it no closer than ACC. A POV of the user
     decides for itself until the merge.
     """
-
-    follow_mps2 = staticmethod(acc_mps2)
-    """Model by which a car follows a VUT that has merged."""
 
     def __init__(self, driver: Driver) -> None:
         """Take the driver of all cars."""
@@ -164,7 +159,7 @@ class LanePov(DriverWrapper):
         if follows.any():
             gap_m = x_vut - self.scenario.vut_length_m - x_pov
             a_vut = (v_vut - self._v_vut_mps) / DT_S
-            most = self.follow_mps2(gap_m, v_pov, v_vut, a_vut, self._v_first_mps)
+            most = acc_mps2(gap_m, v_pov, v_vut, a_vut, self._v_first_mps)
             answer = np.where(follows, np.minimum(answer, most), answer)
         self._v_vut_mps = v_vut.copy()
         return answer
@@ -190,8 +185,7 @@ class Merging:
     @property
     def driven_for(self) -> NDArray[np.bool_]:
         """Which VUTs have merged without any merge request, (K,): they are driven for."""
-        only_accelerate: NDArray[np.bool_] = self.merged & ~self._states_wishes
-        return only_accelerate
+        return self.merged & ~self._states_wishes
 
     def begin(self, corridor: int) -> None:
         """Begin an episode in a corridor: the VUT is on the ramp."""

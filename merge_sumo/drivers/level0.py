@@ -34,8 +34,7 @@ def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scen
     v_squared = v_start * v_start
     v_end = np.minimum(np.sqrt(v_squared + twice_a * distance_m), v_cruise - lag)
     run_up = (v_end * v_end - v_squared) / twice_a
-    time: FloatArray = (v_end - v_start) / a_mps2 + (distance_m - run_up) / v_cruise
-    return time
+    return (v_end - v_start) / a_mps2 + (distance_m - run_up) / v_cruise
 
 
 class Level0Pov(Driver):

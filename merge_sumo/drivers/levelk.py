@@ -194,12 +194,20 @@ class QNetwork:
             fits = weight.ndim == 2 and weight.size and weight.shape == (*bias.shape, *inputs)
             if not fits or weight.dtype.kind != "f" or bias.dtype.kind != "f":
                 raise ValueError(
-                    f"{i}.weight is {weight.shape} of {weight.dtype} and {i}.bias {bias.shape} of "
-                    f"{bias.dtype}, behind {inputs}: they must be floats, (outputs, inputs) and "
-                    "(outputs,), of which the next layer takes the outputs"
+                    f"{i}.weight is {weight.shape} of {weight.dtype}, and {i}.bias is {bias.shape} "
+                    f"of {bias.dtype}: they must be floats, (outputs, inputs) and (outputs,)"
                 )
+            with np.errstate(over="ignore"):
+                largest = (np.abs(weight).max() + np.abs(bias).max()).astype(np.float32)
+            if not np.isfinite(largest):
+                raise ValueError("a weight is NaN, infinite or beyond float32")
             inputs = bias.shape
-        return cls(layers, float(tensors[LIMIT].item()) if LIMIT in tensors else None)
+        if LIMIT not in tensors:
+            return cls(layers)
+        limit_mps2 = float(tensors[LIMIT].item())
+        if not -20.0 <= limit_mps2 < 0.0:
+            raise ValueError("its limit of braking is not from -20 to below 0 m/s2")
+        return cls(layers, limit_mps2)
 
     def limited(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the limit of braking of the network, if it brakes less hard.
@@ -226,8 +234,7 @@ class QNetwork:
         with np.errstate(over="ignore", invalid="ignore"):
             for of_hidden, bias_of_hidden in self.layers[:-1]:
                 hidden = np.maximum(np.matmul(of_hidden, hidden) + bias_of_hidden[:, None], 0.0)
-            values: FloatArray = (np.matmul(weight, hidden) + bias[:, None])[..., 0]
-        return values
+            return np.asarray((np.matmul(weight, hidden) + bias[:, None])[..., 0])
 
     def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
         """Return Q, (n, actions), in float32 by products of whole matrices.

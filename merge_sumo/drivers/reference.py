@@ -57,16 +57,14 @@ class Plan(NamedTuple):
 
     Attributes:
         t_s: time at which the VUT is at M; infinite where it never is.
-        gap_m: |dx| less `dx_crash_m`.
+        pair: the rear and the front vehicle at M; their gap is |dx| less `dx_crash_m`.
         is_rear: whether the VUT is the rear vehicle.
         conflict: whether the gap is negative or unsafe under the model.
     """
 
     t_s: FloatArray
-    gap_m: FloatArray
+    pair: Pair
     is_rear: Flags
-    v_rear_mps: FloatArray
-    v_front_mps: FloatArray
     conflict: Flags
 
 
@@ -79,10 +77,8 @@ class RampDriver(Level0Vut):
         super().__init__(corridors)
         self._reacts = np.zeros(corridors, dtype=np.bool_)
         """Whether the driver has left phase 1."""
-        self._delay_steps = np.zeros(corridors, dtype=np.int64)
-        """Steps of phase 2 that are left."""
-        self._conflict_steps = np.zeros(corridors, dtype=np.int64)
-        """Steps for which a conflict has been predicted without a break."""
+        self._delay_steps, self._conflict_steps = np.zeros((2, corridors), dtype=np.int64)
+        """Steps of phase 2 that are left, and steps of the present conflict of P0."""
         self._braking_mps2 = np.zeros(corridors)
 
     def begin(self, corridor: int, case: Case) -> None:
@@ -109,9 +105,8 @@ class RampDriver(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,)."""
         calm = super().act(scene)
-        v_mps, distance_m = scene.v_vut_mps, np.maximum(-scene.x_vut_m, 0.0)
+        v_mps, distance_m, scenario = scene.v_vut_mps, _distance_m(scene), self.scenario
         # P0: the VUT takes the level-0 profile.
-        scenario = self.scenario
         t_s = level0_time_to(distance_m, v_mps, scenario)
         most_mps = np.maximum(v_mps, scenario.level0_v_mps)
         nominal = self._plan(scene, t_s, np.minimum(v_mps + scenario.level0_a_mps2 * t_s, most_mps))
@@ -130,8 +125,7 @@ class RampDriver(Level0Vut):
         released = np.where(waits, self.model.released_mps2, 0.0)
         self._braking_mps2 = np.where(brakes, np.minimum(harder, most), released)
         answer: FloatArray = np.where(acts & ~present.conflict, 0.0, calm)
-        if self.model.released_mps2 > 0.0:
-            answer = np.where(waits, -self.model.released_mps2, answer)
+        answer = np.where(waits & (released > 0.0), -released, answer)
         return np.where(brakes, -self._braking_mps2, answer)
 
     def _start(self, scene: Scene, nominal: Plan) -> None:
@@ -142,8 +136,6 @@ class RampDriver(Level0Vut):
         missing = np.maximum(model.perception_steps - (self._conflict_steps - 1), 0)
         left_s = model.delay_s + missing * DT_S
         due = conflict & ~self._reacts & self.is_due(scene, nominal)
-        if not due.any():
-            return
         due &= nominal.is_rear | self._can_fall_behind(scene, left_s, self.limit_mps2)
         self._reacts |= due
         self._delay_steps = np.where(due, model.delay_steps + missing, self._delay_steps)
@@ -155,11 +147,9 @@ class RampDriver(Level0Vut):
         is_rear = dx_m >= 0.0
         gap_m = np.where(arrives, np.abs(dx_m) - self.scenario.dx_crash_m, np.inf)
         v_rear = np.where(is_rear, v_vut_mps, v_pov_mps)
-        v_front = np.where(is_rear, v_pov_mps, v_vut_mps)
-        pair = Pair(gap_m, v_rear, v_front)
+        pair = Pair(gap_m, v_rear, np.where(is_rear, v_pov_mps, v_vut_mps))
         unsafe = np.where(is_rear, self.model.is_unsafe(pair), self.model.endangers(pair))
-        conflict = arrives & ((gap_m < 0.0) | unsafe)
-        return Plan(t_s, gap_m, is_rear, v_rear, v_front, conflict)
+        return Plan(t_s, pair, is_rear, arrives & ((gap_m < 0.0) | unsafe))
 
     def _can_fall_behind(
         self, scene: Scene, delay_s: FloatArray | float, limit_mps2: float
@@ -171,8 +161,7 @@ class RampDriver(Level0Vut):
             delay_s: time in which the VUT keeps its speed, (K,) or one.
             limit_mps2: its deceleration from then on.
         """
-        v_mps = scene.v_vut_mps
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        v_mps, distance_m = scene.v_vut_mps, _distance_m(scene)
         room_m = distance_m - v_mps * delay_s
         left = v_mps * v_mps - 2.0 * limit_mps2 * room_m
         t_s = delay_s + (v_mps - np.sqrt(np.maximum(left, 0.0))) / limit_mps2
@@ -181,8 +170,8 @@ class RampDriver(Level0Vut):
         return stops | (_x_pov_m(scene) + scene.v_pov_mps * t_s >= self.scenario.dx_crash_m)
 
     def _demand_mps2(self, scene: Scene, present: Plan) -> FloatArray:
-        """Return the deceleration that the model asks for in P1, (K,)."""
-        return self.model.demand_mps2(Pair(present.gap_m, present.v_rear_mps, present.v_front_mps))
+        """Return the deceleration that the model demands in P1, (K,)."""
+        return self.model.demand_mps2(present.pair)
 
 
 class CarefulVut(RampDriver):
@@ -192,8 +181,7 @@ class CarefulVut(RampDriver):
 
     def is_due(self, scene: Scene, nominal: Plan) -> Flags:
         """Return whether the times to M and from there to the collision are below 2 s together."""
-        times_s = ttc_s(nominal.gap_m, nominal.v_rear_mps, nominal.v_front_mps)
-        return nominal.t_s + times_s < self.model.critical_ttc_s
+        return nominal.t_s + ttc_s(*nominal.pair[:3]) < self.model.critical_ttc_s
 
 
 class FsmVut(RampDriver):
@@ -211,7 +199,7 @@ class FsmVut(RampDriver):
         enough = self._can_fall_behind(scene, 0.0, comfortable)
         overlap = np.where(enough, self.model.comfortable_mps2, self.model.hardest_mps2)
         demand = super()._demand_mps2(scene, present)
-        return np.where(present.gap_m < 0.0, overlap, demand)
+        return np.where(present.pair.gap_m < 0.0, overlap, demand)
 
 
 class Reg157Vut(RampDriver):
@@ -223,9 +211,7 @@ class Reg157Vut(RampDriver):
         """Return whether the delay and braking at the limit take all of the distance to M."""
         v_mps = scene.v_vut_mps
         stop_m = v_mps * v_mps / (2.0 * self.limit_mps2)
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
-        due: Flags = distance_m <= self.model.delay_s * v_mps + stop_m
-        return due
+        return _distance_m(scene) <= self.model.delay_s * v_mps + stop_m
 
 
 class RssVut(RampDriver):
@@ -238,13 +224,10 @@ class RssVut(RampDriver):
 
         Half of the time in which the deceleration grows counts as delay.
         """
-        v_mps, limit_mps2 = scene.v_vut_mps, self.limit_mps2
+        limit_mps2 = self.limit_mps2
         delay_s = self.model.delay_s + 0.5 * limit_mps2 / JERK_MPS3
-        standing = np.zeros(self.corridors)
         limits = delay_s, self.scenario.a_max_mps2, limit_mps2, limit_mps2
-        stops_m = rss_distance_m(v_mps, standing, *limits)
-        due: Flags = np.maximum(-scene.x_vut_m, 0.0) < stops_m
-        return due
+        return _distance_m(scene) < rss_distance_m(scene.v_vut_mps, 0.0, *limits)
 
 
 class CarefulPov(Driver):
@@ -268,8 +251,7 @@ class CarefulPov(Driver):
         """Return the acceleration of the POV in each corridor, (K,)."""
         v_vut, v_pov, crash_m = scene.v_vut_mps, scene.v_pov_mps, self.scenario.dx_crash_m
         limit_mps2 = min(-self.scenario.a_min_mps2, CarefulModel.hardest_mps2)
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
-        t_s = distance_m / np.maximum(v_vut, SLOWEST_MPS)
+        t_s = _distance_m(scene) / np.maximum(v_vut, SLOWEST_MPS)
         dx_m = _x_pov_m(scene) + v_pov * t_s
         collides_s = t_s + ttc_s(-dx_m - crash_m, v_pov, v_vut)
         ahead = (scene.x_vut_m > scene.x_pov_m) & (dx_m < crash_m)
@@ -277,10 +259,14 @@ class CarefulPov(Driver):
         return self._reaction.acceleration_mps2(unsafe, limit_mps2)
 
 
+def _distance_m(scene: Scene) -> FloatArray:
+    """Return the distance of the VUT to M, (K,); 0 after M."""
+    return np.maximum(-scene.x_vut_m, 0.0)
+
+
 def _x_pov_m(scene: Scene) -> FloatArray:
     """Return the position of the POV, (K,); after M relative to the VUT."""
-    x_m: FloatArray = scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
-    return x_m
+    return scene.x_pov_m - np.maximum(scene.x_vut_m, 0.0)
 
 
 REFERENCES: dict[str, type[RampDriver]] = {

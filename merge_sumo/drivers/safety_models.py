@@ -124,9 +124,7 @@ class RssModel(SafetyModel):
     def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether the gap is shorter than the safe distance."""
         limits = self.delay_s, self.accel_mps2, self.brake_mps2, self.brake_mps2
-        safe_m = rss_distance_m(pair.v_rear_mps, pair.v_front_mps, *limits)
-        unsafe: Flags = pair.gap_m < safe_m
-        return unsafe
+        return pair.gap_m < rss_distance_m(pair.v_rear_mps, pair.v_front_mps, *limits)
 
 
 class FsmModel(SafetyModel):
@@ -142,21 +140,17 @@ class FsmModel(SafetyModel):
 
     def is_unsafe(self, pair: Pair) -> Flags:
         """Return whether one of the two metrics is above 0."""
-        unsafe: Flags = self.cfs(pair) + self.pfs(pair) > 0.0
-        return unsafe
+        return self.cfs(pair) + self.pfs(pair) > 0.0
 
     def endangers(self, pair: Pair) -> Flags:
         """Return whether CFS is above 0: the precaution (PFS) is the rear vehicle's."""
-        unsafe: Flags = self.cfs(pair) > 0.0
-        return unsafe
+        return self.cfs(pair) > 0.0
 
     def demand_mps2(self, pair: Pair) -> FloatArray:
         """Return the deceleration that follows from the metrics."""
-        critical, proactive = self.cfs(pair), self.pfs(pair)
-        comfortable = self.comfortable_mps2
+        critical, comfortable = self.cfs(pair), self.comfortable_mps2
         hard = comfortable + (self.hardest_mps2 - comfortable) * critical
-        demand: FloatArray = np.where(critical > 0.0, hard, comfortable * proactive)
-        return demand
+        return np.where(critical > 0.0, hard, comfortable * self.pfs(pair))
 
     def pfs(self, pair: Pair) -> FloatArray:
         """Return the proactive fuzzy metric, 0 (safe) to 1: the leader may brake by 7 m/s2.
@@ -185,16 +179,13 @@ class FsmModel(SafetyModel):
         after = v_rear_mps + self.delay_s * a - v_front_mps
         approach_m = (v_rear_mps + 0.5 * a * self.delay_s - v_front_mps) * self.delay_s
         stop = after * after / 2.0
-        safe_m, unsafe_m = (
-            approach_m + stop / b for b in (self.comfortable_mps2, self.hardest_mps2)
-        )
-        found = _between(gap_m, safe_m, unsafe_m)
+        safe_m = approach_m + stop / self.comfortable_mps2
+        found = _between(gap_m, safe_m, approach_m + stop / self.hardest_mps2)
         closing = v_rear_mps - v_front_mps
         # Only a vehicle that brakes gets slower than the leader within the delay.
         slowing = np.maximum(2.0 * np.abs(a_rear_mps2), 1e-12)
         slower = np.where(gap_m < closing * closing / slowing, 1.0, 0.0)
-        metric: FloatArray = np.where(after < 0.0, slower, found)
-        return np.where(closing > 0.0, metric, 0.0)
+        return np.where(closing > 0.0, np.where(after < 0.0, slower, found), 0.0)
 
 
 def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
@@ -207,17 +198,16 @@ def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) ->
     """
     closing = v_rear_mps - v_front_mps
     times = np.where(closing > 0.0, gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
-    found: FloatArray = np.where(gap_m <= 0.0, 0.0, times)
-    return found
+    return np.where(gap_m <= 0.0, 0.0, times)
 
 
 def rss_distance_m(
     v_rear_mps: FloatArray,
-    v_front_mps: FloatArray,
-    response_s: FloatArray | float,
-    accel_mps2: FloatArray | float,
-    brake_min_mps2: FloatArray | float,
-    brake_max_mps2: FloatArray | float,
+    v_front_mps: FloatArray | float,
+    response_s: float,
+    accel_mps2: float,
+    brake_min_mps2: float,
+    brake_max_mps2: float,
 ) -> FloatArray:
     """Return the safe distance of RSS, (K,): the rear one accelerates for the response time.
 
@@ -225,7 +215,7 @@ def rss_distance_m(
 
     Args:
         v_rear_mps: speeds of the rear vehicle v_r, (K,).
-        v_front_mps: speeds of the front vehicle v_f, (K,).
+        v_front_mps: speeds of the front vehicle v_f, (K,) or one.
         response_s: response time rho.
         accel_mps2: acceleration a of the rear vehicle in that time.
         brake_min_mps2: its least braking b_min after that, positive.
@@ -234,17 +224,14 @@ def rss_distance_m(
     fastest = v_rear_mps + response_s * accel_mps2
     stops_m = v_rear_mps * response_s + 0.5 * accel_mps2 * response_s**2
     stops_m = stops_m + fastest * fastest / (2.0 * brake_min_mps2)
-    safe_m: FloatArray = np.maximum(
-        stops_m - v_front_mps * v_front_mps / (2.0 * brake_max_mps2), 0.0
-    )
-    return safe_m
+    front_m = v_front_mps * v_front_mps / (2.0 * brake_max_mps2)
+    return np.maximum(stops_m - front_m, 0.0)
 
 
 def _between(gap_m: FloatArray, safe_m: FloatArray, unsafe_m: FloatArray) -> FloatArray:
     """Return 1 up to the unsafe distance, 0 from the safe one on, and linear between."""
     width = np.maximum(safe_m - unsafe_m, 1e-12)
-    found: FloatArray = np.clip((safe_m - gap_m) / width, 0.0, 1.0)
-    return found
+    return np.clip((safe_m - gap_m) / width, 0.0, 1.0)
 
 
 class Reaction:

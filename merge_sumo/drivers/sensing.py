@@ -27,11 +27,7 @@ class _Sensors:
     """
 
     def __init__(self, case: Case) -> None:
-        """Measure the start, and the steps before it, in which all keep their first speeds.
-
-        Args:
-            case: has the sensors and the seed of their random numbers.
-        """
+        """Measure the start, and the steps before it, in which all keep their first speeds."""
         scenario, sense = case.scenario, case.sensing
         self._before = whole_steps(scenario.sense.at_most("delay_s"))[0] + 1
         self._far_m = far_m(scenario)
@@ -42,13 +38,9 @@ class _Sensors:
         self._dropout, self._range_m = sense.at_most("dropout"), sense.at_most("range_m")
         self._occluded_until_m = sense.at_most("occluded_until_m", -np.inf)
         steps = scenario.max_steps + round(scenario.follow_up_s / DT_S) + self._before + 1
-        cars = scenario.vehicles
-        if scenario.sense.is_random:
-            rng = np.random.default_rng([26, case.seed])  # a stream of its own
-            self._errors = rng.standard_normal((steps, 2, cars))
-            self._arrives = rng.random((steps, cars))
-        else:
-            self._errors, self._arrives = np.zeros((1, 2, cars)), np.zeros((1, cars))
+        rng = np.random.default_rng([26, case.seed])  # a stream of its own
+        self._errors = rng.standard_normal((steps, 2, scenario.vehicles))
+        self._arrives = rng.random((steps, scenario.vehicles))
         self._measured: list[FloatArray] = []
         x_m, v_mps = np.array(case.starts()).T
         for step in range(-self._before, 1):
@@ -59,14 +51,13 @@ class _Sensors:
         """Measure a state, with NaN for hidden cars."""
         row = step + self._before
         del self._measured[row:]  # the start is measured again as the first step
-        random = min(row, len(self._errors) - 1)
-        seen = state + self._noise * self._errors[random]
+        seen = state + self._noise * self._errors[row]
         seen[V] = np.maximum(seen[V], 0.0)
         hidden = np.abs(state[X] - state[X, VUT]) > self._range_m
         hidden |= state[X, VUT] < self._occluded_until_m
         seen[:, hidden] = np.nan
         if row > 0:  # before, nothing has arrived that could stay
-            lost = self._arrives[random] < self._dropout
+            lost = self._arrives[row] < self._dropout
             seen = np.where(lost, self._measured[-1], seen)
         self._measured.append(seen)
 

@@ -107,7 +107,7 @@ class Rollout:
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, tuple[End, str]] = {}
         self.raised: str | None = None
-        """What the VUT raised instead of its last answer."""
+        """Error that the VUT raised instead of its last answer."""
         self.timeout_at = np.full(corridors, NEVER)
         """Rows of the record at which episodes time out."""
         # One row per step of the world: x, v, a of every vehicle.

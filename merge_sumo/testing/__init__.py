@@ -1,4 +1,4 @@
-"""What tests of others use: assertions on a controller, and contracts of what extends the tool."""
+"""For tests of users: assertions on a controller, and contracts of extensions."""
 
 from merge_sumo.testing.assertions import assert_no_failures
 from merge_sumo.testing.contracts import MeasureContract, SamplerContract, VutContract

@@ -44,7 +44,7 @@ def _message(run: CampaignRun, seed: int) -> str | None:
 
 
 def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
-    """Return which case to look at, and how."""
+    """Return lines on a case, and the commands that show it."""
     case, index = outcome.case, outcome.index
     return [
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",

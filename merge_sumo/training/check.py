@@ -103,12 +103,15 @@ def check_policy(
     points = np.random.default_rng(20_201).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
-    is_pov = role == "pov"
-    trajectories = _play(cases, *((name, other) if is_pov else (other, name)), folder)
+    if role == "pov":
+        trajectories = _play(cases, name, other, folder)
+        without = _play(cases, "level0", other, folder)
+    else:
+        trajectories = _play(cases, other, name, folder)
+        without = _play(cases, other, "level0", folder)
     reached = returns_of(trajectories, reward).of(role, svo_rad)
+    level0 = returns_of(without, reward).of(role, svo_rad)
     collided = np.array([is_close(one) for one in trajectories])
-    unmoved = _play(cases, *(("level0", other) if is_pov else (other, "level0")), folder)
-    level0 = returns_of(unmoved, reward).of(role, svo_rad)
     network = load_network(name, folder)
     opponent = None if other == "level0" else load_network(other, folder)
     game = Game(role, opponent, reward, network.a_min_mps2)

@@ -1,11 +1,11 @@
 """Double deep Q-learning (van Hasselt et al., 2016) of one level-k driver; read top to bottom.
 
-What differs from the textbook, and why:
+Differences from the textbook:
 
 - Targets are squashed by an increasing function, the identity above -2 and logarithmic below. The
   game is deterministic, so that does not change which action is best, and the crash term no longer
   drowns the rest.
-- The target network follows by Polyak averaging, and that average is what is kept.
+- The target network follows by Polyak averaging, and that average is the result.
 - Exploring starts (`game.exploring_starts`).
 - psi is drawn again for every replayed transition: the reward is stored in its three parts.
 - No discount, because every game ends.
@@ -28,6 +28,8 @@ from merge_sumo.training.game import Game, IntArray, exploring_starts
 from merge_sumo.training.reward import RewardParts
 
 SQUASH_BELOW = -2.0
+POLYAK = 0.005
+"""Share of the weights that their average takes over per update."""
 GAMES = 64
 """Games that are played at once."""
 
@@ -44,7 +46,6 @@ class DdqnSettings:
     width: int = 128  # units of each of the two hidden layers
     learning_rate: float = 1e-3  # at the start; falls to `last_learning_rate` along a cosine
     last_learning_rate: float = 1e-5  # at the end
-    polyak: float = 0.005  # share of the network that the target network takes over per update
     exploration: float = 1.0
     """Share of random actions at the start; falls linearly to `last_exploration` when half of
     the transitions are in."""
@@ -219,7 +220,7 @@ def train(
             for group in optimiser.param_groups:
                 group["lr"] = rate * min(1.0, (update + 1) / 500)
             loss = games.loss(online, target, s.batch)
-            descend(optimiser, loss, online, target, s.gradient_norm, s.polyak)
+            descend(optimiser, loss, online, target, s.gradient_norm)
             update += 1
             if update % 1000 == 0:
                 mean_return, crash_share = games.recent()
@@ -240,7 +241,6 @@ def descend(
     network: nn.Sequential,
     average: nn.Sequential,
     gradient_norm: float,
-    polyak: float,
 ) -> None:
     """Take one gradient step.
 
@@ -250,7 +250,6 @@ def descend(
         network: the network.
         average: network with the average of the weights.
         gradient_norm: bound to which the gradient is clipped.
-        polyak: share of the weights that the average takes over.
     """
     weights: list[Tensor] = list(network.parameters())
     averages: list[Tensor] = list(average.parameters())
@@ -259,7 +258,7 @@ def descend(
     nn.utils.clip_grad_norm_(weights, gradient_norm)
     optimiser.step()
     with torch.no_grad():
-        torch._foreach_lerp_(averages, weights, polyak)
+        torch._foreach_lerp_(averages, weights, POLYAK)
 
 
 def make_network(inputs: int, width: int) -> nn.Sequential:

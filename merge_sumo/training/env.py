@@ -59,7 +59,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         """Prepare games of an agent.
 
         Args:
-            role: what the agent drives, "pov" or "vut".
+            role: vehicle of the agent, "pov" or "vut".
             opponent: "level0", or a policy such as "vut1" or "pov1".
             svo: psi of a POV of level 2, in rad, or "random" for one drawn for every game; psi is
                 then part of the observation.
@@ -139,5 +139,4 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         state = self._state[0]
         if self.svo is not None:
             state = np.append(state, self._svo_rad)
-        bounded: FloatArray = np.clip(state, *self._bounds)
-        return bounded
+        return np.asarray(np.clip(state, *self._bounds))

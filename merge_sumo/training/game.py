@@ -49,7 +49,7 @@ class Game:
         returns = game.play(state, svo_rad, greedy(network, US23))
 
     Attributes:
-        role: what the agent drives, "pov" or "vut".
+        role: vehicle of the agent, "pov" or "vut".
         opponent: the network of level k-1; None for the level-0 driver.
         reward: the reward of the scenario that is played.
         a_min_mps2: hardest braking of the agent; None for that of the scenario.

@@ -83,13 +83,13 @@ def train_library(
     scenario: Scenario,
     a_min_mps2: float | None = None,
     on_progress: Callable[[TrainingProgress], None] = lambda _: None,
-    on_done: Callable[[str, str], None] = lambda *_: None,
+    say: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Train networks into a folder, in the order of the helix; finished ones are kept.
 
     A network that the manifest of the folder already has with the same scenario, seed, weights,
-    settings and opponent is not trained again, so an interrupted training continues with what is
-    not finished. Each network has a log next to it, `NAME.training.jsonl`.
+    settings and opponent is not trained again, so an interrupted training continues with the
+    others. Each network has a log next to it, `NAME.training.jsonl`.
 
     Args:
         folder: folder of the networks and their manifest.
@@ -100,7 +100,7 @@ def train_library(
         scenario: the scenario that is played.
         a_min_mps2: hardest braking of the POVs; the VUTs keep the limit of the scenario.
         on_progress: called with the progress of each network.
-        on_done: called with the name of each network and "ready" or "there already".
+        say: called with a sentence about each network that is ready.
 
     Raises:
         UserError: if the limit does not fit the scenario, the scenario has no road, an opponent is
@@ -128,9 +128,9 @@ def train_library(
             if known is None:
                 opponent = plan["opponent"]
                 network = None if opponent == "level0" else load_network(opponent, folder)
-                game = Game(plan["role"], network, reward, plan.get(LIMIT))
+                game = Game(plan["role"], network, reward, plan[LIMIT])
                 tasks[name] = game, seed, of_level
-            elif not _is_of(known, plan):
+            elif not _follows(known, plan):
                 raise UserError(
                     f"{folder} has a {name} of another scenario, seed, opponent or setting: "
                     "choose another folder with `out`, or remove it first"
@@ -141,12 +141,12 @@ def train_library(
             if name not in plans:
                 continue
             if "check" in entry:
-                on_done(name, "there already")
+                say(f"{name} is there already")
                 continue
             count = of_level.check_cases
             check = check_policy(name, folder, count, scenario=scenario, weights=reward.weights)
             _write_entry(folder, name, {**entry, "check": to_plain(check)})
-            on_done(name, "ready")
+            say(f"{name} is ready")
 
 
 def _take(folder: Path) -> None:
@@ -171,11 +171,11 @@ def _take(folder: Path) -> None:
     write_new(manifest, to_json({"networks": {}}, indent=2))
 
 
-def _is_of(known: dict[str, Any], plan: dict[str, Any]) -> bool:
+def _follows(known: dict[str, Any], plan: dict[str, Any]) -> bool:
     """Return whether the entry of a manifest follows a plan."""
-    if not plays_as(scenario_of(known), scenario_of(plan)):
-        return False
-    return all(known.get(key) == plan.get(key) for key in {*plan, LIMIT} - {"scenario"})
+    compared = {key: known.get(key) for key in plan}
+    compared["scenario"] = plan["scenario"]
+    return compared == plan and plays_as(scenario_of(known), scenario_of(plan))
 
 
 def _plan(
@@ -204,7 +204,7 @@ def _plan(
                 f"{scenario_of(entry).name}: choose another folder with `out`"
             )
         opponent_sha256 = entry["sha256"]
-    plan = {
+    return {
         "command": command,
         "scenario": scenario_record(scenario),
         "role": role,
@@ -213,10 +213,8 @@ def _plan(
         "seed": seed,
         "reward_weights": to_plain(reward.weights),
         "settings": to_plain(settings),
+        LIMIT: a_min_mps2 if role == "pov" else None,
     }
-    if a_min_mps2 is not None and role == "pov":
-        plan[LIMIT] = a_min_mps2
-    return plan
 
 
 _Task = tuple[Game, int, TrainingSettings]
@@ -332,7 +330,7 @@ def train_and_check(
     """Train the learned drivers, or only check those in a folder.
 
     Args:
-        settings: what is trained.
+        settings: the networks, their folder and their seed.
         scenario: the scenario; None for the paper's.
         on_part: called with the name of a part, the progress in it, its total and unit, and a note.
         say: called with a sentence about each network.
@@ -363,7 +361,7 @@ def train_and_check(
             scenario=played,
             a_min_mps2=settings.a_min,
             on_progress=progressed,
-            on_done=lambda name, state: say(f"{name} is {state}"),
+            say=say,
         )
     manifest = read_manifest(folder)
     for name in names:

@@ -61,7 +61,6 @@ class RefineSettings:
     updates: int = 2_500  # gradient steps per round
     batch: int = 512  # states per update
     learning_rate: float = 8e-4  # at the start; falls to 2 % of it along a cosine
-    polyak: float = 0.005  # share of the weights that their average takes over per update
     temperature: float = 0.01  # of the softmax by which the cost of a choice is made differentiable
     value_share: float = 0.1  # weight of the fit of Q next to the cost of the choice
 
@@ -79,7 +78,7 @@ class _Starts:
 
 @dataclass(frozen=True, slots=True)
 class _Tried:
-    """States of the games of a round, and what was tried there.
+    """States of the games of a round, and the actions that were tried there.
 
     Attributes:
         at: states and psi.
@@ -265,6 +264,6 @@ def _fit(
         chosen = torch.softmax(q / s.temperature, dim=1)
         cost = (chosen * costs[rows]).sum(dim=1).mean()
         loss = cost + s.value_share * nn.functional.smooth_l1_loss(q, values[rows])
-        descend(optimiser, loss, model, average, 1.0, s.polyak)
+        descend(optimiser, loss, model, average, 1.0)
         last_costs.append(float(cost.detach()))
     return float(np.mean(last_costs[-100:]))

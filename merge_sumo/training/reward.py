@@ -20,8 +20,8 @@ from merge_sumo.scenario.scenario import DT_S, Scenario, Units
 
 Role = Literal["pov", "vut"]
 FULL_GAP_M = 45.0
-"""In the paper's scenario a gap is full when it is this much wider than one that is not critical:
-what a vehicle on the level-0 profile drives in 1.6 s."""
+"""Width of a full gap beyond one that is not critical, in the scenario of the paper: the distance
+that a vehicle on the level-0 profile drives in 1.6 s."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
@@ -44,9 +44,9 @@ class RewardWeights:
     def of(cls, scenario: Scenario) -> Self:
         """Return the weights of a scenario: the paper's, measured in its units.
 
-        What a second of acceleration or of a wrong speed costs is a share of the game's length;
-        accelerations count as shares of the hardest, speeds as shares of the VUT's at M. The
-        crash, and what a gap can win, cost and win the same everywhere.
+        The cost of a second of acceleration, or of a wrong speed, is a share of the length of the
+        game; accelerations count as shares of the hardest, speeds as shares of that of the VUT at
+        M. The cost of a crash and the reward of a gap are the same everywhere.
         """
         unit, paper = Units.of(scenario), cls()
         acceleration = unit.acceleration * unit.acceleration * unit.time
@@ -78,9 +78,13 @@ class RewardParts:
 
 @dataclass(frozen=True, slots=True)
 class Reward:
-    """The reward of a scenario: its weights, and from where on what is bad or good.
+    """The reward of a scenario: the weights, and the scenario with its limits.
 
-    Speeds and accelerations are arrays of one shape, and so is what is returned.
+    Arguments and results are arrays of one shape.
+
+    Example:
+        reward = Reward.of(US23)
+        cost = reward.pov_step(v_pov_mps, a_pov_mps2)
     """
 
     weights: RewardWeights
@@ -111,8 +115,7 @@ class Reward:
         gap, weights = np.abs(dx_m), self.weights
         wide = np.minimum(gap / weights.gap_full_m, 1.0)
         near = np.maximum(1.0 - gap / self.scenario.dx_critical_m, 0.0)
-        reward: FloatArray = weights.gap * wide - weights.critical * near
-        return reward
+        return weights.gap * wide - weights.critical * near
 
     def safety(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
         """Return the safety reward of both vehicles at t1."""

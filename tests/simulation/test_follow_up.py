@@ -1,4 +1,4 @@
-"""What happens after M: both drive on, and it is measured."""
+"""The follow-up after M, and its measures."""
 
 # mypy: no-strict-optional
 
@@ -69,7 +69,7 @@ class TestMeasures:
             Outcome(0, 0, replace(CASE, scenario=AT_M), Measures.of(ending(9.0))).to_record()
         )
 
-    def test_that_nobody_takes_are_refused(self):
+    def test_need_a_follow_up(self):
         with pytest.raises(UserError, match="`follow_up_s` SECONDS"):
             Criterion("after_ttc_s < 2").check(AT_M)
         Criterion("after_ttc_s < 2").check(FOLLOWED)
@@ -83,20 +83,17 @@ def run(vut, scenario):
         return ground.run(cases)
 
 
-class TestSeverity:
-    @pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])
-    def test_is_harsh_where_a_car_behind_did_brake(self, braking, severity):
-        episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))
-        episode.after[0, :, 2] = braking, -4.0  # the VUT, ahead of it, may brake as it likes
-        measures = Measures.of(replace(episode, motion=episode.after[:1]))
-        assert (measures.severity, measures.after_brake_mps2) == (severity, -braking)
+@pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])
+def test_a_merge_is_harsh_where_a_car_behind_did_brake(braking, severity):
+    episode = followed((-40.0, 30.0, 0.0, 25.0), (-37.0, 29.7, 2.5, 25.0))
+    episode.after[0, :, 2] = braking, -4.0  # the VUT is ahead, so its braking does not count
+    measures = Measures.of(replace(episode, motion=episode.after[:1]))
+    assert (measures.severity, measures.after_brake_mps2) == (severity, -braking)
 
 
-class TestDrivingOn:
+class TestFollowUp:
     def test_changes_nothing_up_to_m(self):
-        at_m, behind = run("design1", AT_M), run("design1", FOLLOWED)
-        for index, merged in enumerate(at_m):
-            on = behind[index]
+        for merged, on in zip(run("design1", AT_M), run("design1", FOLLOWED), strict=True):
             assert np.array_equal(on.motion, merged.motion)
             assert (on.end, on.clipped_steps) == (merged.end, merged.clipped_steps)
             assert Measures.of(on).score == Measures.of(merged).score
@@ -112,13 +109,13 @@ class TestDrivingOn:
             assert np.allclose(v[1:], np.maximum(v[:-1] + a[:-1] * DT_S, 0.0), atol=1e-9)
             assert (x[:, VUT] >= 0.0).all()
 
-    def test_a_car_behind_the_vut_brakes_for_it(self):
+    def test_has_a_car_that_brakes_behind_the_vut(self):
         slow = replace(US23, v_vut0_mps=12.0, level0_a_mps2=0.1)
         behind = [t for t in run("level0", slow) if t.after[0, 0, 0] < t.after[0, VUT, 0]]
         assert behind
         assert min(t.after[:, 0, 2].min() for t in behind) < -1.0
 
-    def test_ends_where_the_vut_goes_wrong_and_the_merge_stays(self, tmp_path):
+    def test_ends_with_an_error_of_the_vut_and_the_merge_counts(self, tmp_path):
         (tmp_path / "ends.py").write_text(
             "def ends(seen):\n    return 1.0 if seen.x_vut_m < 10.0 else 1 / 0\n", encoding="utf-8"
         )
@@ -127,8 +124,7 @@ class TestDrivingOn:
             assert "ZeroDivisionError" in trajectory.error
             assert trajectory.after[-1, VUT, 0] >= 10.0
             assert len(trajectory.after) < 10
-            assert (
-                Measures.of(trajectory).score == Measures.of(replace(trajectory, error=None)).score
-            )
+            without = replace(trajectory, error=None)
+            assert Measures.of(trajectory).score == Measures.of(without).score
             words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
             assert words.endswith("After M an error ends the follow-up.")

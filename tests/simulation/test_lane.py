@@ -1,4 +1,4 @@
-"""Merging from an acceleration lane: wishes, cars beside and behind, and SUMO's two lanes."""
+"""Merging from an acceleration lane: merge requests, other cars, and the two lanes in SUMO."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from merge_sumo.simulation.evaluate import simulate
 LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 
 
-class TestAWish:
-    """Of the VUT: granted from the lane's begin on, in the next step; at its end it is forced."""
+class TestAMergeRequest:
+    """It is granted on the lane, in the next step; at the end of the lane a merge is forced."""
 
     def step(self, x_m: float, wish: int | None, scenario: Scenario = LANE) -> bool:
         merging = Merging(1, scenario)
@@ -100,7 +100,7 @@ class TestAControllerThatRaisesAfterItsMerge:
         calm = plan_for("level0", scenario=road).with_engine("kinematic")
         return ([one.trajectory for one in simulate(plan, cases)] for plan in (raising, calm))
 
-    def test_is_driven_for_where_it_only_accelerates(self, tmp_path):
+    def test_follows_by_idm_where_it_only_accelerates(self, tmp_path):
         answer = "min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)"
         for raising, calm in zip(*self.episodes(tmp_path, answer), strict=True):
             assert raising.end is End.MERGED

@@ -1,7 +1,7 @@
 """The lane by a second simulation: one case at a time, from the definitions, without our drivers.
 
 It shares with the package the numbers of a scenario and the trained networks (their inputs, action
-values and accelerations); the rest is written anew with `math`.
+values and accelerations); the rest is written again with `math`.
 """
 
 from __future__ import annotations

@@ -160,7 +160,7 @@ class TestAFolder:
     @pytest.mark.parametrize(
         ("changed", "said"),
         [
-            ({"0.bias": np.zeros(1)}, "0.bias (1,)"),
+            ({"0.bias": np.zeros(1)}, "0.bias is (1,)"),
             ({"1.weight": np.zeros((1, ACTIONS, 8))}, "1.weight is (1, 7, 8)"),
             ({"1.weight": np.zeros((ACTIONS, 9))}, "1.weight is (7, 9)"),
             ({"0.weight": np.zeros((8, FEATURES), dtype=np.int64)}, "of int64"),

@@ -244,9 +244,9 @@ class TestTraining:
         monkeypatch.setattr(helix, "LEVEL_SETTINGS", {1: SMALL, 2: SMALL})
         before = (folder / "pov1.safetensors").stat().st_mtime_ns
         limited: dict[str, Any] = {"scenario": LIKE_A_ROUNDABOUT, "a_min_mps2": -2.0}
-        states = []
-        train_library(folder, ("pov1",), **limited, on_done=lambda *state: states.append(state))
-        assert states == [("pov1", "there already")]
+        said: list[str] = []
+        train_library(folder, ("pov1",), **limited, say=said.append)
+        assert said == ["pov1 is there already"]
         for other in ({"a_min_mps2": None}, {"a_min_mps2": -1.0}, {"seed": 1}, {"scenario": US23}):
             with pytest.raises(UserError, match=r"has a pov1 of another .*`out`"):
                 train_library(folder, ("pov1",), **limited | other)
