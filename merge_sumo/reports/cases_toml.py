@@ -148,40 +148,46 @@ def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> s
         vut: the VUT that drove.
     """
     ordered = sorted(outcomes, key=lambda one: (one.case.level, one.index))
-    head = {name: run.record.get(name) for name in Head.__struct_fields__}
-    head["vut"], head["scenario"] = vut, _scenario(run.scenario, path)
-    head["policies_sha256"] = policies_of(run, ordered)
-    head["tolerance"] = run.tolerance if isinstance(run, CasesFile) else TOLERANCE
-    del head["cases"]
-    lines = [f"{name} = {toml_value(one)}" for name, one in head.items() if one is not None]
+    changed = {
+        "vut": vut,
+        "scenario": _scenario(run.scenario, path),
+        "policies_sha256": policies_of(run, ordered),
+        "tolerance": run.tolerance if isinstance(run, CasesFile) else TOLERANCE,
+    }
+    lines = []
+    for name in Head.__struct_fields__:
+        value = changed.get(name, run.record.get(name))
+        if value is not None and name != "cases":
+            lines.append(f"{name} = {toml_value(value)}")
     lines.append("cases = [")
-    lines += [f"  {_line(run, outcome)}," for outcome in ordered]
+    for outcome in ordered:
+        lines.append(f"  {_line(run, outcome)},")
     return ABOUT + "\n".join([*lines, "]"]) + "\n"
 
 
 def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
     """Return the name of a scenario, and its values that are not those by default."""
-    usual = {field.name: field.default for field in fields(scenario)}
     record = scenario.to_record()
     if len(Path(scenario.net or "").parts) > 1:
         record["net"] = f"./{Path(os.path.relpath(str(scenario.net), path.parent)).as_posix()}"
-    return {k: one for k, one in record.items() if k == "name" or one != usual.get(k)}
+    for field in fields(scenario):
+        if field.name != "name" and record.get(field.name) == field.default:
+            record.pop(field.name, None)
+    return record
 
 
 def _line(run: Run, outcome: Outcome) -> str:
     """Return the line of a case: verdict and deciding measures, its place, and its acceptance."""
-    line = {"index": outcome.index, "level": outcome.case.level, "verdict": verdict_of(outcome)}
-    measures = ["severity"] if outcome.measures.end.is_tested else ["end", "severity"]
-    line |= {name: outcome.measures.value(name) for name in measures}
-    line["margin"] = outcome.margin
-    if not run.criterion.require:
-        for name in sorted(condition_of(run.criterion.words).names):
-            line.setdefault(name, outcome.measures.value(name))
-    line["error"] = outcome.measures.error
-    line = {name: short(value) for name, value in line.items()}
-    for dimension in run.scenario.dimensions(outcome.case.level):
-        line[dimension.field] = getattr(outcome.case, dimension.field)
-    line["draw"] = outcome.case.draw or None
+    record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
+    if outcome.measures.end.is_tested:
+        record["end"] = None
     if isinstance(run, CasesFile) and not passes(outcome):
-        line["accepted"] = run.accepted.get(outcome.index)
+        record["accepted"] = run.accepted.get(outcome.index)
+    names = ["index", "level", "verdict", "end", "severity", "margin"]
+    if not run.criterion.require:
+        names += sorted(condition_of(run.criterion.words).names)
+    line = {name: short(record.get(name)) for name in (*names, "error")}
+    places = [dimension.field for dimension in run.scenario.dimensions(outcome.case.level)]
+    for name in (*places, "draw", "accepted"):
+        line[name] = record.get(name)
     return toml_value({name: value for name, value in line.items() if value is not None})

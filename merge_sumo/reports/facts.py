@@ -6,9 +6,11 @@ Report, terminal, JSON and JUnit take their numbers from this list.
 from __future__ import annotations
 
 import statistics
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.probability import PROBABILITY
@@ -19,6 +21,7 @@ from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.metrics.cause import heading
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 
@@ -148,14 +151,14 @@ def _counts(run: Run, summary: Summary, verdict: Verdict, failing: str) -> Facts
         yield Fact(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
         yield Fact("failures with contact", verdict.contacts, f"{failing}, severity: contact")
+    passing = Counter(one.measures.severity for one in run.cases if not one.failed)
     for severity, name in (
         (Severity.CONTACT, CONTACT),
         (Severity.CONFLICT, "cases with a conflict that are no failures"),
         (Severity.HARSH, "cases with harsh braking after the merge that are no failures"),
     ):
-        number = sum(o.measures.severity == severity and not o.failed for o in run.cases)
-        if number:
-            yield Fact(name, number, f"severity: {severity}, not {failing}")
+        if passing[severity]:
+            yield Fact(name, passing[severity], f"severity: {severity}, not {failing}")
 
 
 def _of_level(run: Run, level: int, found: LevelSummary, failing: str) -> Facts:
@@ -174,20 +177,28 @@ def _of_level(run: Run, level: int, found: LevelSummary, failing: str) -> Facts:
         yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
     if run.scenario.lane_m is None:
         return
-    measures = [outcome.measures for outcome in run.cases if outcome.case.level == level]
-    forced = sum((one.lane_share or 0.0) >= 1.0 for one in measures)
+    at_level = [outcome for outcome in run.cases if outcome.case.level == level]
+    forced = sum(share >= 1.0 for share in _values(at_level, "lane_share"))
     yield fact("merges where the lane ends", forced, "lane_share >= 1")
-    yield fact(
-        "cases that stood on the lane", sum(o.stood_s > 0.0 for o in measures), "stood_s > 0"
-    )
+    stood = sum(time_s > 0.0 for time_s in _values(at_level, "stood_s"))
+    yield fact("cases that stood on the lane", stood, "stood_s > 0")
     for name, key, unit, scale in (
         ("place of the merge, median", "lane_share", "% of the lane", 100.0),
         ("time gap ahead, median", "time_gap_ahead_s", "s", 1.0),
         ("time gap behind, median", "time_gap_behind_s", "s", 1.0),
     ):
-        values = [one.value(key) for one in measures if one.value(key) is not None]
-        if values:
+        if values := _values(at_level, key):
             yield fact(name, scale * statistics.median(values), key, unit)
+
+
+def _values(outcomes: Iterable[Outcome], measure: str) -> list[Any]:
+    """Return the values of a measure in the outcomes that have one."""
+    values = []
+    for outcome in outcomes:
+        value = outcome.measures.value(measure)
+        if value is not None:
+            values.append(value)
+    return values
 
 
 def _repeats(run: Run) -> Facts:
@@ -213,17 +224,15 @@ def _motion(run: Run, unsure: set[int], failing: str) -> Facts:
     yield Fact(WORST, worst.index, "lowest margin")
     kind = heading(worst, run.trajectories([worst.index]).get(worst.index))
     yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
-    measures = [outcome.measures for outcome in failed if outcome.index not in unsure]
-    avoidable = [one.avoidable for one in measures if one.avoidable is not None]
-    if avoidable:
+    decided = [outcome for outcome in failed if outcome.index not in unsure]
+    if avoidable := _values(decided, "avoidable"):
         name = "failures that full braking or full acceleration of the VUT avoids"
         yield Fact(name, sum(avoidable), f"{failing}, avoidable")
     for name, key, unit in (
         ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
         ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
     ):
-        values = [one.value(key) for one in measures if one.value(key) is not None]
-        if values:
+        if values := _values(decided, key):
             yield Fact(name, max(values), f"{failing}: {key}", unit)
 
 
