@@ -11,6 +11,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import cache
 from typing import Any
 
@@ -75,9 +76,11 @@ class RunsOfCase:
 
         Of the runs from the worst to the best it is the first one after the tolerated ones.
         """
-        spared = sum(number / self.runs <= tolerated for number in range(1, self.runs + 1))
+        spared = 1
+        while spared / self.runs <= tolerated:
+            spared += 1
         ordered = sorted(self.outcomes, key=lambda run: (run.margin or 0.0, run.index))
-        return ordered[spared]
+        return ordered[spared - 1]
 
 
 def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
@@ -222,35 +225,35 @@ def summarise(
         tolerated: share of its runs in which a case may fail.
     """
     unsure = undecided(outcomes, tolerated)
-    cases = one_per_case(outcomes, tolerated)
-    ends = Counter(outcome.measures.end for outcome in cases)
     by_level: dict[int, list[Outcome]] = {level: [] for level in levels}
+    cases = one_per_case(outcomes, tolerated)
     for outcome in cases:
         by_level.setdefault(outcome.case.level, []).append(outcome)
+    found = {level: _level(by_level[level], level, unsure) for level in sorted(by_level)}
     return Summary(
         cases=len(cases),
-        failures=sum(outcome.failed for outcome in cases) - len(unsure),
-        ends={end.value: ends[end] for end in End if ends[end]},
-        severities=_severities(cases),
-        levels={level: _level(by_level[level], level, unsure) for level in sorted(by_level)},
+        failures=sum(one.failures for one in found.values()),
+        ends=_tally(End, (outcome.measures.end for outcome in cases)),
+        severities=_tally(Severity, (outcome.measures.severity for outcome in cases)),
+        levels=found,
         undecided=len(unsure),
     )
 
 
-def _severities(outcomes: Sequence[Outcome]) -> dict[str, int]:
-    """Return the number of cases of each severity that occurs, the most severe first."""
-    counts = Counter(outcome.measures.severity for outcome in outcomes)
-    return {severity.value: counts[severity] for severity in Severity if counts[severity]}
+def _tally(kinds: Iterable[StrEnum], values: Iterable[StrEnum | None]) -> dict[str, int]:
+    """Return the number of values of each kind that occurs, in the order of the kinds."""
+    counts = Counter(values)
+    return {kind.value: counts[kind] for kind in kinds if counts[kind]}
 
 
 def _level(outcomes: Sequence[Outcome], level: int, unsure: set[int]) -> LevelSummary:
     points = to_unit((outcome.case for outcome in outcomes if outcome.failed), level)
-    undecided_here = sum(outcome.index in unsure for outcome in outcomes)
+    undecided_here = len(unsure.intersection(outcome.index for outcome in outcomes))
     return LevelSummary(
         cases=len(outcomes),
         tested=sum(outcome.is_tested for outcome in outcomes),
         failures=len(points) - undecided_here,
-        severities=_severities(outcomes),
+        severities=_tally(Severity, (outcome.measures.severity for outcome in outcomes)),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
         undecided=undecided_here,
@@ -271,7 +274,7 @@ class Trouble:
 
     Attributes:
         end: VUT_ERROR, SIM_ERROR or TIMEOUT.
-        message: what the first of them says, on one line, without characters that do not print.
+        message: message of the first of them, on one line, without control characters.
         cases: their indices, ascending.
     """
 
@@ -297,7 +300,7 @@ class Verdict:
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
         troubles: errors and timeouts by message: errors first, then the most frequent.
-        goal: what the VUT reaches in a case that is tested.
+        goal: place that the VUT reaches in a case that is tested.
     """
 
     cases: int
@@ -369,32 +372,27 @@ class Verdict:
 def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
     """Return the verdict on outcomes; a case counts once, as in `summarise`."""
     cases, unsure = one_per_case(outcomes, tolerated), undecided(outcomes, tolerated)
-    failed = [one for one in cases if one.failed and one.index not in unsure]
     groups: dict[tuple[End, str], list[Outcome]] = {}
-    errors = timeouts = 0
+    failures = contacts = errors = timeouts = 0
     for outcome in cases:
-        if outcome.is_tested:
-            continue
         end = outcome.measures.end
-        errors += end.is_error
-        timeouts += not end.is_error
-        # Messages that differ in numbers and addresses alone are one.
-        pattern = _VARYING.sub("#", message_of(outcome))
-        groups.setdefault((end, pattern), []).append(outcome)
+        if outcome.failed and outcome.index not in unsure:
+            failures += 1
+            contacts += outcome.measures.severity == Severity.CONTACT
+        if not outcome.is_tested:
+            errors += end.is_error
+            timeouts += not end.is_error
+            # Messages that differ in numbers and addresses alone are one.
+            pattern = _VARYING.sub("#", message_of(outcome))
+            groups.setdefault((end, pattern), []).append(outcome)
     troubles = []
     for (end, _), same in groups.items():
         indices = tuple(outcome.index for outcome in same)
         troubles.append(Trouble(end, message_of(same[0]), indices))
     troubles.sort(key=lambda one: (not one.end.is_error, -one.count, one.cases[0]))
+    goal = cases[0].case.scenario.goal if cases else US23.goal
     return Verdict(
-        cases=len(cases),
-        failures=len(failed),
-        undecided=len(unsure),
-        contacts=sum(one.measures.severity == Severity.CONTACT for one in failed),
-        errors=errors,
-        timeouts=timeouts,
-        troubles=tuple(troubles),
-        goal=cases[0].case.scenario.goal if cases else US23.goal,
+        len(cases), failures, len(unsure), contacts, errors, timeouts, tuple(troubles), goal
     )
 
 

@@ -122,9 +122,9 @@ def _charts(motions: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
             for name, motion in motions.items():
                 values = np.round(motion[:, car, k], 2).tolist()
                 lines.append((f"{VEHICLES[car]} {name}", values))
-        low = min(min(values) for _, values in lines)
-        high = max(max(values) for _, values in lines)
-        steps = max(len(values) - 1 for _, values in lines)
+        drawn = np.concatenate([motion[:, :, k].ravel() for motion in motions.values()])
+        low, high = (round(float(end), 2) for end in (drawn.min(), drawn.max()))
+        steps = max(map(len, motions.values())) - 1
         chart = {"title": title, "low": low, "high": max(high, low + 1.0), "lines": lines}
         charts.append(chart | {"steps": max(1, steps)})
     return charts

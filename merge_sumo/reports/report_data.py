@@ -67,7 +67,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "lane": lane_m,
         "place": "M" if lane_m is None else scenario.place,
         "vehicles": VEHICLES[: scenario.vehicles],
-        "level_names": {level: level_name(level) for level in ALL_LEVELS},
+        "level_names": dict(zip(ALL_LEVELS, map(level_name, ALL_LEVELS), strict=True)),
         "coordinates": axes,
         "severities": list(Severity),
         "measures": measures,
@@ -134,14 +134,14 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
         case = model.run.outcome(known.index).case
         of_case = found.setdefault(known.index, {"words": [], "axes": []})
         # Of another VUT in the same case.
-        vut = None if known.vut is None else printable(known.vut)
+        prefix = "" if known.vut is None else f"{printable(known.vut)}: "
         for words in changes(known, case):
-            of_case["words"].append(words if vut is None else f"with {vut}: {words}")
-        named = [(axis, *name_and_unit(case, axis.name)) for axis in known.start]
-        named += [(axis, f"vut: {axis.name}", "") for axis in known.parameters]
-        for axis, name, unit in named:
-            title = name if vut is None else f"{vut}: {name}"
-            of_case["axes"].append(to_plain(axis) | {"name": title, "unit": unit})
+            of_case["words"].append(f"with {prefix}{words}" if prefix else words)
+        for axis in (*known.start, *known.parameters):
+            name, unit = f"vut: {axis.name}", ""
+            if axis in known.start:
+                name, unit = name_and_unit(case, axis.name)
+            of_case["axes"].append(to_plain(axis) | {"name": prefix + name, "unit": unit})
     return found
 
 

@@ -88,15 +88,19 @@ def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
     if AT_MOST in of:
         cases = f"{of['cases'].shown} of {of[AT_MOST].shown} cases, converged"
     lines = [f"{of['VUT'].shown}: {RULE} {of[RULE].shown}; {cases}"]
-    rows = [_level_cells(level, row) for level, row in levels.items()]
-    lines += [f"  {line}" for line in aligned(rows)]
+    rows = []
+    is_measured = PROBABLY in of or SHARES.read(run.folder) is not None
+    for level, row in levels.items():
+        is_measured |= STARTS_THAT_FAIL in row
+        rows.append(_level_cells(level, row))
+    for line in aligned(rows):
+        lines.append(f"  {line}")
 
     remarks = []
     if CONTACT in of:
         contacts = _counted(of[CONTACT], "more case")
         remarks.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
-    is_measured = any(STARTS_THAT_FAIL in row for row in levels.values())
-    if not (PROBABLY in of or is_measured or SHARES.read(run.folder)):
+    if not is_measured:
         measure = again("probability", run.folder, run.record)
         remarks.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if remarks:
@@ -161,9 +165,11 @@ def step_headline(step: Step) -> str:
         by = f"by Fisher's exact test p = {step.chance:.2g}"
         parts.append(f"{step.after} passes less often than {step.before}, {by}")
     if step.cases:
-        changes = [one for one in Change if one is Change.BROKE or step.count(one)]
-        numbers = ", ".join(f"{step.count(change)} {change}" for change in changes)
-        parts.append(f"of {counted(len(step.cases), 'shared case')} {numbers}")
+        numbers = []
+        for change in Change:
+            if step.count(change) or change is Change.BROKE:
+                numbers.append(f"{step.count(change)} {change}")
+        parts.append(f"of {counted(len(step.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
     return "; ".join(parts)
@@ -199,7 +205,9 @@ def comparison(compared: Comparison) -> list[str]:
     for number, version in enumerate(compared.versions, start=1):
         verdict = judge(version.outcomes, version.tolerated)
         text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {verdict.counts}")
-        text += [*verdict.trouble_lines(), *(f"  {one}" for one in late_errors(version.outcomes))]
+        text += verdict.trouble_lines()
+        for late in late_errors(version.outcomes):
+            text.append(f"  {late}")
     for level, row in fmc_rows(compared).items():
         text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
     differ = False
@@ -269,7 +277,9 @@ def truths(found: TruthResult) -> list[str]:
         if truth.in_sumo < len(truth.margin):
             cases = counted(truth.in_sumo, "case")
             line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
-        lines += [line, *(f"  {remark}" for remark in truth_remarks(truth))]
+        lines.append(line)
+        for remark in truth_remarks(truth):
+            lines.append(f"  {remark}")
     return [*lines, f"  a case fails when {found.criterion.said(found.scenario)}"]
 
 
@@ -377,7 +387,7 @@ def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
 
 @lines_of.register
 def probability(found: ProbabilityResult) -> list[str]:
-    """Return the probability and its interval, the strata, the levels, and what is counted."""
+    """Return the probability and its interval, the strata, the levels, and the counted cases."""
     if not found.is_judged:
         return ["P(fail) is not known: no case was judged, the VUT never reached the merge point"]
     at = f"{100.0 * found.confidence:g} % interval"
@@ -447,7 +457,7 @@ def robustness(found: StressResult) -> str:
         return "no case failed: which passes fail on a rung is in the table"
     failures = counted(len(found.failures), "failure")
     text = f"robust, as they fail on every rung: {len(found.robust)} of {failures}"
-    fragile = [index for index in found.failures if found.passes_in(index)]
+    fragile = list(filter(found.passes_in, found.failures))
     if fragile:
         fragile.sort(key=found.passes_in, reverse=True)
         shown = ", ".join(f"{index} ({found.passes_in(index)})" for index in fragile[:FRAGILE])
@@ -508,9 +518,10 @@ def _axis(axis: Axis, name: str, unit: str) -> str:
 
 @lines_of.register
 def vut_check(found: VutCheck) -> list[str]:
-    """Return what is wrong in sentences, and the cost of a step."""
-    lines = found.problems or ["nothing wrong"]
-    lines = lines + [f"note: {sentence}" for sentence in found.notes]
+    """Return the problems in sentences, and the cost of a step."""
+    lines = list(found.problems) or ["nothing wrong"]
+    for sentence in found.notes:
+        lines.append(f"note: {sentence}")
     median, worst = found.us_per_step_median, found.us_per_step_worst
     if median is not None:
         lines.append(f"a step costs {median:.0f} us (median), {worst:.0f} us at worst")
@@ -528,7 +539,7 @@ def episode_lines(
     Args:
         outcome: the outcome of the case.
         trajectory: its motion.
-        from_s: begin the table so long before the first conflict, as in -3.
+        from_s: begin of the table in s before the first conflict, such as -3.
     """
     first, begins = Conflict.of(trajectory).begin(from_s)
     case = outcome.case
@@ -565,16 +576,24 @@ def _measures(outcome: Outcome) -> Iterator[str]:
 def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:
     """Return the motion from a row on: a row for each second, for the merge, and for the end.
 
-    Of every vehicle x in m, v in m/s and a in m/s2; then the signals that the VUT has left.
+    Of every vehicle x in m, v in m/s and a in m/s2; then the signals of the VUT.
     """
-    motion, until = trajectory.whole, len(trajectory.motion) - 1
-    cars = VEHICLES[: motion.shape[1]]
-    lines = ["  t s" + "".join(f"  {f'x {who.upper()}':>8}   m/s  m/s2" for who in cars)]
+    motion, merge = trajectory.whole, len(trajectory.motion) - 1
+    last = len(motion) - 1
+    head = "  t s"
+    for who in VEHICLES[: motion.shape[1]]:
+        position = f"x {who.upper()}"
+        head += f"  {position:>8}   m/s  m/s2"
+    lines = [head]
     seconds = range(first, len(motion), round(1.0 / DT_S))
-    for row in sorted({*seconds, max(until, first), len(motion) - 1}):
-        values = "".join(f"  {x:8.1f} {v:5.1f} {a:5.1f}" for x, v, a in motion[row].tolist())
-        signals = {name: of[row] for name, of in (trajectory.signals or {}).items()}
-        left = "".join(f"  {name} {value}" for name, value in signals.items() if value is not None)
-        place = f"  {trajectory.case.scenario.place}" if row == until < len(motion) - 1 else ""
-        lines.append(f"{row * DT_S:5.1f}{values}{place}{left}")
+    for row in sorted({*seconds, max(merge, first), last}):
+        line = f"{row * DT_S:5.1f}"
+        for x_m, v_mps, a_mps2 in motion[row].tolist():
+            line += f"  {x_m:8.1f} {v_mps:5.1f} {a_mps2:5.1f}"
+        if row == merge < last:
+            line += f"  {trajectory.case.scenario.place}"
+        for name, values in (trajectory.signals or {}).items():
+            if values[row] is not None:
+                line += f"  {name} {values[row]}"
+        lines.append(line)
     return lines
