@@ -275,37 +275,33 @@ class ControllerArray(ControllerDriver):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
-        self._signals, self._wishes = {}, None
-        answers = [0.0] * self.corridors
-        wishes: dict[int, int] = {}
-        met = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        self._signals = {}
+        answers, wishes = [0.0] * self.corridors, [NO_WISH] * self.corridors
+        facing = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
         merged = [False] * self.corridors if scene.merged is None else scene.merged.tolist()
-        rows = (scene.active, scene.step, scene.x_m.T, scene.v_mps.T)
-        states = zip(*(row.tolist() for row in rows), met, strict=True)
+        columns = scene.active, scene.step, scene.x_m.T, scene.v_mps.T
+        rows = zip(*(column.tolist() for column in columns), facing, merged, strict=True)
         with self._deadline as deadline:
-            for k, (active, step, x_m, v_mps, row) in enumerate(states):
+            for k, (active, step, x_m, v_mps, row, has_merged) in enumerate(rows):
                 if not active:
                     continue
+                answers[k] = math.nan
                 if self._reasons[k] is not None:
-                    answers[k] = math.nan
                     continue
                 try:
-                    lane_m, controller = self._lanes_m[k], self._controllers[k]
-                    seen = seen_in(round(step * DT_S, 1), row, x_m, v_mps, lane_m, merged=merged[k])
+                    controller, lane_m, t_s = self._controllers[k], self._lanes_m[k], step * DT_S
+                    seen = seen_in(round(t_s, 1), row, x_m, v_mps, lane_m, merged=has_merged)
                     deadline.start()
-                    answers[k], wish = as_answer(controller.act(seen))
+                    answer = as_answer(controller.act(seen))
                     signals = controller.signals()
                     deadline.stop()
+                    answers[k], wishes[k] = answer
                     if signals:
                         self._signals[k] = signals
-                    if wish != NO_WISH:
-                        wishes[k] = wish
                 except BaseException as error:
                     self._fail(k, deadline.reason(error))
-                    answers[k] = math.nan
-        if wishes:
-            self._wishes = np.full(self.corridors, NO_WISH, dtype=np.int8)
-            self._wishes[list(wishes)] = list(wishes.values())
+        chooses = wishes.count(NO_WISH) < self.corridors
+        self._wishes = np.array(wishes, dtype=np.int8) if chooses else None
         return np.array(answers)
 
     def reason(self, corridor: int) -> str | None:

@@ -1,14 +1,13 @@
 """VUTs that are objects of this Python process: a class of a notebook, a lambda, an instance.
 
-An importable one is named, `module:Name`, and hosted as on the command line. The rest is kept
-here under a name of its own, `here:Name`, and drives in the process that runs the cases.
+An importable one is named, `module:Name`, and hosted as on the command line. Others get a name of
+this process, `here:Name`, and drive in it.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from multiprocessing.reduction import ForkingPickler
 from typing import Any, Protocol, SupportsFloat
 
 from merge_sumo.controllers.controller import Seen
@@ -39,7 +38,6 @@ class ActsInBatches(Protocol):
 
 AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
 """A spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`."""
-MAINS = ("__main__", "__mp_main__")
 
 
 def spec_of(vut: Any) -> str:
@@ -75,31 +73,17 @@ def is_here(text: str) -> bool:
 
 
 def names_code(text: str) -> bool:
-    """Return whether who writes a spec says which code of a user's is run.
+    """Return whether a spec, as others may have written it, decides on code of a user's to run.
 
-    An object of this process was put there by who runs it.
+    An object of this process was put there by its user.
     """
     return runs_code(text) and object_of(parse(text)) is None
-
-
-def travels(spec: ControllerSpec) -> bool:
-    """Return whether other processes can be given a VUT: by name, or as a copy of the object.
-
-    They cannot find definitions of the main module.
-    """
-    if spec.kind != HERE:
-        return True
-    try:
-        content = bytes(ForkingPickler.dumps(object_of(spec)))
-    except Exception:  # whatever an object does when it is asked for a copy of itself
-        return False
-    return not any(name.encode() in content for name in MAINS)
 
 
 def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None, AnyWorkers]:
     """Return the specs of both controllers, and the workers that can have them.
 
-    Prints a notice where a controller drives in this process and could do it harm.
+    An object has no workers; a notice says so.
 
     Args:
         vut: the VUT, a spec or an object.
@@ -107,15 +91,14 @@ def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None
         workers: the requested workers.
     """
     specs = spec_of(vut), None if pov is None else spec_of(pov)
-    for spec in (parse(text) for text in specs if text is not None):
+    for spec in map(parse, filter(None, specs)):
         if object_of(spec) is None:
             continue
-        where = "with the cases"
-        if not travels(spec):
-            workers, where = 1, "in this process, without workers"
+        workers = 1
         notice(
-            f"{spec.argument} is an object, so it drives {where}, which its faults may end; "
-            "put its class or function into a module for a process of its own",
+            f"{spec.argument} is an object, so it drives in this process, without workers, "
+            "and its faults may end the process; put its class or function into a module for a "
+            "process of its own",
             UserWarning,
         )
     return *specs, workers
@@ -124,11 +107,12 @@ def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None
 def _importable(target: Any) -> str | None:
     """Return MODULE:NAME of a class or a function; None where no other process finds it so."""
     module, name = getattr(target, "__module__", None), getattr(target, "__qualname__", "")
-    if module in (None, *MAINS) or "<" in name:
+    if module in (None, "__main__", "__mp_main__") or "<" in name:
         return None
     imported: Any = sys.modules.get(str(module))
-    if any(getattr(imported, own, None) is None for own in ("__spec__", "__file__")):
-        return None
+    for own in ("__spec__", "__file__"):
+        if getattr(imported, own, None) is None:
+            return None
     for part in name.split("."):
         imported = getattr(imported, part, None)
     return f"{module}:{name}" if imported is target else None

@@ -320,21 +320,17 @@ def split_command(command: str) -> list[str]:
 
 
 def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
-    """Return the files of a command that are code: it reads and writes the others.
+    """Return the file of code that a command runs, if it is known; it reads and writes others.
 
-    These are its program and, where that is one that this machine has for all, as an interpreter,
-    the first file after it.
+    That is the first file but programs that this machine has for all, as an interpreter.
     """
-    program, *others = arguments
-    words = [program]
-    if shutil.which(Path(program).name) is not None:
-        for word in others:
-            if word in ("-c", "-e", "-m"):  # the code follows by name or as a text
-                break
-            if os.path.isfile(word):  # noqa: PTH113 (any text)
-                words.append(word)
-                break
-    return tuple(filter(Path.is_file, map(Path, words)))
+    for word in arguments:
+        if word in ("-c", "-e", "-m"):  # the code follows by name or as a text
+            break
+        path = Path(word)
+        if os.path.isfile(path) and shutil.which(path.name) is None:  # noqa: PTH113 (any text)
+            return (path,)
+    return ()
 
 
 class Program(Started):

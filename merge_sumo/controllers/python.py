@@ -7,7 +7,7 @@ import importlib
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, partial
@@ -195,9 +195,9 @@ class InstalledKind(PythonKind):
 
 
 class HereKind(OfPython):
-    """An object of this process, `here:NAME`, which drives in the process of the cases."""
+    """An object of this process, `here:NAME`, which drives in it."""
 
-    files_are_known = False
+    files_are_known, max_workers = False, 1
 
     def target(self) -> Any:
         """Return the object; `UserError` where that was an object of another process."""
@@ -212,16 +212,6 @@ class HereKind(OfPython):
             if file and Path(file).is_file():
                 self.code = (Path(file),)
         return target
-
-    def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
-        """Travel with the object."""
-        load, arguments = super().__reduce__()
-        return _with_object, (self._target, load, arguments)
-
-
-def _with_object(target: Any, load: Callable[..., HereKind], arguments: tuple[Any, ...]) -> Any:
-    objects[arguments[1].argument] = target
-    return load(*arguments)
 
 
 class PythonController(Controller):

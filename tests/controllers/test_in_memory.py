@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import threading
 from typing import Any
 
 import pytest
 
 import merge_sumo as ms
-from merge_sumo.controllers.in_memory import is_here, spec_of, travels
-from merge_sumo.controllers.kinds import parse
+from merge_sumo.controllers.in_memory import is_here, spec_of
 
 SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 
@@ -42,7 +40,6 @@ class TestASpec:
     @pytest.mark.parametrize("vut", [Steady, steady])
     def test_of_what_can_be_imported_is_its_name(self, vut):
         assert spec_of(vut) == f"{__name__}:{vut.__name__}"
-        assert travels(parse(spec_of(vut)))
 
     def test_of_another_object_of_the_same_name_is_another(self):
         specs = [spec_of(lambda _: 0.0), spec_of(lambda _: 1.0)]
@@ -59,26 +56,13 @@ class TestASpec:
             ms.run("here:gone", x_pov0_m=-300, v_pov0_mps=30)
 
 
-class TestObjectsThatDoNotTravel:
-    def test_are_lambdas_objects_with_locks_and_those_of_the_main_module(self):
-        with_lock, of_main = Batched(1.0), Batched(1.0)
-        vars(with_lock)["lock"] = threading.Lock()
-        vars(of_main)["part"] = main = type("Main", (Steady,), {"__module__": "__main__"})
-        for vut in (lambda _: 0.0, with_lock, main, of_main):
-            assert not travels(parse(spec_of(vut)))
-
-
 class TestACampaign:
     def test_asks_the_very_object_that_it_was_given(self, tmp_path):
         vut = Batched(1.0)
-        with pytest.warns(UserWarning, match=r"Batched\S* is an object, so it drives with"):
-            run = ms.campaign(vut, **SMALL, out=tmp_path / "run")
+        with pytest.warns(UserWarning, match=r"Batched\S* is an object, .* in this process"):
+            run = ms.campaign(vut, **SMALL, workers=2, out=tmp_path / "run")
         assert vut.asked > 50
         assert run.trajectory(0).a_vut_mps2[0] == 1.0
-
-    def test_of_what_cannot_travel_runs_without_workers(self, tmp_path):
-        with pytest.warns(UserWarning, match="in this process, without workers"):
-            ms.campaign(lambda _: 0.0, **SMALL, workers=2, out=tmp_path / "run")
 
 
 @pytest.mark.slow
