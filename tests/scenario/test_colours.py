@@ -1,4 +1,4 @@
-"""A vehicle has one colour in all pictures, and positions have one axis in all charts."""
+"""A vehicle has one colour in all pictures."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from merge_sumo.analysis.comparison import compare
-from merge_sumo.reports.comparison_page import comparison_page
-from merge_sumo.reports.pages import X_AXIS, source_of
-from merge_sumo.reports.report import report_page
+from merge_sumo.reports.pages import source_of
 from merge_sumo.scenario.scenario import COLOURS
 
 PICTURES = Path(__file__).resolve().parents[2] / "docs" / "pictures"
@@ -27,12 +24,3 @@ def test_the_start_page_draws_the_cars_in_the_same_colours():
     drawing = (PICTURES / "scenario.svg").read_text(encoding="utf-8")
     cars = re.findall(r'<rect [^>]*height="1[26]" rx="[34]" fill="(#[0-9a-f]{6})"', drawing)
     assert cars == [COLOURS[name] for name in ("pov", "vut", "vut", "pov")]
-
-
-def test_positions_have_one_label_and_one_direction_in_all_charts(run):
-    assert report_page(run).count(X_AXIS) == 2, "positions of a case, and why it failed"
-    compared = comparison_page(compare([run, run]))
-    assert compared.count(f"<figcaption>{X_AXIS}</figcaption>") > 0
-    for page in (report_page(run), compared):
-        assert "istance to M" not in page
-        assert "-place" not in page, "the script turns no position round"

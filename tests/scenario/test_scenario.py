@@ -1,4 +1,4 @@
-"""A scenario is a value: what is wrong in one is a sentence, what it says holds in every case."""
+"""A scenario is a value: an error in one is a sentence, and its numbers hold in every case."""
 
 from __future__ import annotations
 
@@ -48,14 +48,11 @@ class TestAFile:
             ("x_pov0_m = [-180, -340]", "x_pov0_m is (-180.0, -340.0): choose metres before M"),
             ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': did you mean x_pov0_m"),
-            ("v_vut0_mps = 99", "v_vut0_mps is 99.0: choose between 0 and 45"),
             ("v_vut0_mps = nan", "v_vut0_mps is nan: choose 0 to 100"),
             ("a_min_mps2 = 3", "a_min_mps2 is 3.0: choose -20 to 0"),
-            ("timeout_s = 1e9", "timeout_s is 1000000000.0: choose 0.1 to 120"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
             ("headway_behind_s = [1.0, 4.0]", "(1.0, 4.0): choose both headways, or none"),
             ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
-            ("name = 3", "name is 3: it must be a text"),
         ],
     )
     def test_with_a_wrong_value_is_refused_with_its_line(self, tmp_path, line, said):
@@ -67,7 +64,7 @@ class TestAFile:
         assert str(refused.value).startswith(f"{path}, line 3: ")
 
     @pytest.mark.parametrize("field", [f for f in fields(Scenario) if f.name in RANGES])
-    @pytest.mark.parametrize("number", ["1e200", "-1e200", "1" + "0" * 400, "1e5"])
+    @pytest.mark.parametrize("number", ["-1e200", "1" + "0" * 400])
     def test_beyond_a_road_and_its_cars_is_refused_with_a_range(self, tmp_path, field, number):
         value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
         (tmp_path / "far.toml").write_text(f"{field.name} = {value}\n")
@@ -85,41 +82,22 @@ class TestAFile:
             named_scenario(str(tmp_path / "no.toml"))
 
 
-OTHER = replace(
-    US23,
-    name="other",
-    x_pov0_m=(-300.0, -100.0),
-    v_pov0_mps=(10.0, 20.0),
-    x_vut0_m=-100.0,
-    v_vut0_mps=10.0,
-    a_min_mps2=-3.0,
-    a_max_mps2=1.5,
-    timeout_s=12.0,
-    level0_a_mps2=0.5,
-    level0_v_mps=14.0,
-    dx_crash_m=4.0,
-)
+OTHER = replace(US23, name="other", x_pov0_m=(-300.0, -100.0), v_vut0_mps=10.0, dx_crash_m=4.0)
 
 
 class TestACase:
     def test_is_a_point_of_the_pool_of_its_scenario(self):
-        pool = Pool(levels=(2,), scenario=OTHER)
         points = np.random.default_rng(0).random((5, 3))
-        cases = pool.cases(points, 2)
-        assert all(case.scenario is OTHER and case.v_vut0_mps == 10.0 for case in cases)
+        cases = Pool(levels=(2,), scenario=OTHER).cases(points, 2)
+        assert {(case.scenario, case.v_vut0_mps) for case in cases} == {(OTHER, 10.0)}
         assert cases[0].x_pov0_m == -300.0 + 200.0 * points[0, 0]
         assert to_unit(cases, 2, scenario=US23) == pytest.approx(points)
 
-    def test_is_judged_by_its_scenario(self):
+    @pytest.mark.parametrize(("scenario", "is_close"), [(US23, True), (OTHER, False)])
+    def test_is_judged_by_its_scenario(self, scenario, is_close):
         motion = np.array([[[x, 20.0, 0.0] for x in row] for row in ((-10.0, -2.0), (-5.0, 0.0))])
-        verdicts = [
-            Measures.of(Trajectory(case, motion, End.MERGED)).is_close
-            for case in (
-                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=US23),
-                Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=OTHER),
-            )
-        ]
-        assert verdicts == [True, False]
+        case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=20.0, scenario=scenario)
+        assert Measures.of(Trajectory(case, motion, End.MERGED)).is_close is is_close
 
 
 @pytest.mark.parametrize("name", ["curved", "lane drop", "OpenDRIVE"])
@@ -142,10 +120,9 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     run = Run(tmp_path / "run")
     assert all(o.measures.end.is_tested for o in run.outcomes)
     assert {o.failed for o in run.outcomes} == {True, False}, "it has a conflict"
-    for index in range(3):
-        x, v, a = run.trajectory(index).motion[:, 1].T
-        assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
-        assert v[1:] == pytest.approx(v[:-1] + a[:-1] * 0.1, abs=1e-9)
+    x, v, a = run.trajectory(0).motion[:, 1].T
+    assert x[1:] == pytest.approx(x[:-1] + v[:-1] * 0.1, abs=1e-9)
+    assert v[1:] == pytest.approx(v[:-1] + a[:-1] * 0.1, abs=1e-9)
     exported = invoke("export", run.folder, 0, "--out", tmp_path / "exported")
     assert exported.exit_code == 0, exported.output
     replayed = invoke("replay", tmp_path / "exported" / "case-00000")

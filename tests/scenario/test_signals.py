@@ -1,4 +1,6 @@
-"""What a controller leaves for each step: bounded, kept with the motion, shown and exported."""
+"""Signals of a controller: bounded, kept with the motion, shown and exported."""
+
+# mypy: no-strict-optional
 
 from __future__ import annotations
 
@@ -7,15 +9,11 @@ import json
 
 import numpy as np
 import pytest
-from support.campaigning import run_campaign
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import Run
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.records import decode
-from merge_sumo.reports.report import write_report
-from merge_sumo.scenario.scenario import POV, US23, VUT
+from merge_sumo.scenario.scenario import POV, VUT
 from merge_sumo.scenario.signals import (
     CHARACTERS,
     MOST_NAMES,
@@ -25,7 +23,6 @@ from merge_sumo.scenario.signals import (
     from_runs,
     to_record,
 )
-from merge_sumo.workers import open_workers
 
 LEAVES = """
 class Vut:
@@ -39,33 +36,15 @@ class Vut:
 """
 
 
-@pytest.fixture
-def campaign(tmp_path):
-    def run(source: str, workers: int = 1, **settings) -> Run:
-        path = tmp_path / "my_vut.py"
-        path.write_text(source, encoding="utf-8")
-        given = {"levels": (0,), "cases": 24, "batch": 12, "sampler": "uniform", **settings}
-        folder = tmp_path / f"run{len(list(tmp_path.iterdir()))}"
-        with open_workers(workers) as there:
-            return run_campaign(
-                CampaignSettings(vut=f"{path}:Vut", **{"scenario": US23, **given}),
-                folder,
-                workers=there,
-            )
-
-    return run
-
-
 @pytest.mark.slow
-def test_every_step_has_what_was_left_at_it(campaign):
-    run = campaign(LEAVES, cases=40, batch=40)
-    for outcome in Run(run.folder).outcomes:
-        found = Run(run.folder).trajectory(outcome.index)
-        assert found.signals is not None
+def test_every_step_has_what_was_left_at_it(write_vut, tmp_path):
+    run = ms.campaign(write_vut(LEAVES), level=0, cases=40, sampler="uniform", out=tmp_path / "run")
+    for outcome in run.run.outcomes:
+        found = run.run.trajectory(outcome.index)
         x_pov_m, x_vut_m = found.whole[:, POV, 0], found.whole[:, VUT, 0]
         gap_m = x_pov_m - x_vut_m
         left = found.signals["gap_m"]
-        assert left[-1] is None, "nobody acts in the last row"
+        assert left[-1] is None, "the last row has no action"
         assert left[:-1] == pytest.approx(gap_m[:-1], rel=1e-5)
         yields = np.array(found.signals["mode"][:-1]) == "yield"
         begins = (x_vut_m[:-1] > -60.0) & (np.abs(gap_m[:-1]) < 15.0)
@@ -88,11 +67,10 @@ class Vut:
 """
 
 
-def test_hostile_names_and_words_are_cut_and_harm_nobody(campaign, tmp_path):
-    run = campaign(HOSTILE, cases=4, batch=4)
-    assert not any(outcome.measures.end.is_error for outcome in run.outcomes)
-    left = Run(run.folder).trajectory(0).signals
-    assert left is not None
+def test_hostile_names_and_words_are_cut_without_harm(write_vut, tmp_path):
+    run = ms.campaign(write_vut(HOSTILE), level=0, cases=4, sampler="uniform", out=tmp_path / "run")
+    assert not any(outcome.measures.end.is_error for outcome in run.run.outcomes)
+    left = run.run.trajectory(0).signals
     assert {name: values[0] for name, values in left.items()} == {
         "=cmd()": "=1+1",
         "</script><b>": "\\x1b[2J\\u202e</script>",
@@ -100,8 +78,8 @@ def test_hostile_names_and_words_are_cut_and_harm_nobody(campaign, tmp_path):
         "\\ud800": "\\udfff",
         "flag": "true",
     }
-    assert "</script><b>" not in write_report(run).read_text()
-    (table,) = ms.export(run.folder, [0], file_format="csv", out=tmp_path / "csv")
+    assert "</script><b>" not in run.report().read_text()
+    (table,) = ms.export(run, [0], file_format="csv", out=tmp_path / "csv")
     with table.open(encoding="utf-8") as file:
         head, first, *_ = csv.reader(file)
     assert head[-5] == "signal_=cmd()"
@@ -119,7 +97,6 @@ def test_what_is_no_number_and_no_word_is_dropped(left):
     "record",
     [
         {},
-        [],
         None,
         {"x": [[10**12, 1.0]]},
         {"x": [[3, 1.0]]},

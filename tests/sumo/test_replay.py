@@ -72,16 +72,13 @@ def folder(collision, tmp_path) -> Path:
     return Path(shutil.copytree(collision, tmp_path / "case"))
 
 
-AT_LEVEL_0 = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-OF_LEVEL_2 = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.6, scenario=US23)
-BODIES_OVERLAP = replace(AT_LEVEL_0, x_pov0_m=-182.0, v_pov0_mps=18.0)
-MOTIONS: dict[str, tuple[Case, float, float, int, End]] = {
-    "a timeout": (AT_LEVEL_0, 0.0, -4.0, 300, End.TIMEOUT),
-    "bodies that overlap": (BODIES_OVERLAP, 0.0, 0.0, 102, End.MERGED),
-    "no step": (AT_LEVEL_0, 0.0, 0.0, 0, End.VUT_ERROR),
-    "level 2": (OF_LEVEL_2, -3.0, 1.0, 83, End.MERGED),
+CASE_OF_LEVEL_2 = Case(level=2, x_pov0_m=-182.0, v_pov0_mps=18.0, svo_rad=0.6, scenario=US23)
+MOTIONS = {
+    "a timeout": (-1.0, -4.0, 300, End.TIMEOUT),
+    "bodies that overlap": (0.0, 0.0, 102, End.MERGED),
+    "no step": (0.0, 0.0, 0, End.VUT_ERROR),
 }
-"""Case, acceleration of the POV and of the VUT, steps and end."""
+"""Acceleration of the POV and of the VUT, steps and end."""
 
 
 class TestAnHonestRecordReplaysIdentically:
@@ -101,8 +98,8 @@ class TestAnHonestRecordReplaysIdentically:
 
     @pytest.mark.parametrize("name", MOTIONS)
     def test_of_any_motion(self, tmp_path, name):
-        case, pov, vut, steps, end = MOTIONS[name]
-        trajectory = commanded(case, np.full((steps, 2), (pov, vut)), end=end)
+        pov, vut, steps, end = MOTIONS[name]
+        trajectory = commanded(CASE_OF_LEVEL_2, np.full((steps, 2), (pov, vut)), end=end)
         assert_identical(write_replay(tmp_path / "case", road_of(), trajectory), steps + 1)
 
     def test_of_an_older_version_without_a_scenario(self, folder):
@@ -204,11 +201,9 @@ CHANGES: list[tuple[Callable[[etree._Element], object], str]] = [
     (many(HOLD_STEPS), "in 11 or more rows"),
     (many(MAX_TIMESTEPS + 1), WRONG),
     (lambda record: record[ROW].set("time", "4.05"), WRONG),
-    (lambda record: record[ROW].attrib.pop("time"), WRONG),
     (lambda record: record[ROW].append(copy.deepcopy(record[ROW][1])), WRONG),
     (without_vut, "must have pov, vut every 0.1 s"),
     (lambda record: record[ROW][0].set("lane", "ramp_0"), "has pov on lane ramp_0, which is not"),
-    (lambda record: record[ROW][0].set("pos", "nan"), WRONG),
     (lambda record: record[ROW][0].set("pos", "1e8"), WRONG),
 ]
 """A change of a record, and the sentence of the refusal."""
@@ -242,23 +237,13 @@ class TestAFolderThatCannotBeReplayed:
         assert "there is no folder" in refusal(tmp_path / "nowhere")
 
 
-def rows_of(path: Path) -> dict[tuple[float, str], tuple[float, float]]:
-    rows = {}
-    for step in etree.parse(path).getroot():
-        for car in step:
-            place = float(step.get("time")), str(car.get("id"))
-            rows[place] = float(car.get("x")), float(car.get("speed"))
-    return rows
-
-
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
 def test_plain_sumo_replays_a_folder_that_is_shipped(folder, tmp_path):
     """Start sumo from elsewhere, on the configuration of a folder; the record must come out."""
     output = tmp_path / "plain.fcd.xml"
     command = [sumo_program("sumo"), "-c", str(folder / CONFIG), "--fcd-output", str(output)]
     subprocess.run([*command, "--precision", "9"], check=True, cwd=tmp_path, capture_output=True)
-    recorded, played = rows_of(folder / RECORD), rows_of(output)
-    assert len(recorded) > 200
-    assert played.keys() == recorded.keys()
-    for place, row in recorded.items():
-        assert played[place] == pytest.approx(row, abs=1e-6)
+    recorded, lanes = replay_module._record(folder / RECORD, "the record")
+    played, _ = replay_module._record(output, "the replay")
+    assert len(lanes) > 200
+    assert np.allclose(played[:, :, :3], recorded[:, :, :3], 0.0, 1e-6, equal_nan=True)
