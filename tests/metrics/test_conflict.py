@@ -28,7 +28,6 @@ def motion(gaps_m: list[float], closing_mps: list[float]) -> FloatArray:
     [
         # Bodies overlap before the merge, which is row 2, and again in rows 4 and 5.
         ([-1.0, 9.0, 4.0, 1.0, 0.0, -2.0], [5.0] * 6, (4, "the contact")),
-        ([-1.0, 9.0, -1.0, 1.0, 0.0, -2.0], [5.0] * 6, (2, "the contact")),
         # 2, 1.5 and 3 s; then as low again, which is not the first.
         ([1.0, 1.0, 4.0, 3.0, 3.0, 1.5], [9.0, 9.0, 2.0, 2.0, 1.0, 1.0], (3, "the lowest time to")),
         ([1.0, 1.0, 4.0, 5.0, 6.0, 7.0], [9.0, 9.0, 0.0, -1.0, 0.0, -1.0], (2, "the merge")),
@@ -45,10 +44,9 @@ def test_is_looked_for_from_the_merge_on(
     assert Conflict.of(Trajectory(case, before, End.MERGED, after=after)) == (row, what)
 
 
-@pytest.mark.parametrize("end", [End.TIMEOUT, End.VUT_ERROR, End.SIM_ERROR])
-def test_is_the_end_without_a_merge(end: End) -> None:
+def test_is_the_end_without_a_merge() -> None:
     case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-    trajectory = Trajectory(case, motion([-1.0, 2.0, 1.0], [5.0] * 3), end)
+    trajectory = Trajectory(case, motion([-1.0, 2.0, 1.0], [5.0] * 3), End.TIMEOUT)
     assert Conflict.of(trajectory) == (2, "the end of the episode")
 
 

@@ -55,16 +55,10 @@ def expected(trajectory: Trajectory) -> str | None:
     at_m = {car: float(x_m[0, car] - x_m[0, VUT]) for car in cars}
     nearest = min(cars, key=lambda car: abs(at_m[car]))
     behind = [car for car in cars if at_m[car] < 0.0] + [VUT] * (at_m[nearest] > 0.0)
-    least_m = (
-        min(
-            abs(float(of_car - of_vut))
-            for car in cars
-            for of_car, of_vut in zip(x_m[:, car], x_m[:, VUT], strict=True)
-        )
-        - LENGTH_M
-    )
-    falls = [v_mps[t, row] - v_mps[t + 1, row] for row in behind for t in range(len(v_mps) - 1)]
-    hardest_mps2 = float(max([0.0, *falls])) / 0.1
+    distance_m = np.abs(np.delete(x_m, VUT, axis=1) - x_m[:, [VUT]])
+    least_m = float(distance_m.min()) - LENGTH_M
+    falls_mps = -np.diff(v_mps[:, behind], axis=0)
+    hardest_mps2 = float(falls_mps.max(initial=0.0)) / 0.1
     near_m = abs(at_m[nearest]) - NEAR_M
     if min(abs(least_m), abs(near_m), abs(hardest_mps2 - HARSH_MPS2)) < CLOSE_CALL:
         return None

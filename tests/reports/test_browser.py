@@ -187,15 +187,8 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         signed = [f"{value:.1f}".replace("-", "\u2212") for value in (x_m, below_m, above_m)]
         of_start = [f"x_POV0 {signed[0]} m", *signed[1:], f"v_POV0 {v_mps:.2f} m/s", "25.50"]
         assert texts == [*of_start, "vut: gap_m 16.20", "14.10"]
-        # What fails is between the two values that pass: 15.1 m of the 36 m that are drawn.
-        stuck, track = (page.locator(f"#why-changes .{name}").first for name in ("stuck", "track"))
-        share = (above_m - below_m) / (2 * 1.5 * (above_m - x_m))
-        assert _box(stuck)["width"] / _box(track)["width"] == pytest.approx(share, abs=0.01)
         drawn = page.locator("#why-time text.named").all_text_contents()
         assert [float(text.split()[-2]) for text in drawn] == [round(t, 1) for t in moments]
-        before = _box(page.locator("#why-time .now"))["x"]
-        page.evaluate("at(0)")
-        assert _box(page.locator("#why-time .now"))["x"] < before - 50
         page.evaluate(f"location.hash = '#case-{second.index}'")
         page.locator("#why-ask").wait_for()
         assert not page.locator("#why-known").is_visible()
@@ -206,7 +199,3 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         page.evaluate(f"location.hash = '#case-{passed}'")
         page.wait_for_function(f"chosen === place.get({passed})")
         assert not page.locator("#why").is_visible()
-
-
-def _box(locator):
-    return locator.bounding_box()

@@ -69,8 +69,6 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
     assert totals == [str(len(cases)), str(len(decided)), str(len(failing) - len(decided))]
     runs = page.xpath("//dl/div[dt/text()='runs']/dd/text()")
     assert runs == [str(30 * RUNS)]
-    assert "arc: the share of its runs that fail" in text
-    assert "by the surrogate, within 0.025 of cases that ran more than once" in text
     assert "An undecided case fails in more than 20 % of its runs so far" in text
     with shown(browser, made.folder / REPORT) as opened:
         # All cases ran more than once: the learned probability is shown around each, nowhere else.
@@ -81,11 +79,9 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
         assert f"undecided ({len(failing) - len(decided)})" in words
         arcs = opened.locator(".map .of-runs")
         assert arcs.count() == len(both_ways)
-        drawn = sorted(
-            float(arcs.nth(place).get_attribute("stroke-dasharray").split()[0])
-            for place in range(arcs.count())
-        )
-        assert drawn == sorted(100.0 * failures[start] / RUNS for start in both_ways)
+        drawn = arcs.evaluate_all("all => all.map((arc) => arc.getAttribute('stroke-dasharray'))")
+        shares = {f"{100 * failures[start] // RUNS}" for start in both_ways}
+        assert {dashes.split()[0] for dashes in drawn} == shares
         start = both_ways[0]
         index = opened.evaluate(
             "([x, v]) => cases.index.find((_, i) => Math.abs(cases.x_pov0_m[i] - x) < 0.01"

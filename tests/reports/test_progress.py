@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 
 import pytest
 from lxml import html
@@ -29,10 +28,10 @@ def clock(monkeypatch):
     return now
 
 
-def bars_for(folder, *, terminal=False, shown=True, cases=180, tolerated=0.0):
+def bars_for(folder, *, terminal=False):
     out = io.StringIO()
     console = Console(file=out, force_terminal=terminal, width=100, color_system=None)
-    return CampaignBars(folder, cases, tolerated, shown=shown, console=console), out
+    return CampaignBars(folder, 180, console=console), out
 
 
 def said(run, tmp_path, clock, **how) -> str:
@@ -63,22 +62,6 @@ def test_on_a_terminal_bars_end_with_what_was_found(run, tmp_path, clock):
     shown = said(run, tmp_path, clock, terminal=True)
     for text in ("a [b]: 180 cases", "0/180", "180/180", "1 error", "40/40"):
         assert text in shown
-
-
-def test_a_case_counts_once_and_fails_while_more_of_its_runs_fail_than_tolerated(
-    run, tmp_path, clock
-):
-    fails = next(outcome for outcome in run.outcomes if outcome.failed)
-    passes = next(outcome for outcome in run.outcomes if not outcome.failed).measures
-    bars, out = bars_for(tmp_path, cases=4, tolerated=0.5)
-    bars.begin("a")
-    for draw, measures in enumerate((fails.measures, passes, fails.measures, fails.measures)):
-        clock[0] += 10.0
-        case = replace(fails.case, draw=draw)
-        bars.ended([replace(fails, index=draw, case=case, measures=measures, margin=None)])
-    found = [line.split("  ")[1] for line in out.getvalue().splitlines()[1:]]
-    unsure = "0 failures, 1 undecided"
-    assert found == [unsure, "0 failures", unsure, unsure], "half of the runs is not more"
 
 
 @pytest.mark.parametrize(
