@@ -212,8 +212,5 @@ def _simulate_both(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]
 
 
 def _open_simulators(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[None]:
-    earlier = plan.earlier
-    if earlier is not None:
-        _open_simulators(earlier, nothing)
-    with opened_simulator(replace(plan, against=None)):
-        return nothing
+    simulate(plan, [])
+    return nothing

@@ -64,8 +64,7 @@ class TestCarsOfTheMainline:
     def test_that_are_far_away_change_nothing(self, level):
         alone, far = cases_of(level, 60, US23), []
         for case in alone:
-            headways = {"headway_ahead_s": 18.0, "headway_behind_s": 16.0}
-            far.append(replace(case, scenario=TRAFFIC, **headways))
+            far.append(replace(case, scenario=TRAFFIC, headway_ahead_s=18.0, headway_behind_s=16.0))
         for one, other in zip(run("design2", alone), run("design2", far), strict=True):
             assert np.array_equal(one.motion, other.motion[:, :2])
             assert one.end == other.end
