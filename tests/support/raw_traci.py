@@ -31,15 +31,13 @@ class GoneError(Exception):
 
 
 class Client:
-    def __init__(self, port: int, patience_s: float = 10.0) -> None:
-        for left in reversed(range(max(round(patience_s / RETRY_S), 1))):
-            try:
-                self.socket = socket.create_connection(("127.0.0.1", port), timeout=patience_s)
-                break
-            except OSError:
-                if not left:
-                    raise
-                time.sleep(RETRY_S)
+    def __init__(self, port: int) -> None:
+        for _ in range(500):
+            with suppress(OSError):
+                self.socket = socket.create_connection(("127.0.0.1", port), timeout=10.0)
+                return
+            time.sleep(RETRY_S)
+        raise GoneError
 
     def send(self, *commands: bytes) -> None:
         content = b"".join(commands)
@@ -49,15 +47,13 @@ class Client:
             raise GoneError from error
 
     def read(self, count: int) -> bytes:
-        data = b""
+        data, part = b"", b""
         while len(data) < count:
-            try:
+            with suppress(OSError):
                 part = self.socket.recv(count - len(data))
-            except OSError as error:
-                raise GoneError from error
             if not part:
                 raise GoneError
-            data += part
+            data, part = data + part, b""
         return data
 
     def ask(self, *commands: bytes) -> bytes:
@@ -67,14 +63,14 @@ class Client:
     def step(self, target_s: float = 0.0) -> None:
         self.ask(command(STEP, struct.pack("!d", target_s)))
 
-    def speed(self, vehicle: str = "vut") -> float | None:
-        """Return the speed of a vehicle, or None when it is not there."""
-        answer = self.ask(command(GET_VEHICLE, bytes((SPEED,)) + text(vehicle)))
+    def speed(self) -> float | None:
+        """Return the speed of the VUT, or None when it is not there."""
+        answer = self.ask(command(GET_VEHICLE, bytes((SPEED,)) + text("vut")))
         return struct.unpack("!d", answer[-8:])[0] if answer[2] == 0 else None
 
-    def set_speed(self, value: float, vehicle: str = "vut") -> bytes:
+    def set_speed(self, value: float) -> None:
         typed = struct.pack("!Bd", 0x0B, value)
-        return self.ask(command(SET_VEHICLE, bytes((SPEED,)) + text(vehicle) + typed))
+        self.ask(command(SET_VEHICLE, bytes((SPEED,)) + text("vut") + typed))
 
     def drive(self, steps: int) -> None:
         """Make steps on the level-0 profile."""

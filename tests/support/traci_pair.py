@@ -112,6 +112,11 @@ class ToSession(Connection):
         return result
 
 
+def _options(folder: Path) -> list[str]:
+    files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
+    return [*files, *OPTIONS]
+
+
 def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
     """Start a real SUMO behind its own TraCI server; return it and a client's connection.
 
@@ -119,10 +124,8 @@ def open_program(folder: Path) -> tuple[subprocess.Popen[bytes], Any]:
     """
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
-    program = sumo_program("sumo")
     process = subprocess.Popen(
-        [program, *files, *OPTIONS, "--remote-port", str(port)],
+        [sumo_program("sumo"), *_options(folder), "--remote-port", str(port)],
         env=sumo_environment(),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -180,31 +183,29 @@ class Pair:
         self.process, self.real = open_program(folder)
         vehicle = self.real.vehicle
         changes_mps = {"vut": change_mps, "pov": -change_mps}
+        before_mps: dict[str, float] = {}
         starts = {"pov": (road.mainline, *pov), "vut": (road.ramp, -182.0, 18.0)}
         for name, (path, x_m, v_mps) in starts.items():
             self.real.route.add(f"route.{name}", edges_of(path))
             point = path.point(x_m)
-            lane = point.lane.rpartition("_")[2]
             place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
-            vehicle.add(name, f"route.{name}", typeID=name, departLane=lane, **place)
+            place["departLane"] = point.lane.rpartition("_")[2]
+            vehicle.add(name, f"route.{name}", typeID=name, **place)
             vehicle.setColor(name, COLOURS[name == "vut"])
-        begins_m: dict[str, dict[str, float]] = {}
-        before = {}
-        for name, (path, _, v_mps) in starts.items():
-            begins_m[name] = {piece.lane: piece.start_m for piece in path.pieces}
-            before[name] = v_mps
+            before_mps[name] = v_mps
         for step in range(steps):
             self.session.answered()
             self.real.simulationStep()
             states = {}
-            for name in starts:
+            for name, (path, *_) in starts.items():
                 vehicle.setSpeedMode(name, DEPARTURE_SPEED_MODE if name == "vut" else 32)
                 vehicle.setLaneChangeMode(name, 0)
                 vehicle.setSpeed(name, vehicle.getSpeed(name) + changes_mps[name])
-                v_mps = vehicle.getSpeed(name)
-                x_m = begins_m[name][vehicle.getLaneID(name)] + vehicle.getLanePosition(name)
-                states[name] = x_m, v_mps, (v_mps - before[name]) / DT_S
-                before[name] = v_mps
+                lane, v_mps = vehicle.getLaneID(name), vehicle.getSpeed(name)
+                (begin_m,) = [piece.start_m for piece in path.pieces if piece.lane == lane]
+                x_m = begin_m + vehicle.getLanePosition(name)
+                states[name] = x_m, v_mps, (v_mps - before_mps[name]) / DT_S
+                before_mps[name] = v_mps
             if step:
                 self.session.sumo.call("vehicle.setSpeed", "vut", states["vut"][1])
                 self.session.step()
@@ -229,20 +230,19 @@ class Drive:
         self.road, self.folder = road_of(), folder
         write_files(folder, self.road, US23)
         self.process, self.real = open_program(folder)
-        self.real.route.add("route.vut", edges_of(self.road.ramp))
 
     def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
         """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
         self.restart(pov)
-        _as_at_first(self.real)
-        if "vut" in self.real.vehicle.getIDList():
-            self.real.vehicle.remove("vut")
-        self.real.vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
+        self.real.load(_options(self.folder))
+        self.real.route.add("route.vut", edges_of(self.road.ramp))
+        vehicle = self.real.vehicle
+        vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
         self.real.simulationStep()
-        self.real.vehicle.setSpeedMode("vut", DEPARTURE_SPEED_MODE)
-        self.real.vehicle.setLaneChangeMode("vut", 0)
-        self.real.vehicle.setColor("vut", COLOURS[1])
-        self.real.vehicle.setSpeed("vut", 18.0)
+        vehicle.setSpeedMode("vut", DEPARTURE_SPEED_MODE)
+        vehicle.setLaneChangeMode("vut", 0)
+        vehicle.setColor("vut", COLOURS[1])
+        vehicle.setSpeed("vut", 18.0)
 
     def restart(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
         """Let the vehicles depart in a new session."""
@@ -273,15 +273,6 @@ class Drive:
     def close(self) -> None:
         close_mirror()
         end_program(self.process)
-
-
-def _as_at_first(connection: Any) -> None:
-    """Give the VUT's type the numbers that it had."""
-    vehicletype = connection.vehicletype
-    vehicletype.setMaxSpeed("vut", road_of().speed_limit_mps)
-    vehicletype.setAccel("vut", US23.a_max_mps2)
-    vehicletype.setDecel("vut", -US23.a_min_mps2)
-    vehicletype.setEmergencyDecel("vut", -US23.a_min_mps2)
 
 
 def questions() -> Iterator[tuple[str, str, tuple[Any, ...]]]:
