@@ -17,15 +17,14 @@ from merge_sumo.analysis.comparison import (
     with_shares,
 )
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.campaigns.again import campaign_in, command
+from merge_sumo.campaigns.again import command
 from merge_sumo.campaigns.repeats import others_drive, repeat_of, unrepeatable
 from merge_sumo.campaigns.run import Run
-from merge_sumo.controllers.kinds import waits_for_client
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
-from merge_sumo.scenario.scenario import LEVELS, OWN, AnyLevels, level_name, names_of_levels
+from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
 from merge_sumo.simulation.evaluate import evaluate, open_simulators, with_measures
 
 AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
@@ -80,7 +79,11 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
         outcomes=[ran[outcome.index].outcome for outcome in before],
         motions=lambda indices: {index: motions[index] for index in indices},
     )
-    compared = of_two(earlier, later, _source(study))
+    source = (
+        f"the cases come from the recorded search of {run.vut}; a campaign with `against` searches "
+        "for cases that only the new version fails"
+    )
+    compared = of_two(earlier, later, source)
     (step,) = compared.steps
     cases = step.cases
     if isinstance(run, CasesFile):
@@ -126,25 +129,3 @@ def _ran(
         episodes[old.index] = episode.at(old.index, old.batch)
         on_cases(1)
     return episodes
-
-
-def _source(study: RunStudy) -> str:
-    """Return a sentence on the origin of the cases, with the command of a search of today's VUT."""
-    settings, before = study.settings, study.run.settings.vut
-    earlier = None if before == settings.vut or waits_for_client(before) else before
-    some_levels = OWN not in settings.levels and settings.levels != LEVELS
-    own_rule = settings.fail_when != settings.scenario.criterion
-    search = campaign_in(
-        settings.scenario,
-        vut=settings.vut,
-        against=earlier,
-        pov=settings.pov,
-        level=",".join(map(str, settings.levels)) if some_levels else None,
-        fail_when=settings.fail_when if own_rule else None,
-    )
-    source = (
-        f"the cases come from the search of {study.run.vut} as it was recorded, so what the "
-        "version of now alone fails may lie elsewhere"
-    )
-    # A scenario in a file that is not here has no command.
-    return f"{source}: `{search}` searches there" if search else source

@@ -19,8 +19,6 @@ from merge_sumo.controllers.python import object_of
 from merge_sumo.controllers.signatures import is_code
 from merge_sumo.controllers.spec import HERE, PYTHON, ControllerSpec
 from merge_sumo.printable import quoted
-from merge_sumo.road.scenario_file import spoken_name
-from merge_sumo.scenario.scenario import US23, Scenario
 
 CONTROLLERS = ("vut", "pov", "against")
 OPTIONS = {"run": ("run", "case"), "resume": ("campaign", "resume")}
@@ -87,14 +85,6 @@ def call(verb: str, *arguments: Argument, **options: Argument) -> str:
         expression = _controller(str(value)) if name in CONTROLLERS else _expression(value)
         parts.append(f"{name}={expression}")
     return f"ms.{verb}({', '.join(parts)})"
-
-
-def campaign_in(scenario: Scenario, **options: str | None) -> str:
-    """Return the command of a campaign in a scenario; empty for a scenario without a name."""
-    name = spoken_name(scenario)
-    if name is None:
-        return ""
-    return command("campaign", **options, scenario=None if name == US23.name else name)
 
 
 def _flag(name: str) -> str:

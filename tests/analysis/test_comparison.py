@@ -193,7 +193,7 @@ def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
     assert code == 1
     before, after = (version["levels"]["0"]["fmc"] for version in told["versions"])
     assert after < before
-    assert told["source"].startswith("the cases come from the search of design1")
+    assert told["source"].startswith("the cases come from the recorded search of design1")
 
 
 @pytest.mark.parametrize(
