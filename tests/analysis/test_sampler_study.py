@@ -11,13 +11,11 @@ import pytest
 from support.plans import key_of, plan_for
 from support.vut_contract import factory
 
-from merge_sumo import config
 from merge_sumo.analysis.sampler_study import (
     SamplerRun,
     SamplerStudy,
     SamplerSummary,
     Spread,
-    Study,
 )
 from merge_sumo.analysis.truth import Truth, ground_truth
 from merge_sumo.metrics.fmc import fmc
@@ -99,21 +97,6 @@ def test_a_truth_is_of_the_code_that_the_vut_loaded_also_while_it_drove(tmp_path
     (tmp_path / "late_gain.py").write_text("# changed")
     assert truth_of(vut, tmp_path / "cache") == 4
     assert truth_of(vut, tmp_path / "cache") == 0
-
-
-def test_a_study_says_what_samplers_found_of_the_truth(cache):
-    study = Study(plan_for("design1"), cache=cache)
-    asked = config.Benchmark("design1", seeds=2, cases=50, batch=20, truth_cases=300)
-    result = study.compare((0,), ["uniform"], asked)
-    found = result.samplers["uniform"]
-    assert found.cases_by_batch == [20, 40, 50]
-    assert all(curve == sorted(curve) for curve in found.fmc_by_batch)
-    assert result.is_small
-    assert found.fmc_over_truth == found.cases_to_90_percent == Spread(None, None, None)
-    assert found.covered_share_by_batch == sorted(found.covered_share_by_batch)
-    share = found.covered_share
-    assert 0.0 < share.low <= share.median <= share.high <= 1.0
-    assert result.dense == {}
 
 
 def searched(points_by_batch: list[list[tuple[float, float]]]) -> SamplerRun:

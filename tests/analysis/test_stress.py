@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 import merge_sumo as ms
-from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, StressResult, flips_of
+from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, flips_of
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
@@ -65,9 +66,11 @@ def test_verdicts_flip_as_the_cases_by_themselves_say(run, found, name):
 
 
 def test_the_ladder_says_which_failures_are_robust(found):
-    passing = [set(flips.passes + flips.without_verdict) for r in found.rungs for flips in r.runs]
-    robust = [index for index in found.failures if not any(index in some for some in passing)]
-    assert list(found.robust) == robust
+    passing = set[int]()
+    for one in found.rungs:
+        for flips in one.runs:
+            passing |= {*flips.passes, *flips.without_verdict}
+    assert set(found.robust) == set(found.failures) - passing
     assert found.runs == DRAWS + len(RUNGS) - 1
 
 
@@ -76,9 +79,9 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "What hangs by a thread" not in page
     assert "Ten worst failures, one of each region first" in page
-    robust = found.failures[-1]
-    flips = Flips(tuple(index for index in found.failures if index != robust))
-    kept = replaced(found, rungs=(Rung("one", "<b>one</b>", runs=(flips,)),))
+    *others, robust = found.failures
+    flips = Flips(tuple(others))
+    kept = structs.replace(found, rungs=(Rung("one", "<b>one</b>", runs=(flips,)),))
     (run.folder / STRESS.name).write_text(json.dumps(to_plain(kept)))
     page = Path(run.report()).read_text(encoding="utf-8")
     (run.folder / STRESS.name).unlink()
@@ -90,21 +93,14 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     assert listed.index(f'data-case="{robust}"') == listed.index("data-case=")
 
 
-def replaced(found, **changes):
-    names = StressResult.__struct_fields__
-    return StressResult(**{name: changes.get(name, getattr(found, name)) for name in names})
-
-
 def test_flips_by_hand(run):
     failed = next(o for o in run.run.outcomes if o.failed)
     passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
-    fails, passes = failed, passed
-    stands = Measures(end=End.TIMEOUT, score=-400.0)
-    ends = Outcome(0, 0, failed.case, stands)
+    timeout = Outcome(0, 0, failed.case, Measures(end=End.TIMEOUT, score=-400.0))
     both = [failed, passed]
-    assert flips_of(both, [fails, passes]) == Flips()
-    assert flips_of(both, [passes, fails]) == Flips((failed.index,), (passed.index,))
-    assert flips_of(both, [ends, ends]) == Flips((), (), (failed.index, passed.index))
+    assert flips_of(both, both) == Flips()
+    assert flips_of(both, both[::-1]) == Flips((failed.index,), (passed.index,))
+    assert flips_of(both, [timeout] * 2) == Flips((), (), (failed.index, passed.index))
 
 
 def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
