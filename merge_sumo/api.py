@@ -324,9 +324,7 @@ def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | N
 def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
     """Return the replay folder of a case, written where it does not exist yet."""
     path = folder_of(folder)
-    if not (path / SETTINGS).is_file():
-        if index is not None:
-            raise UserError(f"{path} is not a campaign: leave the index away")
+    if index is None and not (path / SETTINGS).is_file():
         return path
     if index is None:
         raise UserError(
@@ -602,25 +600,20 @@ def run_and_report(
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)
-            stop.add_note(f"continue with: {_resumption(settings, folder, where, config)}")
+            # Gates and files are not among the settings.
+            command = again(
+                "resume",
+                folder,
+                asdict(settings),
+                gates=list(config.gates) or None,
+                junit=junit,
+                workers=where.workers if isinstance(where.workers, str) else None,
+            )
+            stop.add_note(f"continue with: {command}")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
-
-
-def _resumption(
-    settings: CampaignSettings, folder: Path, where: c.Execution, config: c.CampaignCalls
-) -> str:
-    """Return the command that continues a campaign; gates and files are not among its settings."""
-    options: dict[str, Any] = {}
-    if config.gates:
-        options["gates"] = list(config.gates)
-    if config.junit is not None:
-        options["junit"] = config.junit
-    if isinstance(where.workers, str):
-        options["workers"] = where.workers
-    return again("resume", folder, asdict(settings), **options)
 
 
 def _note_studies(study: run_study.RunStudy, bars: CampaignBars, check: Callable[[], None]) -> None:

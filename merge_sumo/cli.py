@@ -13,7 +13,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from cyclopts import App, CycloptsError, Group, Parameter, Token
+from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliTokensError
 
 import merge_sumo as ms
 from merge_sumo import config as c
@@ -371,9 +371,12 @@ def execute(words: Sequence[str]) -> int:
     try:
         with notices_printed():
             return app(words) or 0
+    except UnusedCliTokensError as error:
+        unused = " ".join(map(quoted, error.unused_tokens or ()))
+        raise UserError(f"too many arguments: {unused}") from error
     except CycloptsError as error:
         token = getattr(error, "token", None)
-        if token is not None and token.value.startswith("--"):
+        if token is not None and token.keyword and token.value.startswith("--"):
             raise UserError(
                 f"the option {token.keyword} needs a value before {token.value}"
             ) from None

@@ -236,7 +236,7 @@ def open_workers(workers: AnyWorkers = None) -> Workers:
     if isinstance(workers, str):
         return dask_workers(workers)
     count = workers_or_cores(workers)
-    if count > 1 and is_daemonic():
+    if count > 1 and multiprocessing.current_process().daemon:
         notice(
             "the cases run in this process, as a daemonic process, such as a worker of "
             "multiprocessing.Pool, starts no others"
@@ -248,11 +248,6 @@ def open_workers(workers: AnyWorkers = None) -> Workers:
 def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
     """Give workers, which stay open, or this process as the only one."""
     return open_workers(1) if workers is None else nullcontext(workers)
-
-
-def is_daemonic() -> bool:
-    """Return whether `multiprocessing` lets this process start no others."""
-    return multiprocessing.current_process().daemon
 
 
 def dask_workers(address: str) -> Workers:

@@ -28,7 +28,11 @@ Argument = str | Path | int | float | Sequence[int | str] | Mapping[str, float]
 
 
 def again(
-    verb: str, folder: Path, record: Mapping[str, Any], *arguments: Argument, **options: Argument
+    verb: str,
+    folder: Path,
+    record: Mapping[str, Any],
+    *arguments: Argument,
+    **options: Argument | None,
 ) -> str:
     """Return the command of a verb for a recorded campaign, with the controllers of the campaign.
 
@@ -37,9 +41,9 @@ def again(
         folder: folder of the campaign.
         record: content of its `campaign.json`.
         arguments: further arguments after the folder.
-        options: options by keyword; a controller replaces the recorded one.
+        options: options by keyword; a controller replaces the recorded one, None is left out.
     """
-    named: dict[str, Argument] = {}
+    named: dict[str, Argument | None] = {}
     for name in CONTROLLERS:
         spec = record.get(name)
         # A run folder names no code to run; see `settings_of`. Only a campaign has two versions.

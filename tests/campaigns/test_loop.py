@@ -155,44 +155,28 @@ def settings(sampler: str = "gpr", **changes: Any) -> CampaignSettings:
     return campaign_settings(sampler=sampler, **{**values, **changes})
 
 
-UNIFORM = campaign_settings(vut="design1", sampler="uniform", cases=90, batch=20)
-
-
 def recorded(folder: Path) -> dict[str, bytes]:
     """Return what a campaign has recorded, by name."""
     files = [folder / OUTCOMES, *(folder / TRAJECTORIES).iterdir()]
     return {file.name: file.read_bytes() for file in files}
 
 
-@pytest.fixture(scope="module")
-def two():
-    with open_workers(2) as opened:
-        yield opened
-
-
-@pytest.fixture(scope="module")
-def in_turn(tmp_path_factory) -> dict:
-    """What is recorded when every batch of uniform cases waits for the one before."""
-    folder = tmp_path_factory.mktemp("in-turn") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(UniformSampler, "learns", True)
-        run_campaign(UNIFORM, folder)
-    return recorded(folder)
-
-
-@pytest.mark.parametrize("in_flight", [1, 8])
-def test_any_number_in_flight_gives_the_same_bytes_on_any_workers(in_flight, two, tmp_path):
-    few = settings(cases=16, in_flight=in_flight, levels=(0, 1))
+def test_cases_in_flight_give_the_same_bytes_on_any_workers(tmp_path):
+    few = settings(cases=16, in_flight=8, levels=(0, 1))
     run_campaign(few, tmp_path / "1")
-    run_campaign(few, tmp_path / "2", workers=two)
+    with open_workers(2) as two:
+        run_campaign(few, tmp_path / "2", workers=two)
     assert recorded(tmp_path / "1") == recorded(tmp_path / "2")
 
 
-def test_cases_ahead_are_recorded_as_in_turn(in_turn, tmp_path):
+def test_cases_ahead_are_recorded_as_in_turn(tmp_path, monkeypatch):
+    uniform = campaign_settings(vut="design1", sampler="uniform", cases=90, batch=20)
     seen: list[int] = []
-    run_campaign(UNIFORM, tmp_path / "run", on_case=lambda one: seen.append(one.index))
-    assert recorded(tmp_path / "run") == in_turn
+    run_campaign(uniform, tmp_path / "ahead", on_case=lambda one: seen.append(one.index))
     assert seen == list(range(90))
+    monkeypatch.setattr(UniformSampler, "learns", True)
+    run_campaign(uniform, tmp_path / "in turn")
+    assert recorded(tmp_path / "ahead") == recorded(tmp_path / "in turn")
 
 
 @pytest.mark.parametrize(

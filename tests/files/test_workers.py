@@ -22,7 +22,7 @@ from support.processes import wait_for
 
 from merge_sumo import api
 from merge_sumo.campaigns.run import OUTCOMES
-from merge_sumo.errors import Notice, UserError, WorkersLostError
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -257,18 +257,6 @@ class TestADaskCluster:
             f"continue with: merge-sumo campaign --resume run --gate 'fmc>0.5' --workers {address}"
         )
         assert all(line.startswith(("design1 v level 0", "cases: ", "so far")) for line in before)
-
-    @pytest.mark.slow
-    def test_that_is_gone_leaves_a_note_in_python(self, cluster, tmp_path):
-        address, _, scheduler = cluster
-        folder = tmp_path / "run"
-        keywords: dict[str, Any] = {"sampler": "uniform", "level": 0, "progress": False}
-        keywords |= {"cases": 20_000, "out": folder, "workers": address}
-        with pytest.raises(WorkersLostError) as lost:
-            api.campaign("design1", on_case=lambda _: scheduler.kill(), **keywords)
-        note = f"continue with: merge-sumo campaign --resume {folder} --workers {address}"
-        assert lost.value.__notes__ == [note]
-        assert lost.value._render_traceback_()[-1] == note
 
     @pytest.mark.slow
     def test_gives_the_same_outcomes_although_a_worker_is_killed(self, cluster, expected, tmp_path):
