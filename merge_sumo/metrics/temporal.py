@@ -1,9 +1,8 @@
 """Requirements over time: signal temporal logic over the signals of an episode, by rtamt.
 
-A formula says what is to hold, such as `always (v_vut_mps > 2)`. Its robustness at the begin of the
-episode (Donze and Maler, 2010) is above 0 where it holds and below where it does not, in the units
-of the signals. rtamt (Nickovic and Yamaguchi, 2020) imports modules that a formula names, so that
-only words and signs of our own get to it.
+A formula has to hold, such as `always (v_vut_mps > 2)`. Its robustness at the begin of the episode
+(Donze and Maler, 2010) is above 0 where it holds, in the units of the signals. rtamt (Nickovic and
+Yamaguchi, 2020) imports modules that a formula names: only known words and signs reach it.
 """
 
 from __future__ import annotations
@@ -27,9 +26,9 @@ SIGNALS = (
     *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
     *("dx_m", "dv_mps", "bumper_gap_m", "ttc_s"),
 )
-"""What a formula may speak of, at every step; of the car that is nearest to the VUT at M."""
+"""Signals of a formula, at every step; of the car that is nearest to the VUT at M."""
 NEVER_S = 100.0
-"""The time to collision where no gap closes, and the longest."""
+"""The longest time to collision, also where no gap closes."""
 LAST_PYTHON = (3, 12)
 """The last one that the parser of rtamt runs on."""
 WORDS = (
@@ -37,39 +36,35 @@ WORDS = (
     *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
 )
 FINITE = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
-"""Parts of a formula that have numbers, by rtamt's names; infinite, they would decide by chance."""
+"""Parts of a formula with numbers, by rtamt's names: infinite ones would decide by chance."""
 _TOKEN = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
+_WORD = re.compile(r"[A-Za-z_]\w*")
 _BOUNDS = re.compile(r"\[([^\]]*)\]")
 _NUMBER = re.compile(r"\d+\.?\d*|\.\d+")
 
 
 def check_formula(text: str) -> str:
-    """Return a formula on one line, with single spaces; `UserError` where a word or sign is none.
+    """Return a formula on one line, with single spaces; `try_formula` parses it.
 
-    Whether it is one as a whole, `try_formula` says.
+    Raises:
+        UserError: it has an unknown word or sign, or a time that no episode has.
     """
-    what = f"`require` {printable(text[:80])!r}"
     if len(text) > MOST_CHARACTERS:
         raise UserError(f"`require` has {len(text)} characters: {MOST_CHARACTERS} are the most")
-    place = depth = 0
-    while place < len(text):
-        token = _TOKEN.match(text, place)
-        if token is None:
-            sign = printable(text[place])
-            raise UserError(
-                f"{what}: at character {place + 1}: {sign!r} is no part of a formula over signals"
-            )
-        word = token[0]
-        if (word[0].isalpha() or word[0] == "_") and word not in (*SIGNALS, *WORDS):
-            hint = meant(word, (*SIGNALS, *WORDS))
-            hint = hint or f"choose {', '.join(SIGNALS)}"
-            raise UserError(
-                f"{what}: at character {place + 1}: there is no signal {word!r}: {hint.strip()}"
-            )
-        depth += (word == "(") - (word == ")")
+    what = f"`require` {printable(text[:80])!r}"
+    if unknown := _TOKEN.sub("", text):
+        sign = printable(unknown[0])
+        raise UserError(f"{what}: {sign!r} is not part of a formula over signals")
+    known = (*SIGNALS, *WORDS)
+    for word in _WORD.findall(text):
+        if word not in known:
+            hint = meant(word, known) or f"choose {', '.join(SIGNALS)}"
+            raise UserError(f"{what}: there is no signal {word!r}: {hint.strip()}")
+    depth = 0
+    for sign in text:
+        depth += (sign == "(") - (sign == ")")
         if depth < 0:
             raise UserError(f"{what}: a bracket is closed that was not opened")
-        place = token.end()
     for bounds in _BOUNDS.findall(text):
         ends_s = [float(number) for number in _NUMBER.findall(bounds)]
         if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
@@ -78,7 +73,7 @@ def check_formula(text: str) -> str:
 
 
 def try_formula(text: str) -> None:
-    """Raise `UserError` where a checked formula is none, or rtamt is missing."""
+    """Raise `UserError` where a checked formula cannot be parsed, or rtamt is missing."""
     try:
         _robustness(text, {name: np.ones(2) for name in SIGNALS})
     except ImportError as error:
@@ -93,7 +88,7 @@ def try_formula(text: str) -> None:
     # A parser that is not ours.
     except Exception as error:
         raise UserError(
-            f"`require` {text[:80]!r} is no formula of signal temporal logic such as 'always "
+            f"`require` {text[:80]!r} is not a formula of signal temporal logic such as 'always "
             f"((x_vut_m > -20) implies (bumper_gap_m > 2))': {printable(str(error))[:200]}"
         ) from error
 
@@ -127,8 +122,8 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
     data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
     specification = _specification(text)
     value = float(specification.evaluate(data)[0][1])
-    # A minimum or a maximum over time hides what is no number, so that every part is looked at; an
-    # operator with bounds in time appends infinities to its part.
+    # A minimum or a maximum over time hides infinite values: every part is checked, without the
+    # infinities that an operator with bounds in time appends.
     for node, part in specification.ast.offline_results.items():
         if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
             raise UserError(

@@ -1,4 +1,4 @@
-// The report beside its player (player.js): maps, the view of a case, and the table of all cases.
+// The report around its player (player.js): maps, the view of a case, and the table of all cases.
 const PLACE = data.place; // M, or what merges from an acceleration lane are called
 const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
 const place = new Map(cases.index.map((index, i) => [index, i]));
@@ -225,7 +225,7 @@ function ticks(step) {
 
 /* ---------- a case: road, motion, charts ---------- */
 const panel = byId("case");
-function dock(on) { // at the foot of the window, or in its place beside the lists
+function dock(on) { // at the foot of the window, or in its place next to the lists
   panel.classList.toggle("docked", on);
   byId("explorer").classList.toggle("docked", on);
   byId("close").hidden = !on;
