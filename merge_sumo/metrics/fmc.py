@@ -12,7 +12,7 @@ The paper has two and three dimensions, with one radius. Failures are a thin lay
 hypersurface of the pool, where the order of merging changes, and a ball covers a disc of it with
 one dimension less. In more dimensions a disc of the paper's radius would be next to nothing, so
 there the radius is the one for which the disc is as large as in three (`radius_for`): to cover as
-much of such a layer takes about as many balls.
+much of such a layer takes about the same number of balls.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _near(points: ArrayLike, others: ArrayLike, nth: int) -> BoolArray:
 
 
 def growth_bound(points: ArrayLike) -> float:
-    """Return the most that as many uniform cases again add to the FMC, as a share of it.
+    """Return a bound on the FMC that the same number of uniform cases again adds, as a share of it.
 
     Of N uniform cases, the failures within a radius of a place x are Poisson distributed with mean
     N m(x), where m is the failing share of the pool in the ball around x. The expected volume in
@@ -247,7 +247,7 @@ def _places_in_ball(dimension: int) -> FloatArray:
 
 
 def _checked(points: ArrayLike) -> FloatArray:
-    """Return points as an array (n, d), or raise a ValueError that says what is wrong."""
+    """Return points as an array (n, d), or raise a ValueError."""
     cases = np.asarray(points, dtype=np.float64)
     if cases.shape == (0,):
         return np.zeros((0, 1))

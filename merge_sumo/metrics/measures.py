@@ -198,7 +198,7 @@ class Measures:
     __hash__ = None  # type: ignore[assignment]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the values: the episode goes on its own."""
+        """Return the values without the episode."""
         return self.values
 
     def __setstate__(self, values: dict[str, Any]) -> None:
@@ -252,7 +252,7 @@ class Measures:
     def pet_s(self) -> float | None:
         """Post-encroachment time: time between the two front bumpers at M (Allen et al., 1978).
 
-        Where the POV has not arrived by t1, it is taken on at its speed at t1; None when it stands.
+        A POV that has not arrived by t1 keeps its speed at t1; None when it stands.
         """
         return _post_encroachment_time(self.trajectory) if self.end.is_tested else None
 
@@ -326,10 +326,10 @@ class Measures:
         column="braking asked after M",
     )
     def brake_after_mps2(self) -> float | None:
-        """Deceleration that whoever is behind at M needs not to touch the car ahead.
+        """Deceleration of the vehicle behind at M that keeps it from touching the one ahead.
 
-        It begins after 0.75 s to react, and the car ahead keeps its speed (`merge.py`);
-        None where none is in time, and without a merge.
+        It begins after a reaction time of 0.75 s, and the vehicle ahead keeps its speed; None where
+        no braking is in time, and without a merge.
         """
         return brake_after_mps2(self.trajectory) if self.end is End.MERGED else None
 
@@ -390,9 +390,8 @@ class Measures:
     def last_avoidable_s(self) -> float | None:
         """Where |dx| < 6 m at M, the last time from which the VUT could have kept 6 m.
 
-        At full acceleration or full braking by eq. (4), against the recorded motion of the
-        POV and the other
-        cars (taken on at their last speed); None when there was no such time, and where
+        At full acceleration or full braking by eq. (4), against the recorded motion of the other
+        cars, which then keep their last speed; None when there was no such time, and where
         |dx| >= 6 m.
         """
         return last_avoidable_s(self.trajectory) if self.is_close else None
@@ -409,7 +408,7 @@ class Measures:
 
     @measure()
     def error(self) -> str | None:
-        """What the VUT or the simulation did wrong, also after M, else None."""
+        """Message of an error of the VUT or of the simulation, also after M, else None."""
         return None if self.trajectory.error is None else as_reason(self.trajectory.error)
 
     @measure(only_with=TRAFFIC, default=VEHICLES[POV])

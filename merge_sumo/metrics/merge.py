@@ -1,12 +1,9 @@
-"""The state in which the VUT merges: bodies instead of points, and what those behind must do then.
+"""The merge and the time after it: bumper gaps, severity, the first conflict, and ways out.
 
-At M both drive in one lane. The bumper gap is from the front bumper of the one behind to the rear
-bumper of the one ahead. The one behind has to brake so that the bodies never touch while the one
-ahead keeps its speed; it begins after the time that a driver takes to react. With the gap g and
-the closing speed w that is w^2 / (2 (g - w tau)).
-
-The severity of an encounter follows from the simulated motion at M and behind it; what counts as a
-failure is another question (`criterion.py`).
+At M both vehicles drive in one lane. The bumper gap is from the front bumper of the one behind to
+the rear bumper of the one ahead. The one behind has to brake so that bodies never touch while the
+one ahead keeps its speed; it begins after a reaction time. With the gap g and the closing speed w
+that is w^2 / (2 (g - w tau)).
 """
 
 from __future__ import annotations
@@ -116,10 +113,9 @@ def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
 
 
 def braked_after_mps2(trajectory: Trajectory) -> float | None:
-    """Return the hardest braking after M, in m/s2, of those that are behind another there.
+    """Return the hardest braking after M, in m/s2; None without a follow-up.
 
-    They are the cars behind the VUT at M, and the VUT itself where the nearest car is ahead of it.
-    None without a follow-up.
+    It is of the cars behind the VUT at M, and of the VUT where the nearest car is ahead of it.
     """
     if trajectory.after is None:
         return None
@@ -147,7 +143,7 @@ class Severity(StrEnum):
 
 
 def meanings(scenario: Scenario) -> dict[Severity, str]:
-    """Return what the words mean in a scenario."""
+    """Return the meaning of each severity in a scenario."""
     soon = f"within {scenario.follow_up_s:g} s after"
     found = {
         Severity.CONTACT: f"bodies touch at M or {soon} it",
@@ -168,7 +164,7 @@ def check_from(from_s: float | None) -> None:
 
 
 class Conflict(NamedTuple):
-    """The row of the first conflict of an episode, and what it is.
+    """The row of the first conflict of an episode, and its kind in words.
 
     With the VUT in the lane of the mainline it is the contact, where bodies first overlap, else the
     lowest time to collision between bumpers, else the merge. Without a merge it is the end.
@@ -197,14 +193,18 @@ class Conflict(NamedTuple):
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Self:
-        """Find it in what happened."""
+        """Find it in the motion of an episode."""
         scenario = trajectory.case.scenario
         merges = len(trajectory.motion) - 1 if trajectory.end is End.MERGED else None
         in_one_lane = scenario.ramp == scenario.mainline
         return cls.find(trajectory.whole, 0 if in_one_lane else merges, scenario.lengths_m)
 
     def begin(self, from_s: float | None) -> tuple[int, list[str]]:
-        """Return the row so long before it and that in words; the first one, without, for None."""
+        """Return the row some time before it, and a line that says so.
+
+        Args:
+            from_s: time, not above 0; None for the first row, without a line.
+        """
         if from_s is None:
             return 0, []
         row = round(max(self.row + from_s / DT_S, 0.0))
@@ -221,9 +221,8 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
     where the VUT merged. In traffic every car has to be avoided, and
     gaps between cars are left out.
 
-    Other cars move as recorded, and keep their last speed after that. The VUT moves by eq. (4), as
-    in the record: by the speed before a step, so what it decides in one moves it from the next on.
-    By the speed after the step the time would be a step later, and up to 0.5 s.
+    Other cars move as recorded, then keep their last speed. The VUT moves by eq. (4): by the speed
+    before a step, so that a decision moves it from the next step on.
     """
     place_m = place_of_merge_m(trajectory)
     cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario

@@ -1,4 +1,4 @@
-"""Doubts about the outcomes of a campaign, in sentences: what to know before believing them."""
+"""Doubts about the outcomes of a campaign, in sentences."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ _THRESHOLD = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(
 
 
 def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str, int]) -> list[str]:
-    """Return sentences on what is odd about the outcomes of a campaign; none for most.
-
-    Of a criterion that says the same of all cases, a neighbour that would not. `vain` are commands
-    that changed nothing: see `in_vain`.
+    """Return sentences on doubts about a campaign; none for most.
 
     Args:
         outcomes: outcomes of a campaign.
-        criterion: the failure criterion.
+        criterion: its failure criterion. Where all cases have the same verdict, a threshold in
+            another unit or of the other sign is suggested if it would tell cases apart.
         vain: number of cases by command that had no effect.
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
@@ -37,7 +35,7 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
 
 
 def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield in how many cases a driver fails after M, where a verdict stands already."""
+    """Yield a sentence on cases with an error after M, which have a verdict."""
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:
         first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"
@@ -45,7 +43,7 @@ def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
 
 
 def in_vain(cases: Mapping[str, int]) -> list[str]:
-    """Return a sentence on commands that changed nothing, by the cases in which they were given."""
+    """Return a sentence on commands without an effect, by the number of cases with each."""
     listed = ", ".join(f"{printable(name)} in {counted(n, 'case')}" for name, n in cases.items())
     return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
 
@@ -89,7 +87,7 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[
 
 
 def _with_other_thresholds(condition: str) -> Iterator[tuple[str, str]]:
-    """Yield a condition with a threshold in another unit or of the other sign, and what it is."""
+    """Yield a condition with a threshold in another unit or of the other sign, and its meaning."""
     for found in _THRESHOLD.finditer(condition):
         name, number = found[1], float(found[2])
         others = [(-number, "the other sign")]

@@ -40,7 +40,7 @@ FORMATS = {
     "csv": "one table of motion",
     "cases": "one file to commit: at most 40 cases, or those named",
 }
-"""What is written, by the name that follows `--format`."""
+"""Content of each format."""
 
 
 def export_cases(
