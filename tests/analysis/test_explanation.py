@@ -213,8 +213,6 @@ def test_a_controller_that_has_changed_is_refused(tmp_path):
     mine = tmp_path / "mine.py"
     mine.write_text("def drive(seen):\n    return 1.0\n")
     own = uniform(f"{mine}:drive", tmp_path / "run", 60)
-    mine.write_text("def drive(seen):
-    return -0.5 if seen.t_s < 4.0 else 0.5
-")
+    mine.write_text("def drive(seen):\n    return -0.5 if seen.t_s < 4.0 else 0.5\n")
     with pytest.raises(UserError, match="nothing can be said of its changes"):
         ms.explain(own, vut=f"{mine}:drive")
