@@ -37,41 +37,30 @@ CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 Point = tuple[float, float, str]
 
 
-def outcome(became: str, index: int = 0) -> Outcome:
-    """Return the outcome of `CASE` by a word, as "contact", "contact, passes" or "timeout"."""
-    if became in ("timeout", "vut error"):
-        end = End[became.replace(" ", "_").upper()]
-        score = None if end.is_error else -1.0
-        return Outcome(index, 0, CASE, Measures(end=end, score=score, t_end_s=60.0))
-    word, _, passes = became.partition(", ")
-    failed = word in ("contact", "conflict") and not passes
-    found = Measures(
-        end=End.MERGED,
-        score=-600.0 if failed else -20.0,
-        t_end_s=8.0,
-        severity=word,
-    )
-    return Outcome(index, 0, CASE, found)
+def outcome(severity: str | None, score: float | None, end: End = End.MERGED) -> Outcome:
+    return Outcome(0, 0, CASE, Measures(end=end, score=score, t_end_s=8.0, severity=severity))
+
+
+SAFE, HARSH = outcome("safe", -20.0), outcome("harsh", -20.0)
+CONTACT, TOUCHES = outcome("contact", -600.0), outcome("contact", -20.0)
+TIMEOUT = outcome(None, -1.0, End.TIMEOUT)
+ERROR = outcome(None, None, End.VUT_ERROR)
 
 
 @pytest.mark.parametrize(
     ("before", "after", "change", "words"),
     [
-        ("contact", "safe", Change.FIXED, "contact -> safe"),
-        ("safe", "contact", Change.BROKE, "safe -> contact"),
-        ("harsh", "vut error", Change.BROKE, "harsh -> vut error"),
-        ("contact", "timeout", Change.NEITHER, "contact -> timeout"),
-        ("contact", "conflict", Change.NEITHER, "contact -> conflict"),
-        ("safe", "harsh", Change.BOTH, "safe -> harsh"),
-        # Bodies still touch: nobody would call that fixed, although the criterion is met.
-        (
-            *("contact", "contact, passes", Change.STILL_CONTACT),
-            "contact, a failure -> contact, no failure",
-        ),
+        (CONTACT, SAFE, Change.FIXED, "contact -> safe"),
+        (SAFE, CONTACT, Change.BROKE, "safe -> contact"),
+        (HARSH, ERROR, Change.BROKE, "harsh -> vut error"),
+        (CONTACT, TIMEOUT, Change.NEITHER, "contact -> timeout"),
+        (SAFE, HARSH, Change.BOTH, "safe -> harsh"),
+        # Bodies still touch, although the criterion is met.
+        (CONTACT, TOUCHES, Change.STILL_CONTACT, "contact, a failure -> contact, no failure"),
     ],
 )
-def test_what_became_of_a_case(before, after, change, words):
-    one = ComparedCase.of([outcome(before)], [outcome(after)])
+def test_the_change_of_a_case(before, after, change, words):
+    one = ComparedCase.of([before], [after])
     assert (one.change, change_in_words(one)) == (change, words)
 
 
@@ -113,7 +102,6 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
         (Change.BOTH, 0, 2),
     ]
     assert (found.broke, found.worse) == (1, True)
-    assert sum(step.transitions.values()) == 3
     # The table of transitions stands before any list of cases.
     lines = found.lines()
     assert lines.index("from 1 to 2: 3 cases with both") < lines.index("broke, 1:")
@@ -133,8 +121,6 @@ def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tm
     assert said.code == 1
     assert "Version 2 passes in a smaller share" in (tmp_path / "page.html").read_text()
     assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "1"
-    found = compare([a, b]).to_record()
-    assert (found["worse"], found["steps"][0]["passes_less"]) == (True, True)
     assert not compare([b, a]).worse, "it passes more often"
     other = changed(tmp_path / "other", b, sampler="uniform")
     assert not compare([a, other]).worse, "another sampler finds other shares in one version"
