@@ -141,8 +141,9 @@ def make_folder(path: Path, option: str = "`out`", *, exist_ok: bool = False) ->
     Raises:
         UserError: it exists or cannot be made.
     """
-    if exist_ok and path.name not in ("", "..") and path.is_dir():
-        return
+    with suppress(OSError):  # `check_new` refuses a name that is too long
+        if exist_ok and path.name not in ("", "..") and path.is_dir():
+            return
     check_new(path, option)
     try:
         path.mkdir(parents=True)

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from support.plans import key_of, plan_for
 from support.processes import cpu_s
+from support.writers import tree
 
 import merge_sumo as ms
 from merge_sumo.analysis.truth import ground_truth, read_truth
@@ -158,15 +159,6 @@ ATTACKS = {
     "device": (TRUTH, truth(files='{"/dev/zero": "0"}'), believe, "not believed"),
 }
 """File, hostile content, the verb that reads it, and how its result begins or what refuses it."""
-
-
-def tree(root: Path) -> dict[str, tuple[int, int, int]]:
-    """Return kind, size and time of everything below a folder."""
-    found = {}
-    for path in root.rglob("*"):
-        status = path.lstat()
-        found[str(path)] = status.st_mode, status.st_size, status.st_mtime_ns
-    return found
 
 
 @pytest.fixture

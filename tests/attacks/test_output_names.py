@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import stat
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from conftest import some
 from support.calling import assert_refused
 from support.campaigning import resume_campaign
-from support.writers import INTO_FOLDERS, PLACES, WRITERS
+from support.writers import INTO_FOLDERS, PLACES, WRITERS, tree
 
 import merge_sumo as ms
 from merge_sumo import files
@@ -36,20 +35,6 @@ ODD = [
     *("x" * 255, " lead", "a%41", "${HOME}", "$(id)", ";ls", "*", "a:b", "-rf", "--help", "a'b"),
     *("a\\b", "\n", "\x1b[31mred", "日本", "\u202eabc", ".hidden", NOT_UTF8, "new/sub"),
 ]
-
-
-def tree(root: Path) -> dict[str, tuple[str, object]]:
-    """Return everything below a folder by its kind and content; links are not followed."""
-    found: dict[str, tuple[str, object]] = {}
-    for path in [root, *root.rglob("*")]:
-        mode = path.lstat().st_mode
-        if stat.S_ISLNK(mode):
-            found[str(path)] = "link", str(path.readlink())
-        elif stat.S_ISREG(mode):
-            found[str(path)] = "file", path.read_bytes()
-        else:
-            found[str(path)] = "other", stat.S_IFMT(mode)
-    return found
 
 
 def no_case(*_: object, **_options: object) -> None:

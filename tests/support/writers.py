@@ -1,18 +1,18 @@
-"""Every command that writes under a name that a person gives, and what may be at that place."""
+"""Every command that writes under a given name, and the things that may have that name."""
 
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
 
-CAMPAIGN: Final = "campaign --vut design1 --level 0 --sampler uniform --cases 60 --seed 1 --quiet"
-BENCHMARK: Final = (
+CAMPAIGN = "campaign --vut design1 --level 0 --sampler uniform --cases 60 --seed 1 --quiet"
+BENCHMARK = (
     "benchmark --vut design1 --level 0 --samplers uniform --seeds 1 --cases 40 --truth-cases 300 "
     "--workers 1"
 )
-WRITERS: Final = {
+WRITERS = {
     "campaign": (f"{CAMPAIGN} --out", ""),
     "junit of a campaign": (f"{CAMPAIGN} --out new --junit", ".xml"),
     "run": ("run --vut design1 --level 0 --x -200 --v 30 --out", ""),
@@ -34,18 +34,18 @@ WRITERS: Final = {
     ),
 }
 """Command up to the name of what it writes, and how that name ends."""
-INTO_FOLDERS: Final = {"export", "export csv", "export openscenario"}
+INTO_FOLDERS = {"export", "export csv", "export openscenario"}
 """These add to a folder that is there."""
 
 
-def folder_of_somebody(path: Path) -> None:
+def folder_of_another_user(path: Path) -> None:
     path.mkdir()
     (path / "notes").write_text("theirs")
 
 
-PLACES: Final[dict[str, Callable[[Path], object]]] = {
+PLACES: dict[str, Callable[[Path], object]] = {
     "a file": lambda path: path.write_text("theirs"),
-    "a folder": folder_of_somebody,
+    "a folder": folder_of_another_user,
     "an empty folder": Path.mkdir,
     "a link to a folder": lambda path: path.symlink_to("theirs"),
     "a link to a file": lambda path: path.symlink_to("theirs/thesis"),
@@ -53,4 +53,15 @@ PLACES: Final[dict[str, Callable[[Path], object]]] = {
     "a link to itself": lambda path: path.symlink_to(path.name),
     "a pipe": os.mkfifo,
 }
-"""What makes what is there already, of somebody else."""
+"""Things of another user at a place, and what makes them."""
+
+
+def tree(root: Path) -> dict[str, tuple[int, ...]]:
+    """Return everything below a folder by kind, and files and links by size and time of change."""
+    found: dict[str, tuple[int, ...]] = {}
+    for path in root.rglob("*"):
+        status = path.lstat()
+        found[str(path)] = (status.st_mode,)
+        if not stat.S_ISDIR(status.st_mode):
+            found[str(path)] += (status.st_size, status.st_mtime_ns)
+    return found
