@@ -29,10 +29,10 @@ def test_a_point_of_a_path_is_where_sumo_draws_its_lane(corridor, name):
     try:
         for path in (road.mainline, road.ramp):
             for piece, following in zip(path.pieces, [*path.pieces[1:], None], strict=True):
-                beside = road.lane_drop and following and following.start_m == 0.0
+                changes = road.lane_drop and following and following.start_m == 0.0
                 length_m = libsumo.lane.getLength(piece.lane)
-                if beside and piece.is_internal:
-                    continue  # one of both is beside the lane that the file has
+                if changes and piece.is_internal:
+                    continue  # one of both is next to the lane of the file
                 name_of_edge, _, index = piece.lane.rpartition("_")
                 for share in (0.0, 0.3, 0.71, 1.0):
                     x, y = libsumo.simulation.convert2D(name_of_edge, share * length_m, int(index))

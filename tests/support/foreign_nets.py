@@ -1,4 +1,4 @@
-"""Nets that are not ours, built by netconvert: what people draw, download and convert."""
+"""Nets of others, drawn, downloaded and converted, as netconvert builds them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import math
 import subprocess
 from pathlib import Path
 
+from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import find_corridor, read_net
+from merge_sumo.scenario.scenario import Bounds
 from merge_sumo.sumo.binding import sumo_program
 
 
@@ -78,7 +80,7 @@ def straight(folder: Path, kind: str) -> Path:
 
 
 def lane_drop(folder: Path, kind: str = "priority") -> Path:
-    """An auxiliary lane beside two lanes: it ends, or at a zipper it is led into the next one."""
+    """An auxiliary lane next to two lanes: it ends, or at a zipper it is led into the next one."""
     into = lane("acc", 0, "out", 0) if kind == "zipper" else ""
     return plain(
         folder,
@@ -91,31 +93,31 @@ def lane_drop(folder: Path, kind: str = "priority") -> Path:
     )  # fmt: skip
 
 
-OSM_NODES_M = {1: (-900, 0), 2: (-500, 10), 3: (-200, 5), 4: (0, 0), 5: (300, -20)} | {
-    6: (900, -100), 7: (-450, -160), 8: (-300, -90), 9: (-150, -30), 10: (1500, -200),
-}  # fmt: skip
+OSM_NODES_M = {
+    **{1: (-900, 0), 2: (-500, 10), 3: (-200, 5), 4: (0, 0), 5: (300, -20), 6: (900, -100)},
+    **{7: (-450, -160), 8: (-300, -90), 9: (-150, -30), 10: (1500, -200)},
+}
 """Nodes of the OpenStreetMap piece, in metres east and north of 42.3 N 83.7 W."""
+OSM_WAYS = """
+<way id="4711" version="1" visible="true"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="4"/>
+<nd ref="5"/><nd ref="6"/><nd ref="10"/><tag k="highway" v="motorway"/><tag k="lanes" v="2"/>
+<tag k="maxspeed" v="70 mph"/></way><way id="4712" version="1" visible="true"><nd ref="7"/>
+<nd ref="8"/><nd ref="9"/><nd ref="4"/><tag k="highway" v="motorway_link"/><tag k="lanes" v="1"/>
+<tag k="oneway" v="yes"/></way>
+"""
 
 
-def osm(folder: Path, *options: str) -> Path:
+def osm(folder: Path) -> Path:
     """Return a motorway with a link, as OpenStreetMap writes it and its import makes a net."""
-    east = 111_320 * math.cos(math.radians(42.3))
-    nodes = "".join(
-        f'<node id="{n}" version="1" visible="true" '
-        f'lat="{42.3 + y / 111_320:.9f}" lon="{-83.7 + x / east:.9f}"/>'
-        for n, (x, y) in OSM_NODES_M.items()
-    )
-
-    def way(number: int, through: list[int], **tags: object) -> str:
-        refs = "".join(f'<nd ref="{n}"/>' for n in through)
-        values = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-        return f'<way id="{number}" version="1" visible="true">{refs}{values}</way>'
-
-    main = way(4711, [1, 2, 3, 4, 5, 6, 10], highway="motorway", lanes=2, maxspeed="70 mph")
-    link = way(4712, [7, 8, 9, 4], highway="motorway_link", lanes=1, oneway="yes")
-    (folder / "piece.osm").write_text(f'<osm version="0.6">{nodes}{main}{link}</osm>')
+    degree_m = 111_320
+    east_m = degree_m * math.cos(math.radians(42.3))
+    nodes = ""
+    for n, (x, y) in OSM_NODES_M.items():
+        place = f'lat="{42.3 + y / degree_m:.9f}" lon="{-83.7 + x / east_m:.9f}"'
+        nodes += f'<node id="{n}" version="1" visible="true" {place}/>'
+    (folder / "piece.osm").write_text(f'<osm version="0.6">{nodes}{OSM_WAYS}</osm>')
     out = folder / "osm.net.xml"
-    netconvert("--osm-files", folder / "piece.osm", *options, "-o", out)
+    netconvert("--osm-files", folder / "piece.osm", "--ramps.guess", "--geometry.remove", "-o", out)
     return out
 
 
@@ -128,7 +130,7 @@ def opendrive(folder: Path, of: Path) -> Path:
 
 
 def two_edges(folder: Path) -> Path:
-    """A curved acceleration lane of two edges, with a sidewalk beside it and internal lanes."""
+    """A curved acceleration lane of two edges, with a sidewalk and internal lanes."""
     bend = "-200,0 -120,6 -60,16 0,30"
     return plain(
         folder,
@@ -149,11 +151,7 @@ FOREIGN = {
     "priority": (lambda f: straight(f, "priority"), "in out out2", "r0 r1 out"),
     "zipper": (lambda f: straight(f, "zipper"), "in out", "r0 r1 out out2"),
     "lane drop": (lane_drop, "in acc out", "ramp acc out"),
-    "OSM": (
-        lambda f: osm(f, "--ramps.guess", "--geometry.remove"),
-        f"4711#0 {AUXILIARY} 4711#1",
-        f"4712 {AUXILIARY} 4711#1",
-    ),
+    "OSM": (osm, f"4711#0 {AUXILIARY} 4711#1", f"4712 {AUXILIARY} 4711#1"),
     "OpenDRIVE": (lambda f: opendrive(f, curved(f)), "-40 -41", "-42 -41"),
 }
 """Name, builder, edges of the mainline and of the ramp."""
@@ -169,14 +167,13 @@ LANE_M = (-30.0, 60.0)
 """Of a scenario; the lanes of these nets are longer."""
 
 
-def corridor_of(name: str, folder: Path):
+def corridor_of(name: str, folder: Path, lane_m: Bounds | None = None) -> Corridor:
     """Build a net and find its merge."""
-    build, mainline, ramp = FOREIGN[name]
-    return find_corridor(read_net(build(folder)), mainline.split(), ramp.split())
-
-
-def lane_corridor_of(name: str, folder: Path):
-    """Return the merge in one of `LANES`, with its acceleration lane."""
-    build, mainline, ramp = LANES[name]
+    build, mainline, ramp = (LANES if lane_m else FOREIGN)[name]
     net = read_net(build(folder))
-    return find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+    return find_corridor(net, mainline.split(), ramp.split(), lane_m=lane_m)
+
+
+def lane_corridor_of(name: str, folder: Path) -> Corridor:
+    """Return the merge in one of `LANES`, with its acceleration lane."""
+    return corridor_of(name, folder, LANE_M)
