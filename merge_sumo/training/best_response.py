@@ -26,9 +26,6 @@ SAME = 1e-2
 MAX_STATES = 200_000
 """With more states, as on a long ramp without such a lattice, states that differ by twice as much
 count as one, and so on. No effect on the returns was seen up to 0.2 m and m/s."""
-SPEED_CELLS = 1 << 16
-POSITION_CELLS = 1 << 20
-"""Upper bounds of the numbers of cells."""
 
 
 def best_response(game: Game, state: FloatArray, known: FloatArray) -> FloatArray:
@@ -123,10 +120,9 @@ def _best_of_each(cases: IntArray, own: FloatArray, so_far: FloatArray, same: fl
         so_far: returns so far, (n,).
         same: difference up to which states count as one, in m and m/s.
     """
-    x, v = np.rint(own.T / same).astype(np.int64)
-    key = (cases * SPEED_CELLS + v) * POSITION_CELLS + (x + POSITION_CELLS // 2)
-    order = np.lexsort((-so_far, key))
-    return order[_begins(key[order][None])]
+    x, v = np.rint(own.T / same)
+    order = np.lexsort((-so_far, x, v, cases))
+    return order[_begins(np.array([cases, v, x])[:, order])]
 
 
 def beam_search(

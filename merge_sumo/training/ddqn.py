@@ -64,13 +64,6 @@ class TrainingProgress:
     total: int  # updates or rounds of this stage
     loss: float  # of DDQN's fit, or the mean loss of return that a choice of the network means
     mean_return: float  # of the games played lately, from exploring starts
-    crash_share: float | None = None  # share of collisions among them; None while refining
-
-    @property
-    def note(self) -> str:
-        """The measurements, for a bar."""
-        crashes = "" if self.crash_share is None else f"  crashes {self.crash_share:.2%}"
-        return f"return {self.mean_return:.3f}{crashes}"
 
 
 def squash(q: Tensor) -> Tensor:
@@ -113,7 +106,7 @@ class _Games:
         self.state = np.zeros((GAMES, 4))
         self.decisions = np.zeros(GAMES, dtype=np.int64)
         self.svo_rad, self.returns = np.zeros((2, GAMES))
-        self.ended: list[tuple[float, bool]] = []
+        self.ended: list[float] = []
         self._begin(np.arange(GAMES))
 
     @property
@@ -148,17 +141,8 @@ class _Games:
         self.decisions += 1
         again = np.flatnonzero(over | (self.decisions >= self.game.max_decisions))
         if again.size:
-            crashed = parts.safe[again] < -self.game.reward.weights.crash / 2
-            self.ended += zip(self.returns[again].tolist(), crashed.tolist(), strict=True)
+            self.ended += self.returns[again].tolist()
             self._begin(again)
-
-    def recent(self) -> tuple[float, float]:
-        """Return mean return and share of crashes of the games that ended last."""
-        self.ended = self.ended[-2000:]
-        if not self.ended:
-            return math.nan, math.nan
-        mean_return, crash_share = np.mean(self.ended, axis=0).tolist()
-        return mean_return, crash_share
 
     def loss(self, online: nn.Sequential, target: nn.Sequential, batch: int) -> Tensor:
         """Return the loss of the online network on some transitions."""
@@ -223,13 +207,11 @@ def train(
             descend(optimiser, loss, online, target, s.gradient_norm)
             update += 1
             if update % 1000 == 0:
-                mean_return, crash_share = games.recent()
                 progress = TrainingProgress(
                     done=update,
                     total=s.updates,
                     loss=float(loss.detach()),
-                    mean_return=mean_return,
-                    crash_share=crash_share,
+                    mean_return=float(np.mean(games.ended[-2000:])),
                 )
                 on_progress(progress)
     return export(target, game.a_min_mps2)

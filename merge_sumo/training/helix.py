@@ -354,7 +354,8 @@ def train_and_check(
             )
 
         def progressed(now: TrainingProgress) -> None:
-            on_part(f"{now.network} {now.stage}", now.done, now.total, "updates", now.note)
+            note = f"return {now.mean_return:.3f}"
+            on_part(f"{now.network} {now.stage}", now.done, now.total, "updates", note)
 
         train_library(
             *(folder, names, settings.seed),
