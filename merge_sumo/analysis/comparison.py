@@ -6,12 +6,14 @@ Cases that both versions ran are paired; where each has cases of its own, shares
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from merge_sumo.campaigns.again import command
 from merge_sumo.campaigns.run import Run
@@ -76,11 +78,6 @@ class Version:
             motions=run.trajectories,
             sampler=run.settings.sampler,
         )
-
-    @property
-    def cases(self) -> list[Outcome]:
-        """The deciding run of each case."""
-        return one_per_case(self.outcomes, self.tolerated)
 
     @cached_property
     def at(self) -> dict[int, LevelSummary]:
@@ -172,8 +169,7 @@ class ComparedCase:
         runs_a, runs_b = _repeated(before), _repeated(after)
         chance = None
         if runs_a and runs_b and (runs_a.varies or runs_b.varies):
-            shares = [(runs.failures, runs.runs) for runs in (runs_a, runs_b)]
-            chance = fisher(*shares)
+            chance = fisher((runs_a.failures, runs_a.runs), (runs_b.failures, runs_b.runs))
         return cls(a, b, _change(a, b, chance), runs_a, runs_b, chance)
 
     def to_record(self) -> dict[str, Any]:
@@ -214,7 +210,8 @@ def fisher(one: tuple[int, int], other: tuple[int, int]) -> float:
     """Return the p-value of Fisher's exact test of two shares, (part, whole)."""
     from scipy.stats import fisher_exact
 
-    table = [[part, whole - part] for part, whole in (one, other)]
+    table = np.array((one, other))
+    table[:, 1] -= table[:, 0]
     return float(fisher_exact(table)[1])
 
 
@@ -229,8 +226,10 @@ def paired(
         tolerated: share of its runs in which a case may fail.
     """
     first, second = _by_start(before), _by_start(after)
-    shared = first.keys() & second.keys()
-    return in_order(ComparedCase.of(first[start], second[start], tolerated) for start in shared)
+    cases = []
+    for start in first.keys() & second.keys():
+        cases.append(ComparedCase.of(first[start], second[start], tolerated))
+    return in_order(cases)
 
 
 def _by_start(outcomes: Iterable[Outcome]) -> dict[Case, list[Outcome]]:
@@ -329,10 +328,10 @@ class Comparison(Result):
     @property
     def worse(self) -> bool:
         """Whether a case got worse, a version passes less often, or the last one tested no case."""
-        got_worse = any(step.count(change) for step in self.steps for change in GOT_WORSE)
-        passes_less = any(step.passes_less for step in self.steps)
-        is_tested = any(outcome.is_tested for outcome in self.versions[-1].outcomes)
-        return got_worse or passes_less or not is_tested
+        for step in self.steps:
+            if step.passes_less or any(map(step.count, GOT_WORSE)):
+                return True
+        return not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints."""
@@ -357,7 +356,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
         raise UserError("a comparison needs two campaigns or more: name the older one first")
     for run in runs[1:]:
         _check_comparable(runs[0], run)
-    versions = [Version.of(run) for run in runs]
+    versions = list(map(Version.of, runs))
     if not versions[0].at.keys() & versions[1].at.keys():
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
     notes = []
@@ -428,12 +427,18 @@ def _step(versions: Sequence[Version], after: int) -> Step:
     earlier, later = versions[after - 1], versions[after]
     step = Step(after, after + 1, paired(earlier.outcomes, later.outcomes, later.tolerated))
     levels = earlier.at.keys() & later.at.keys()
-    before = [outcome for outcome in earlier.cases if outcome.case.level in levels]
-    now = [outcome for outcome in later.cases if outcome.case.level in levels]
+    before = _at_levels(earlier, levels)
+    now = _at_levels(later, levels)
     has_own = len(step.cases) < max(len(before), len(now))
     if has_own and earlier.sampler == later.sampler:
         return with_shares(step, before, now)
     return step
+
+
+def _at_levels(version: Version, levels: Container[int]) -> list[Outcome]:
+    """Return the deciding run of each case of some levels."""
+    cases = one_per_case(version.outcomes, version.tolerated)
+    return [outcome for outcome in cases if outcome.case.level in levels]
 
 
 def with_shares(step: Step, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> Step:

@@ -70,14 +70,17 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     study = replace(study, plan=study.plan.for_cases(len(before)))
     open_simulators(study.plan, study.workers)
     ran = _ran(study, before, study.on_cases)
-    motions = {index: episode.trajectory for index, episode in ran.items()}
+    outcomes, motions = [], {}
+    for outcome in before:
+        outcomes.append(ran[outcome.index].outcome)
+        motions[outcome.index] = ran[outcome.index].trajectory
     earlier = replace(Version.of(run), outcomes=before)
     later = replace(
         earlier,
         vut=settings.vut,
         folder=None,
-        outcomes=[ran[outcome.index].outcome for outcome in before],
-        motions=lambda indices: {index: motions[index] for index in indices},
+        outcomes=outcomes,
+        motions=lambda _indices: motions,
     )
     source = (
         f"the cases come from the recorded search of {run.vut}; a campaign with `against` searches "
@@ -85,10 +88,13 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     )
     compared = of_two(earlier, later, source)
     (step,) = compared.steps
-    cases = step.cases
-    if isinstance(run, CasesFile):
-        cases = [replace(one, change=run.change_of(one)) for one in cases]
-    changed = [one.b for one in cases if one.change in AGAIN and one.runs_b is None]
+    cases, changed = [], []
+    for one in step.cases:
+        if isinstance(run, CasesFile):
+            one = replace(one, change=run.change_of(one))  # noqa: PLW2901
+        cases.append(one)
+        if one.change in AGAIN and one.runs_b is None:
+            changed.append(one.b)
     again = _ran(study, others_drive(changed, settings))
     repeats = []
     for row, one in enumerate(cases):
@@ -104,7 +110,7 @@ def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
     if warning := unrepeatable(repeats):
         notes.append(warning)
     if number := step.count(Change.NOT_REPEATABLE):
-        step = with_shares(step, [one.a for one in cases], [one.b for one in cases])
+        step = with_shares(step, before, outcomes)
         notes.append(
             f"Not counted one by one, as it may be chance: {counted(number, 'change')}. Draw "
             "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from itertools import accumulate
+from itertools import accumulate, chain, product
 from pathlib import Path
 from typing import Any
 
@@ -217,9 +217,9 @@ class Study:
             self.plan.povs.check_level(level)
         plan = self.plan.for_cases(search.batch or COMPARED_BATCH)
         name = title(str(plan.vut.spec), search.levels)
-        tasks = [(sampler, seed) for sampler in samplers for seed in range(seeds)]
+        tasks = list(product(samplers, range(seeds)))
         ran = self.workers.run(partial(search.run, plan), tasks, _lost_search, chunk=1)
-        found: dict[str, list[SamplerRun]] = {sampler: [] for sampler in samplers}
+        found: dict[str, list[SamplerRun]] = defaultdict(list)
         for number, ((sampler, _), one) in enumerate(zip(tasks, ran, strict=True), start=1):
             found[sampler].append(one)
             self.on_part(name, number, len(tasks), "runs", sampler)
@@ -325,12 +325,11 @@ class SamplerStudy(Result):
         """
         total = 0.0
         for level, truth in self.truths.items():
-            failing = [truth.failures]
-            for searches in self.searches.values():
-                failing += [search.failures(level) for search in searches]
-            dense = self.dense.get(level, truth)
-            known = np.concatenate([points for points in failing if len(points)] or failing[:1])
-            total += max(fmc(known), fmc(dense.failures))
+            known = truth.failures
+            for search in chain.from_iterable(self.searches.values()):
+                if len(search.failures(level)):
+                    known = np.concatenate((known, search.failures(level)))
+            total += max(fmc(known), fmc(self.dense.get(level, truth).failures))
         return total
 
     @cached_property
