@@ -312,7 +312,7 @@ def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | N
         from_s: begin so long before the first conflict, as in -3.
 
     Returns:
-        The exit code of sumo-gui.
+        1 where sumo-gui failed, else 0.
 
     Raises:
         UserError: without a display.

@@ -79,11 +79,13 @@ def series(left: Iterable[tuple[int, Left]], rows: int) -> Signals | None:
 
 
 def to_record(signals: Signals) -> dict[str, list[list[Any]]]:
-    """Return signals as JSON keeps them: by name, [how often, value] for values that stay."""
-    return {
-        name: [[len(list(same)), value] for value, same in groupby(values)]
-        for name, values in signals.items()
-    }
+    """Return signals as JSON keeps them: by name, [number of rows, value] for equal values."""
+    record: dict[str, list[list[Any]]] = {}
+    for name, values in signals.items():
+        record[name] = []
+        for value, same in groupby(values):
+            record[name].append([len(list(same)), value])
+    return record
 
 
 SignalRuns = Annotated[
@@ -99,8 +101,10 @@ def from_runs(runs: SignalRuns, rows: int) -> Signals:
     for name, pairs in runs.items():
         if sum(count for count, _ in pairs) != rows:
             raise UserError("a signal has other rows than the motion")
-        values = [value for _, value in pairs if value is not None]
-        if _word(name) != name or [_value(value) for value in values] != values:
-            raise UserError("a signal is not as it was written")
-        signals[name] = tuple(value for count, value in pairs for _ in range(count))
+        values: list[float | str | None] = []
+        for count, value in pairs:
+            if _word(name) != name or (value is not None and _value(value) != value):
+                raise UserError("a signal is not as it was written")
+            values += [value] * count
+        signals[name] = tuple(values)
     return signals

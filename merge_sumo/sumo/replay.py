@@ -156,7 +156,7 @@ def _first(difference: FloatArray) -> tuple[int, ...]:
 
 
 def check_display() -> None:
-    """Raise `UserError` when there is no display."""
+    """Raise `UserError` without a display."""
     if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(
             "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
