@@ -6,15 +6,16 @@ import ast
 import re
 import subprocess
 import sys
-from collections import defaultdict
+from collections import Counter
+from collections.abc import Iterable
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 PACKAGE = Path(__file__).resolve().parent.parent / "merge_sumo"
-FILES = sorted(path for path in PACKAGE.rglob("*.py") if "shipped" not in path.parts)
 
 LAYERS = (
     *("scenario", "metrics", "road", "drivers", "sumo", "controllers", "simulation", "samplers"),
@@ -50,19 +51,24 @@ def module_of(file: Path) -> str:
     return ".".join(parts).removesuffix(".__init__")
 
 
-MODULES = {module_of(file): file for file in FILES}
+MODULES = {module_of(file): file for file in PACKAGE.rglob("*.py") if "shipped" not in file.parts}
 
 
 @cache
-def nodes_of(file: Path) -> tuple[ast.AST, ...]:
-    return tuple(ast.walk(ast.parse(file.read_text(encoding="utf-8"))))
+def all_nodes_of(module: str) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))))
+
+
+def nodes_of(module: str, *kinds: type[ast.AST]) -> list[Any]:
+    """Return the nodes of some kinds in a module."""
+    return [node for node in all_nodes_of(module) if isinstance(node, kinds)]
 
 
 @cache
-def imports_of(file: Path) -> set[str]:
-    """Return the dotted names that a file imports: by statement, by a call, by a string."""
-    found = set()
-    for node in nodes_of(file):
+def imports_of(module: str) -> set[str]:
+    """Return the dotted names that a module imports: by statement, by a call, by a string."""
+    found: set[str] = set()
+    for node in all_nodes_of(module):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -76,62 +82,60 @@ def imports_of(file: Path) -> set[str]:
 
 
 def called(node: ast.Call) -> str:
-    """Return the last name of what is called."""
+    """Return the last name of the function of a call."""
     return getattr(node.func, "attr", getattr(node.func, "id", ""))
 
 
-def calls_in(file: Path) -> list[ast.Call]:
-    return [node for node in nodes_of(file) if isinstance(node, ast.Call)]
-
-
 def room_of(module: str) -> str:
-    """Return the folder of a module in the package; "" for a file beside the folders."""
-    parts = module.split(".")
-    return parts[1] if len(parts) > 1 and parts[0] == "merge_sumo" and parts[1] in LAYERS else ""
+    """Return the folder of a module in the package; "" for a file next to the folders."""
+    package, _, rest = module.partition(".")
+    room = rest.partition(".")[0]
+    return room if package == "merge_sumo" and room in LAYERS else ""
 
 
-def imports_any(file: Path, modules: set[str]) -> set[str]:
-    """Return which imported names are one of the modules, or inside of it."""
-    return {
-        name
-        for name in imports_of(file)
-        if any(f"{name}.".startswith(f"{module}.") for module in modules)
-    }
+def rooms_of(names: Iterable[str]) -> set[str]:
+    return {room_of(name) for name in names}
+
+
+def imports_any(module: str, libraries: set[str]) -> set[str]:
+    """Return which imported names are one of some libraries, or inside of it."""
+    found = set()
+    for name in imports_of(module):
+        if any(f"{name}.".startswith(f"{library}.") for library in libraries):
+            found.add(name)
+    return found
 
 
 class TestImports:
     @pytest.mark.parametrize("room", ONLY_IN)
     def test_of_libraries_are_in_their_room_alone(self, room):
-        importing = {module_of(file) for file in FILES if imports_any(file, ONLY_IN[room])}
-        elsewhere = {module for module in importing if room_of(module) != room}
-        assert elsewhere == set()
-        assert importing or room == "nowhere", "the check itself sees imports"
+        importing = [module for module in MODULES if imports_any(module, ONLY_IN[room])]
+        assert rooms_of(importing) == ({room} if room != "nowhere" else set())
 
     def test_go_down_the_layers(self):
-        for file in FILES:
-            if room := room_of(module_of(file)):
+        for module in MODULES:
+            if room := room_of(module):
                 allowed = {"", *LAYERS[: LAYERS.index(room) + 1]}
-                assert {room_of(name) for name in imports_of(file)} <= allowed, file
+                assert rooms_of(imports_of(module)) <= allowed, module
 
     def test_of_files_make_no_circle(self):
-        graph = {
-            name: (imports_of(file) & MODULES.keys()) - {name, "merge_sumo"}
-            for name, file in MODULES.items()
-        }
+        graph = {}
+        for module in MODULES:
+            graph[module] = (imports_of(module) & MODULES.keys()) - {module, "merge_sumo"}
         TopologicalSorter(graph).prepare()  # which raises CycleError
 
     def test_are_known_for_every_folder_of_the_package(self):
-        folders = {file.relative_to(PACKAGE).parts[0] for file in FILES if file.parent != PACKAGE}
+        folders = {path.parent.name for path in PACKAGE.glob("*/*.py")}
         assert folders == set(LAYERS)
 
     def test_of_a_report_open_no_simulation(self):
-        for file in FILES:
-            if room_of(module_of(file)) == "reports":
-                values = imports_any(file, SIMULATING) - set(MODULES)
-                assert values <= REPORTS_READ, file
+        for module in MODULES:
+            if room_of(module) == "reports":
+                values = imports_any(module, SIMULATING) - MODULES.keys()
+                assert values <= REPORTS_READ, module
 
     def test_of_a_command_are_the_api_and_what_prints(self):
-        assert {room_of(name) for name in imports_of(PACKAGE / "cli.py")} == {""}
+        assert rooms_of(imports_of("merge_sumo.cli")) == {""}
 
     def test_of_the_command_line_load_nothing_heavy(self):
         script = "import sys, merge_sumo.cli; print('\\n'.join(sys.modules))"
@@ -144,49 +148,41 @@ class TestImports:
 
 
 def test_xml_is_read_without_entities():
-    found = []
-    for file in FILES:
-        for call in calls_in(file):
+    for module in MODULES:
+        for call in nodes_of(module, ast.Call):
             name = ast.unparse(call.func)
             options = {option.arg: ast.unparse(option.value) for option in call.keywords}
-            if name == "etree.XMLParser" and options.get("resolve_entities") != "False":
-                found.append(f"{file}: {name} without resolve_entities=False")
-            reads = name in ("etree.parse", "etree.fromstring", "etree.XML", "etree.iterparse")
-            if reads and len(call.args) < 2 and not {"parser", "resolve_entities"} & options.keys():
-                found.append(f"{file}: {name} without a parser")
-    assert found == []
+            if name == "etree.XMLParser":
+                assert options.get("resolve_entities") == "False", module
+            if name in ("etree.parse", "etree.fromstring", "etree.XML", "etree.iterparse"):
+                given = len(call.args) == 2 or {"parser", "resolve_entities"} & options.keys()
+                assert given, f"{module}: {name} without a parser"
 
 
-def test_files_are_removed_and_renamed_in_two_modules():
+def test_files_are_removed_and_renamed_in_one_module():
     removers = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
     removing = set()
-    for module, file in MODULES.items():
-        for call in calls_in(file):
+    for module in MODULES:
+        for call in nodes_of(module, ast.Call):
             if called(call) in removers or ast.unparse(call.func) in ("os.remove", "os.replace"):
                 removing.add(module)
     assert removing == {"merge_sumo.files"}
 
 
 def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
-    long = []
     for module, file in MODULES.items():
-        if len(file.read_text(encoding="utf-8").splitlines()) > 700:
-            long.append(module)
-        for node in nodes_of(file):
-            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-                docstring = len((ast.get_docstring(node) or "").splitlines())
-                if (node.end_lineno or 0) - node.lineno + 1 - docstring > 60:
-                    long.append(f"{module}.{node.name}")
-    assert long == []
+        assert len(file.read_text(encoding="utf-8").splitlines()) <= 700, module
+        for node in nodes_of(module, ast.FunctionDef, ast.AsyncFunctionDef):
+            docstring = len((ast.get_docstring(node) or "").splitlines())
+            lines = node.end_lineno - node.lineno + 1 - docstring
+            assert lines <= 60, f"{module}.{node.name}"
 
 
 def test_no_two_classes_have_one_name():
-    modules = defaultdict(list)
-    for module, file in MODULES.items():
-        for node in nodes_of(file):
-            if isinstance(node, ast.ClassDef):
-                modules[node.name].append(module)
-    assert {name: known for name, known in modules.items() if len(known) > 1} == {}
+    names = []
+    for module in MODULES:
+        names += [node.name for node in nodes_of(module, ast.ClassDef)]
+    assert [name for name, count in Counter(names).items() if count > 1] == []
 
 
 FLAG = re.compile(r"^[^-].*[ (`]--[a-z]")
@@ -196,17 +192,13 @@ A_COMMAND = re.compile(r"(?:merge-sumo|pip|netconvert) ")
 
 def test_no_message_of_a_room_names_a_flag():
     """A message names a field in backticks; a command turns it into its flag."""
-    found = []
-    for module, file in MODULES.items():
+    for module in MODULES:
         if room_of(module) in ("", "sumo"):
             continue
-        inner = {node.value for node in nodes_of(file) if isinstance(node, ast.Expr)}
-        for node in nodes_of(file):
-            if isinstance(node, ast.JoinedStr):
-                inner |= set(node.values)
-        for node in nodes_of(file):
-            if isinstance(node, ast.JoinedStr | ast.Constant) and node not in inner:
-                text = ast.unparse(node).lstrip("f'\" ")
-                if FLAG.search(text) and not A_COMMAND.search(text):
-                    found.append(f"{module}: {text}")
-    assert found == []
+        inner = {node.value for node in nodes_of(module, ast.Expr)}  # docstrings
+        for node in nodes_of(module, ast.JoinedStr):
+            inner |= set(node.values)
+        for node in nodes_of(module, ast.JoinedStr, ast.Constant):
+            text = ast.unparse(node).lstrip("f'\" ")
+            if node not in inner and FLAG.search(text):
+                assert A_COMMAND.search(text), f"{module}: {text}"

@@ -139,7 +139,6 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
     [
         ("design1", ()),
         pytest.param("my_vut.py:MyVut", ("--scenario", "us23-lane"), marks=pytest.mark.slow),
-        pytest.param("my_vut:MyVut", (), marks=pytest.mark.slow),
     ],
 )
 @pytest.mark.usefixtures("place")
