@@ -99,7 +99,7 @@ from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.workers import open_workers
+from merge_sumo.workers import AnyWorkers, open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
@@ -539,6 +539,13 @@ def path_of(path: Path | str | None) -> Path | None:
     return None if path is None else Path(path)
 
 
+def _workers_for(settings: CampaignSettings, named: AnyWorkers) -> AnyWorkers:
+    """Return the workers that are named; without, one where more would not pay."""
+    if named is None and settings.cases <= FEW_CASES and not settings.may_vary:
+        return 1
+    return named
+
+
 def run_and_report(
     settings: CampaignSettings,
     plan: SimulationPlan,
@@ -574,15 +581,9 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
-    workers = where.workers
-    if workers is None and settings.cases <= FEW_CASES and not settings.may_vary:
-        workers = 1
+    count = plan.workers(_workers_for(settings, where.workers))
     try:
-        with (
-            open_workers(plan.workers(workers)) as available,
-            bars,
-            RunningReport(folder) as report,
-        ):
+        with open_workers(count) as available, bars, RunningReport(folder) as report:
             done = run_campaign(
                 settings,
                 plan,
