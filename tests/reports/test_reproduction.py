@@ -57,7 +57,6 @@ class TestATinyReproduction:
                 assert sampler["fmc"]["median"] <= column["limit_fmc"]
         assert "| gpr / truth | - (0.78) | - (0.69) | - (0.44) |" in table
         assert "| coverage / limit |" in table
-        assert "| coverage / truth after " in table
         assert "The truth of level-0 POV, design1 is too small to be divided by" in table
         assert "dense" not in table
 
