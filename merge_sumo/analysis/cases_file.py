@@ -60,8 +60,8 @@ class CasesFile(Run):
         try:
             head = convert(record, Head)
             scenario = convert(head.scenario, Scenario)
-            if "/" in (scenario.net or ""):
-                scenario = replace(scenario, net=str((path.parent / str(scenario.net)).resolve()))
+            if scenario.net is not None and "/" in scenario.net:
+                scenario = replace(scenario, net=str((path.parent / scenario.net).resolve()))
             self.criterion = Criterion(head.fail_when, head.require)
             self.criterion.check(scenario)
             del record["cases"]
@@ -75,9 +75,7 @@ class CasesFile(Run):
         except UserError as error:
             raise UserError(f"the cases file {path}: {at}{error}") from error
         self.outcomes = list(self._by_index.values())
-        levels = sorted({outcome.case.level for outcome in self.outcomes})
-        self.record["levels"] = levels
-        self.settings = replace(self.settings, levels=tuple(levels))
+        self.record["levels"] = self.levels
 
     @property
     def levels(self) -> list[int]:
