@@ -117,9 +117,8 @@ class TestRampDrivers:
             (FsmVut, -6.9, True),
             (RssVut, -20.0, True),
             (RssVut, -60.0, False),
-            # Behind one that draws away, both as far as they fear that it brakes.
+            # Behind one that draws away, but might brake.
             (FsmVut, 10.0, True),
-            (RssVut, 10.0, True),
             (FsmVut, 70.0, False),
         ],
     )

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +18,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
@@ -59,15 +57,6 @@ class TestMeasures:
         assert measures.after_drac_mps2 is None
         for met in ("after_drac_mps2 > 99", "after_ttc_s < 0.1", "contact", "unsafe"):
             assert Criterion(met).margin(episode, measures) < 0.0, met
-
-    def test_are_in_the_record_where_there_is_a_follow_up(self):
-        outcome = Criterion("contact").outcome(0, 0, followed((-10.0, 20.0, 0.0, 25.0)))
-        record = json.loads(json.dumps(outcome.to_record()))
-        assert list(record)[-5:] == [*FOLLOWED_UP, "margin"]
-        assert Outcome.from_json(json.dumps(record), FOLLOWED) == outcome
-        assert not set(FOLLOWED_UP) & set(
-            Outcome(0, 0, replace(CASE, scenario=AT_M), Measures.of(ending(9.0))).to_record()
-        )
 
     def test_need_a_follow_up(self):
         with pytest.raises(UserError, match="`follow_up_s` SECONDS"):

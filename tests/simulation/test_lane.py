@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.evaluate import simulate, simulate_part
 
 LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 
@@ -92,22 +93,24 @@ class Raises:
 
 
 class TestAControllerThatRaisesAfterItsMerge:
-    def episodes(self, tmp_path, answer):
+    ROAD = named_scenario("us23-lane")
+    CASES = uniform(20, 0, ROAD)
+
+    def raising(self, tmp_path, answer):
         (tmp_path / "raises.py").write_text(RAISING.format(answer=answer))
-        road = named_scenario("us23-lane")
-        cases = uniform(20, 0, road)
-        raising = plan_for(f"{tmp_path / 'raises.py'}:Raises", scenario=road)
-        calm = plan_for("level0", scenario=road).with_engine("kinematic")
-        return ([one.trajectory for one in simulate(plan, cases)] for plan in (raising, calm))
+        plan = plan_for(f"{tmp_path / 'raises.py'}:Raises", scenario=self.ROAD)
+        return simulate_part(plan, self.CASES, attrgetter("trajectory"))
 
     def test_follows_by_idm_where_it_only_accelerates(self, tmp_path):
         answer = "min(max((28.0 - seen.v_vut_mps) / 0.1, 0.0), 1.0)"
-        for raising, calm in zip(*self.episodes(tmp_path, answer), strict=True):
+        plan = plan_for("level0", scenario=self.ROAD).with_engine("kinematic")
+        others = simulate_part(plan, self.CASES, attrgetter("trajectory"))
+        for raising, calm in zip(self.raising(tmp_path, answer), others, strict=True):
             assert raising.end is End.MERGED
             np.testing.assert_allclose(raising.after, calm.after, rtol=0.0, atol=1e-9)
 
     def test_is_an_error_where_it_chooses_to_merge(self, tmp_path):
-        for raising, _ in zip(*self.episodes(tmp_path, "1.0, True"), strict=True):
+        for raising in self.raising(tmp_path, "1.0, True"):
             assert raising.end is End.VUT_ERROR
             assert raising.error.startswith("ValueError: after M")
             assert raising.after is None
