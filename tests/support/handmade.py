@@ -29,25 +29,23 @@ def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Tra
     In a timeout it brakes instead, and stands until 12 s. Other cars of the mainline keep their
     speed.
     """
+    starts = np.array(case.starts())
+    x, v = starts[:, 0], starts[:, 1]
     rows = []
-    x, v = (list(values) for values in zip(*case.starts(), strict=True))
-    step = 0
-    while x[VUT] < 0.0 and step * DT_S < 12.0:
-        a = [0.0] * len(x)
-        if case.level and 2.0 < step * DT_S < 5.0 + (case.svo_rad or 0.0):
+    while x[VUT] < 0.0 and len(rows) * DT_S < 12.0:
+        t_s = len(rows) * DT_S
+        a = np.zeros(len(x))
+        if case.level and 2.0 < t_s < 5.0 + (case.svo_rad or 0.0):
             a[POV] = -0.5
-        a[VUT] = (
-            1.0
-            if step * DT_S < 3.0
-            else max(US23.a_min_mps2, -v[VUT] / DT_S) * (1.0 if timeout else 0.05)
-        )
-        rows.append(list(zip(x, v, a, strict=True)))
-        x = [place + speed * DT_S for place, speed in zip(x, v, strict=True)]
-        v = [speed + change * DT_S for speed, change in zip(v, a, strict=True)]
-        step += 1
-    rows.append(list(zip(x, v, [0.0] * len(x), strict=True)))
-    end = End.TIMEOUT if timeout else End.MERGED if error is None else End.VUT_ERROR
-    return Trajectory(case, np.array(rows), end, error)
+        a[VUT] = 1.0
+        if t_s >= 3.0:
+            hardest = max(US23.a_min_mps2, -v[VUT] / DT_S)
+            a[VUT] = hardest if timeout else 0.05 * hardest
+        rows.append(np.stack((x, v, a), axis=1))
+        x, v = x + v * DT_S, v + a * DT_S
+    rows.append(np.stack((x, v, np.zeros(len(x))), axis=1))
+    end = End.MERGED if error is None else End.VUT_ERROR
+    return Trajectory(case, np.array(rows), End.TIMEOUT if timeout else end, error)
 
 
 def cases_of(level: int, count: int, scenario: Scenario = US23) -> list[Case]:
@@ -55,14 +53,11 @@ def cases_of(level: int, count: int, scenario: Scenario = US23) -> list[Case]:
     rng = np.random.default_rng([7, level])
     points = rng.random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
-    meets = {0: 8.9, 1: 8.8, 2: 8.7}[level]
-    near = [
-        replace(
-            case,
-            x_pov0_m=max(-340.0, -meets * case.v_pov0_mps + float(rng.normal(0.0, 6.0))),
-        )
-        for case in cases[::2]
-    ]
+    meets_s = (8.9, 8.8, 8.7)[level]
+    near = []
+    for case in cases[::2]:
+        x_m = -meets_s * case.v_pov0_mps + float(rng.normal(0.0, 6.0))
+        near.append(replace(case, x_pov0_m=max(-340.0, x_m)))
     return cases[1::2] + near
 
 
