@@ -164,7 +164,7 @@ class Driver(ABC):
         return ()
 
     def close(self) -> None:  # noqa: B027 (most drivers hold nothing)
-        """Release what the driver holds: processes, sockets."""
+        """Release the processes and sockets of the driver."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

@@ -21,7 +21,7 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator, SubstepSimulator
+from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.workers import Job, Workers, when_worker_ends
@@ -165,8 +165,8 @@ def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
             if _kept is None or _kept[0] != _key(plan):
                 close_simulator()
                 plan.check_software()
-                kind = KinematicSimulator if plan.engine is Engine.KINEMATIC else Simulator
-                _kept = _key(plan), (SubstepSimulator if plan.substeps > 1 else kind)(plan)
+                by_equations = plan.engine is Engine.KINEMATIC or plan.substeps > 1
+                _kept = _key(plan), KinematicSimulator(plan) if by_equations else Simulator(plan)
                 when_worker_ends(close_simulator)
             yield _kept[1]
         except BaseException:
@@ -184,7 +184,7 @@ def close_simulator() -> None:
 
 
 def _key(plan: SimulationPlan) -> tuple[object, ...]:
-    """Return what decides whether a simulator serves a plan."""
+    """Return the key of the simulator that serves a plan."""
     return plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors, plan.substeps
 
 

@@ -38,14 +38,23 @@ ROUNDING = 1e-6
 
 
 class KinematicSimulator(Simulator):
-    """A VUT and the POVs as arrays, without SUMO but for the cases that it checks."""
+    """A VUT and the POVs in eq. (4), without SUMO but for the cases that it checks.
+
+    A plan with a shorter step than that of SUMO has no such cases.
+    """
 
     def __init__(self, plan: SimulationPlan) -> None:
-        """Start the drivers; SUMO starts with the first case that it checks."""
+        """Start the drivers; SUMO starts with the first case that it checks.
+
+        Raises:
+            UserError: if a driver needs SUMO.
+        """
         self._plan = plan
         self._sumo: Simulator | None = None
+        most = CORRIDORS if plan.needs_sumo is None else plan.corridors
         with ExitStack() as opened:
-            world = EquationWorld(CORRIDORS, plan.road, plan.scenario)
+            corridors = corridors_of(plan, most)
+            world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
             self._open_drivers(plan, world, opened)
 
     def run(self, cases: Sequence[Case]) -> list[Trajectory]:
@@ -55,7 +64,7 @@ class KinematicSimulator(Simulator):
             UserError: if a case ends otherwise in SUMO.
         """
         ended = super().run(cases)
-        if not cases:
+        if not cases or self._plan.substeps > 1:
             return ended
         close = self._close_calls(ended)
         indices = sorted(close | drawn(cases))
@@ -107,18 +116,6 @@ class KinematicSimulator(Simulator):
             f"({_end_of(sumo)}) than by the equations of motion alone ({_end_of(kinematic)}): "
             "choose `engine` sumo"
         )
-
-
-class SubstepSimulator(Simulator):
-    """A VUT and the POVs by eq. (4) alone, each step in parts: for a step shorter than SUMO's."""
-
-    def __init__(self, plan: SimulationPlan) -> None:
-        """Start the drivers; `UserError` for those that drive in SUMO only."""
-        with ExitStack() as opened:
-            most = CORRIDORS if plan.needs_sumo is None else plan.corridors
-            corridors = corridors_of(plan, most)
-            world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
-            self._open_drivers(plan, world, opened)
 
 
 def drawn(cases: Sequence[Case]) -> set[int]:

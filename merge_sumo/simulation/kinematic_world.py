@@ -29,9 +29,6 @@ class EquationWorld:
         v_mps: speeds, (A, corridors).
     """
 
-    vut_type: None = None
-    """SUMO drives none of the vehicles."""
-
     def __init__(
         self, corridors: int, road: Corridor, scenario: Scenario, substeps: int = 1
     ) -> None:

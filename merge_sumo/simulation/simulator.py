@@ -40,7 +40,7 @@ class Simulator:
     ran_again: Collection[int] = ()
 
     def __init__(self, plan: SimulationPlan) -> None:
-        """Start SUMO and the drivers, with as many corridors as all of these can serve."""
+        """Start SUMO and the drivers, with the number of corridors that all of these can serve."""
         own = plan.povs.own
         car_type = None if own is None else own.vut_type
         with ExitStack() as opened:

@@ -1,4 +1,4 @@
-"""The crosscheck of tools/: HighwayEnv's vehicles by hand, motion and verdicts beside SUMO's."""
+"""The crosscheck of tools/: vehicles of HighwayEnv by hand, and verdicts next to those of SUMO."""
 
 from __future__ import annotations
 
