@@ -37,11 +37,10 @@ from scipy.ndimage import maximum_filter
 
 from merge_sumo import config
 from merge_sumo.analysis.exposure import Distribution, Traffic, named_traffic, read_distribution
-from merge_sumo.analysis.run_study import RunStudy, StudyFile, check_least
+from merge_sumo.analysis.run_study import RunStudy, StudyFile, check_least, end_of
 from merge_sumo.analysis.surface import learn_surface
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.outcome import Episode
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.records import Record, to_json
 from merge_sumo.result import Result
@@ -238,7 +237,7 @@ def failure_probability(
         names = [dimension.field for dimension in scenario.dimensions(one.level)]
         fresh = study.settings.pool.cases(distribution.points(one.level, chances), one.level)
         failures = without_verdict = 0
-        for case, ended in zip(fresh, study.simulate(plan, fresh, _judged), strict=True):
+        for case, ended in zip(fresh, study.simulate(plan, fresh, end_of), strict=True):
             failed, is_tested, by_sumo = ended
             failures += failed
             without_verdict += not is_tested
@@ -266,11 +265,6 @@ def failure_probability(
     )
     write_new(out, to_json(result, indent=2))
     return result
-
-
-def _judged(episode: Episode) -> tuple[bool, bool, bool]:
-    """Return whether a case failed, has a verdict, and ran in SUMO."""
-    return episode.outcome.failed, episode.outcome.is_tested, episode.in_sumo
 
 
 def expected_cells(study: RunStudy, distribution: Distribution) -> list[Cells]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from merge_sumo import config
 from merge_sumo.analysis.run_study import OnPart, check_least
-from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, SearchSettings, Study
+from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, Study
 from merge_sumo.analysis.truth import TRUTH_CASES
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
@@ -242,8 +242,10 @@ def reproduce(
         found = studies[column.vut].compare((column.level,), SAMPLERS, options)
         columns[column.title] = ColumnResult(column, found)
     batch = 2 * scale.batch
-    search = SearchSettings(levels=LEVELS, cases=scale.batches * batch, batch=batch)
-    together = studies["design2"].searches(search, ADAPTIVE, scale.seeds)
+    options = config.Benchmark(
+        "design2", seeds=scale.seeds, cases=scale.batches * batch, batch=batch
+    )
+    together = studies["design2"].searches(LEVELS, ADAPTIVE, options)
     levels = {name: _level_batches(searches) for name, searches in together.items()}
     return Reproduction(scale, columns, levels, povs.sha256())
 

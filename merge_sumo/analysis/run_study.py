@@ -76,6 +76,11 @@ def check_least(options: object, **least: int) -> None:
             raise UserError(f"`{name}` is {value}: it must be {number} or more")
 
 
+def end_of(episode: Episode) -> tuple[bool, bool, bool]:
+    """Return whether a case failed, has a verdict, and ran in SUMO."""
+    return episode.outcome.failed, episode.outcome.is_tested, episode.in_sumo
+
+
 @dataclass(frozen=True, slots=True)
 class RunStudy:
     """A recorded campaign, and how a study runs cases of it.

@@ -79,38 +79,38 @@ class SamplerRun:
         return np.array(shares)
 
 
-@dataclass(frozen=True, kw_only=True, slots=True)
-class SearchSettings:
-    """The searches of a benchmark, which differ in sampler and seed.
+def search(
+    plan: SimulationPlan,
+    levels: tuple[int, ...],
+    cases: int,
+    batch: int | None,
+    tasks: Sequence[Task],
+) -> list[SamplerRun]:
+    """Run searches in this process.
 
-    Attributes:
+    Args:
+        plan: how their cases run.
         levels: POV levels.
-        cases: number of cases.
+        cases: number of cases of a search.
         batch: cases of a batch; None for those of the sampler, or `COMPARED_BATCH`.
+        tasks: the searches.
     """
-
-    levels: tuple[int, ...]
-    cases: int
-    batch: int | None
-
-    def run(self, plan: SimulationPlan, tasks: Sequence[Task]) -> list[SamplerRun]:
-        """Run searches in this process."""
-        searches = []
-        pool = Pool(levels=self.levels, scenario=plan.scenario)
-        for name, seed in tasks:
-            sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
-            batch = self.batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-            groups: Groups = []
-            SearchLoop(sampler, plan, self.cases, batch=batch).run(groups.extend)
-            search = SamplerRun([], [])
-            for group in groups:
-                search.outcomes.extend(episode.outcome for episode in group)
-                total = 0.0
-                for level in self.levels:
-                    total += fmc(search.failures(level))
-                search.fmc.append(total)
-            searches.append(search)
-        return searches
+    searches = []
+    pool = Pool(levels=levels, scenario=plan.scenario)
+    for name, seed in tasks:
+        sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
+        size = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
+        groups: Groups = []
+        SearchLoop(sampler, plan, cases, batch=size).run(groups.extend)
+        found = SamplerRun([], [])
+        for group in groups:
+            found.outcomes.extend(episode.outcome for episode in group)
+            total = 0.0
+            for level in levels:
+                total += fmc(found.failures(level))
+            found.fmc.append(total)
+        searches.append(found)
+    return searches
 
 
 def _lost_search(task: Task) -> SamplerRun:
@@ -200,25 +200,25 @@ class Study:
             truth = known_truth(self.plan, level, DENSE_CASES, cache=self.cache)
             if truth is not None:
                 dense[level] = truth
-        search = SearchSettings(levels=levels, cases=options.cases, batch=options.batch)
-        return SamplerStudy(self.searches(search, samplers, options.seeds), truths, dense)
+        return SamplerStudy(self.searches(levels, samplers, options), truths, dense)
 
     def searches(
-        self, search: SearchSettings, samplers: Sequence[str], seeds: int
+        self, levels: tuple[int, ...], samplers: Sequence[str], options: config.Benchmark
     ) -> dict[str, list[SamplerRun]]:
         """Let each sampler search with each seed; return the searches by sampler.
 
         Args:
-            search: levels, cases and batch.
+            levels: levels of the POV.
             samplers: names of the samplers.
-            seeds: number of seeds.
+            options: numbers of seeds and cases, and cases of a batch.
         """
-        for level in search.levels:
+        for level in levels:
             self.plan.povs.check_level(level)
-        plan = self.plan.for_cases(search.batch or COMPARED_BATCH)
-        name = title(str(plan.vut.spec), search.levels)
-        tasks = list(product(samplers, range(seeds)))
-        ran = self.workers.run(partial(search.run, plan), tasks, _lost_search, chunk=1)
+        plan = self.plan.for_cases(options.batch or COMPARED_BATCH)
+        name = title(str(plan.vut.spec), levels)
+        tasks = list(product(samplers, range(options.seeds)))
+        run_some = partial(search, plan, levels, options.cases, options.batch)
+        ran = self.workers.run(run_some, tasks, _lost_search, chunk=1)
         found: dict[str, list[SamplerRun]] = defaultdict(list)
         for number, ((sampler, _), one) in enumerate(zip(tasks, ran, strict=True), start=1):
             found[sampler].append(one)

@@ -14,11 +14,10 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.run_study import RunStudy, StudyFile
+from merge_sumo.analysis.run_study import RunStudy, StudyFile, end_of
 from merge_sumo.campaigns.run import Run
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.outcome import Episode
 from merge_sumo.metrics.summary import clopper_pearson, undecided
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
@@ -133,7 +132,8 @@ def note_shares(
                 ended = list(evaluate(plan, cases, workers, end_of))
             except UserError:  # eq. (4) and SUMO disagree, as a rounding error turned a decision
                 return
-            shares.append(LevelShare(level, count, *np.sum(ended, axis=0).tolist()))
+            failures, tested, _ = np.sum(ended, axis=0).tolist()
+            shares.append(LevelShare(level, count, failures, count - tested))
             on_part(len(shares) * count, len(run.levels) * count)
     SHARES.write(run.folder, Shares(tuple(shares)))
 
@@ -150,8 +150,3 @@ def uniform_cases(scenario: Scenario, level: int, count: int, seed: int) -> list
     rng = np.random.default_rng([seed, STREAM, level])
     points = rng.random((count, len(scenario.dimensions(level))))
     return Pool(levels=(level,), scenario=scenario).cases(points, level)
-
-
-def end_of(episode: Episode) -> tuple[bool, bool]:
-    """Return whether a case fails, and whether it has no verdict."""
-    return episode.outcome.failed, not episode.outcome.is_tested

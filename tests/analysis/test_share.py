@@ -12,8 +12,8 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo import api
 from merge_sumo.analysis import share
-from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.analysis.share import SHARES, LevelShare, end_of, note_shares, uniform_cases
+from merge_sumo.analysis.run_study import RunStudy, end_of
+from merge_sumo.analysis.share import SHARES, LevelShare, note_shares, uniform_cases
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.simulation.evaluate import evaluate, simulate_part
 
@@ -42,7 +42,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path, monkeypatch
     points = np.random.default_rng(99).random((5000, 2))
     pool = campaign_settings(vut="design1").pool
     many = evaluate(plan, pool.cases(points, 0), None, end_of)
-    known = sum(fails for fails, _ in many) / len(points)
+    known = sum(fails for fails, _, _ in many) / len(points)
     low, high = level.interval
     assert low < known < high
     assert (level.cases, level.failures > 0) == (2000, True)
@@ -83,7 +83,7 @@ def test_of_a_controller_of_the_user_is_measured_too():
         assert one.cases == 200
         cases = uniform_cases(plan.scenario, level, 200, seed=4)
         ends = simulate_part(plan.for_verdicts(), cases, end_of)
-        assert one.failures == sum(failed for failed, _ in ends)
+        assert one.failures == sum(failed for failed, _, _ in ends)
         assert one.failures or level == 1
         said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
         assert said in str(run)
@@ -107,7 +107,9 @@ def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
     settings = campaign_settings(vut="own.py:Own", levels=(0, 1), cases=4)
     run = run_campaign(settings, Path("run"))
     run.outcomes *= 600
-    monkeypatch.setattr(share, "evaluate", lambda _plan, cases, *_: [(True, False)] * len(cases))
+    monkeypatch.setattr(
+        share, "evaluate", lambda _plan, cases, *_: [(True, True, True)] * len(cases)
+    )
     note_shares(RunStudy(run, settings, resolve(settings)))
     assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
 
