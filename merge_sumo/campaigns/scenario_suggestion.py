@@ -52,8 +52,8 @@ def kind_of_merge(road: Corridor) -> list[str]:
         )
         return [f"kind: merge at the point M, because {why}"]
     lanes = (
-        f"{' '.join(lane.lanes)} of the ramp runs next to {' '.join(lane.beside)} of the mainline "
-        f"for {lane.length_m:.1f} m"
+        f"{' '.join(lane.lanes)} of the ramp runs next to {' '.join(lane.mainline_lanes)} of the "
+        f"mainline for {lane.length_m:.1f} m"
     )
     if road.lane_m is not None:
         mark = ", and the net marks it" if lane.is_marked else ""

@@ -155,18 +155,23 @@ MAX_LANE_M = 2000.0
 
 @dataclass(frozen=True, slots=True)
 class AccelerationLane:
-    """A lane of the ramp that runs next to one of the mainline up to where the paths become one."""
+    """A lane of the ramp that runs next to one of the mainline up to where the paths become one.
+
+    Attributes:
+        begin_m: lane coordinate of its begin, the gore.
+        end_m: lane coordinate of its end.
+        lanes: its ids in the net file, one for each edge.
+        mainline_lanes: ids of the lanes next to it.
+        is_marked: whether the net marks it, as netconvert does.
+        exits: edges after it, other than that of the mainline: weaving traffic leaves there.
+    """
 
     begin_m: float
-    """Lane coordinates of its begin, the gore, and of its end."""
     end_m: float
     lanes: tuple[str, ...]
-    """Its ids in the net file, one for each edge, and those of the lanes next to it."""
-    beside: tuple[str, ...]
+    mainline_lanes: tuple[str, ...]
     is_marked: bool
-    """Whether the net marks it, as netconvert does."""
     exits: tuple[str, ...]
-    """Edges after it, other than that of the mainline: weaving traffic leaves there."""
 
     @property
     def length_m(self) -> float:

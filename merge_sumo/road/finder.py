@@ -377,7 +377,8 @@ def _acceleration_lane(main: list[Piece], ramp: list[Piece]) -> tuple[_Pieces, _
 
 def _roads(pieces: list[Piece]) -> list[int]:
     """Return the numbers of the pieces outside of junctions, the last one first."""
-    return [number for number, piece in reversed([*enumerate(pieces)]) if not piece.is_internal]
+    numbers = range(len(pieces) - 1, -1, -1)
+    return [number for number in numbers if not pieces[number].is_internal]
 
 
 def _lane_of_road(
@@ -402,7 +403,7 @@ def _lane_of_road(
         begin_m=end_m - _length_m(main),
         end_m=end_m,
         lanes=tuple(piece.lane for piece in ramp if not piece.is_internal),
-        beside=tuple(piece.lane for piece in main if not piece.is_internal),
+        mainline_lanes=tuple(piece.lane for piece in main if not piece.is_internal),
         is_marked=any(lane.isAccelerationLane() for lane in lanes),
         exits=tuple(sorted(exits - {link.target.getEdge().getID()})),
     )

@@ -48,7 +48,7 @@ def play(root: Path) -> str:
 
 
 def host(root: Path) -> str:
-    """Use a net with every kind of controller and in an export; return what is made of it."""
+    """Use a net with every kind of controller and in an export; return the files made of it."""
     road = road_of(root / "sent" / "net.xml")
     with World(1, road, scenario=US23) as world:
         world.advance()
@@ -129,7 +129,7 @@ LOG = (
 INCLUDE = '<xi:include xmlns:xi="http://www.w3.org/2001/XInclude" href="~/secret.xml"/>'
 DECLARES = "declares a document type or an entity"
 ATTACKS = {
-    # What is added has no effect.
+    # Additions have no effect.
     "detector": (NET, first('<e2Detector lane="a" file="~/thesis"/>'), host, "hosted"),
     "light with a log": (NET, first(LOG), host, "hosted"),
     "projection": (NET, instead('"!"', '"+proj=utm +nadgrids=~/secret.xml"'), host, "hosted"),

@@ -64,7 +64,7 @@ def world(run, tmp_path, monkeypatch) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Remove what is at a path; a link is not followed."""
+    """Remove a file, link or folder; a link is not followed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:

@@ -36,7 +36,7 @@ class TestAFile:
         (tmp_path / "any.toml").write_text(to_toml(written, ["two", "lines"]))
         assert read_scenario(tmp_path / "any.toml") == written
 
-    def test_says_only_what_differs_and_finds_its_net_beside_it(self, tmp_path):
+    def test_says_only_what_differs_and_finds_its_net_next_to_it(self, tmp_path):
         (tmp_path / "short.toml").write_text('net = "a/b.net.xml"\nx_vut0_m = -90\n')
         found = named_scenario(str(tmp_path / "short.toml"))
         net = str(tmp_path / "a" / "b.net.xml")
