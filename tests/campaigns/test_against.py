@@ -117,25 +117,18 @@ class TestRefuses:
             resume_campaign(Path("run"), {"cases": 20})
 
 
-class TestCommand:
-    def test_gate_and_page_say_what_broke(self, call):
-        command = ("campaign", "--vut", "new.py:f", "--against", "old.py:f", "--level", "0")
-        more = ("--cases", "25", "--seed", "3", "--out", "run", "-q", "--json")
-        said = call(*command, *more, "--gate", "regressions", "--junit", "run.xml")
-        assert said.code == 1
-        result = json.loads(said.out)
-        rows = result["against"]["transitions"]
-        count = sum(row["cases"] for row in rows if row["change"] == "broke")
-        assert count == sum(broke(outcome.case) for outcome in Run(Path("run")).outcomes) > 0
-        assert f"gate regressions: met ({count} regression" in said.err
-        page = Path("run/against.html").read_text()
-        assert f'<h2 id="change-1-1">Broke: {count}</h2>' in page
-        assert "new.py:f" in page
-        assert "old.py:f" in page
-        assert "against.html" in Path("run/report.html").read_text()
-        assert (
-            f'failures="{count}"' in Path("run.xml").read_text().split("against old.py:f")[1][:99]
-        )
+def test_gate_and_page_name_what_broke(call):
+    command = ("campaign", "--vut", "new.py:f", "--against", "old.py:f", "--level", "0")
+    more = ("--cases", "25", "--seed", "3", "--out", "run", "-q", "--json")
+    said = call(*command, *more, "--gate", "regressions", "--junit", "run.xml")
+    assert said.code == 1
+    rows = json.loads(said.out)["against"]["transitions"]
+    count = sum(row["cases"] for row in rows if row["change"] == "broke")
+    assert count == sum(broke(outcome.case) for outcome in Run(Path("run")).outcomes) > 0
+    assert f"gate regressions: met ({count} regression" in said.err
+    assert f'<h2 id="change-1-1">Broke: {count}</h2>' in Path("run/against.html").read_text()
+    assert "against.html" in Path("run/report.html").read_text()
+    assert f'failures="{count}"' in Path("run.xml").read_text().split("against old.py:f")[1][:99]
 
 
 def test_a_case_that_passed_and_ends_with_an_error_broke(command_line):

@@ -8,6 +8,7 @@ import json
 import os
 import resource
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -174,30 +175,20 @@ class TestARun:
         for outcome in run.outcomes:
             assert Measures.of(run.trajectory(outcome.index), lines) == outcome.measures
 
-    @pytest.mark.parametrize("name", ["campaign.json", "outcomes.jsonl"])
-    def test_without_one_of_its_files_is_no_campaign(self, folder, name):
-        (folder / name).unlink()
-        with pytest.raises(UserError) as error:
-            Run(folder)
-        assert_sentence(error, "not a campaign", name)
-
-    def test_says_when_the_trajectories_of_a_case_are_missing(self, folder):
+    def test_without_one_of_its_files_says_so(self, folder):
         (folder / "trajectories" / "00001.npz").unlink()
         run = Run(folder)
         assert len(run.trajectory(0).motion) == 61
-        with pytest.raises(UserError) as error:
+        with pytest.raises(UserError, match=r"00001\.npz"):
             run.trajectory(2)
-        assert_sentence(error, "00001.npz")
+        for name in ("outcomes.jsonl", "campaign.json"):
+            (folder / name).unlink()
+            with pytest.raises(UserError, match=f"not a campaign.*{name}"):
+                Run(folder)
 
     def test_runs_no_code_that_hides_in_trajectories(self, folder):
-        class Trap:
-            def __reduce__(self):
-                return (os.mkdir, (str(folder / "trapped"),))
-
-        hidden = np.array([Trap()], dtype=object)
         path = folder / "trajectories" / "00000.npz"
+        hidden = np.array([Path(folder)], dtype=object)  # which is read by unpickling alone
         np.savez(path, index=np.array([0, 1]), rows=np.array([1, 1]), motion=hidden)
-        with pytest.raises(UserError) as error:
+        with pytest.raises(UserError, match=r"00000\.npz"):
             Run(folder).trajectory(0)
-        assert_sentence(error, "00000.npz")
-        assert not (folder / "trapped").exists()

@@ -92,7 +92,7 @@ def test_every_command_judges_a_case_alike(world: World):
     assert world.campaign["levels"][str(LEVEL)]["failures"] == sum(map(fails, records))
     run_judges_as_the_campaign(world, records)
     rerun_changes_nothing(world)
-    check_compare_and_truth(world, records)
+    truth_judges_as_run(world)
     probability_judges_as_run(world)
     resume_goes_on_alike(world, records)
 
@@ -115,22 +115,13 @@ def rerun_changes_nothing(world: World) -> None:
     assert again["worse"] is False
 
 
-def check_compare_and_truth(world: World, records: list[dict[str, Any]]) -> None:
-    """Compare searches as a campaign with the same sampler, seed and batches; so does its truth."""
-    count = 10
-    (truth,) = world("truth", *ASKED, "--cases", count, "--workers", 1)
-    points = np.random.default_rng([0, LEVEL]).random(
-        (count, len(world.scenario.dimensions(LEVEL)))
-    )
+def truth_judges_as_run(world: World) -> None:
+    (truth,) = world("truth", *ASKED, "--cases", 10, "--workers", 1)
+    dims = len(world.scenario.dimensions(LEVEL))
+    points = np.random.default_rng([0, LEVEL]).random((10, dims))
     cases = Pool(levels=(LEVEL,), scenario=world.scenario).cases(points, LEVEL)
     failing = np.array([world.judged(case) for case in cases])
-    assert truth["failures"] == failing.sum()
-    sampler = ("--samplers", "uniform", "--seeds", 1, "--cases", CASES, "--batch", CASES)
-    (compared,) = world("benchmark", *ASKED, *sampler, "--truth-cases", count, "--workers", 1)
-    assert compared["truth_fmc"] == truth["fmc"] == fmc(points[failing])
-    assert compared["samplers"]["uniform"]["failures"]["median"] == sum(map(fails, records))
-    of_campaign = world.campaign["levels"][str(LEVEL)]["fmc"]
-    assert compared["samplers"]["uniform"]["fmc"]["median"] == pytest.approx(of_campaign)
+    assert (truth["failures"], truth["fmc"]) == (failing.sum(), fmc(points[failing]))
 
 
 def probability_judges_as_run(world: World) -> None:

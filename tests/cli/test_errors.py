@@ -61,7 +61,6 @@ class TestAWrongSignature:
                 "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
                 "my.py:3: reset(self, seen) is called as reset(self, corridor, seen)",
             ),
-            ("def V():\n    return 0.0\n", "my.py:1: V() is called as V(seen)"),
             (
                 "def V(x, v, *rest, gain):\n    return 0.0\n",
                 "my.py:1: V(x, v, rest, gain) is called as V(seen)",
@@ -79,7 +78,6 @@ class TestAWrongSignature:
         "source",
         [
             "def f(*arguments, **named): ...",
-            "def f(seen, gain=1.0): ...",
             "class f:\n    def act(self, *rest): ...\n    def reset(self, seen, seed=0): ...",
             "class f:\n    act = staticmethod(lambda seen: 0.0)",
             "class f:\n    reset = None\n    def act(self, seen): ...",
