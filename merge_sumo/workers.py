@@ -79,7 +79,7 @@ class Workers(AbstractContextManager["Workers"]):
 
     Example:
         with open_workers(2) as workers:
-            job = workers.submit(simulate, chunks, lost)
+            job = workers.submit(function, items, lost)
             results = workers.collect(job)
 
     Attributes:
@@ -116,16 +116,18 @@ class Workers(AbstractContextManager["Workers"]):
     def submit(
         self,
         function: Callable[[Sequence[T]], Sequence[R]],
-        chunks: Iterable[Sequence[T]],
+        items: Sequence[T],
         lost: Callable[[T], R],
+        chunk: int | None = None,
     ) -> Job[T, R]:
-        """Submit chunks of items.
+        """Submit items in chunks.
 
         Args:
             function: gives a result for each item of a chunk; it is found by its name in other
                 processes, and may run twice.
-            chunks: the chunks.
+            items: the items.
             lost: gives the result of an item that ends its worker twice.
+            chunk: items that a worker takes at a time; by default a share of them.
 
         Returns:
             What `collect` takes.
@@ -133,14 +135,16 @@ class Workers(AbstractContextManager["Workers"]):
         Raises:
             WorkersLostError: no worker can be reached.
         """
-        job = Job(function, list(chunks), lost)
-        for chunk in job.chunks:
+        size = chunk or self.chunk_size(len(items))
+        chunks = [items[first : first + size] for first in range(0, len(items), size)]
+        job = Job(function, chunks, lost)
+        for part in job.chunks:
             try:
-                future = self._executor.submit(function, chunk)
+                future = self._executor.submit(function, part)
             except self._died:  # earlier
                 self._executor.shutdown()
                 self._executor = self._open(self.count)
-                future = self._executor.submit(function, chunk)
+                future = self._executor.submit(function, part)
             except self._gone as error:
                 raise WorkersLostError(LOST) from error
             job.futures.append(future)
@@ -193,7 +197,7 @@ class Workers(AbstractContextManager["Workers"]):
         first = 0
         while jobs or first < len(items):
             while first < len(items) and len(jobs) < ahead:
-                jobs.append(self.submit(function, [items[first : first + size]], lost))
+                jobs.append(self.submit(function, items[first : first + size], lost, size))
                 first += size
             yield from self.collect(jobs.popleft())
 

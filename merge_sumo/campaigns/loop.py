@@ -17,6 +17,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import groupby
 from typing import Final
 
@@ -25,7 +26,7 @@ from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.controller_model import ControllerModelPair
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.simulation.evaluate import submit_cases
+from merge_sumo.simulation.evaluate import lost, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import MAX_CHUNK, Job, Workers
 
@@ -84,7 +85,9 @@ class SearchLoop:
             stop: whether the outcomes with a verdict end the search.
             history: whole groups that ran before, in order.
         """
-        self._sampler, self._plan, self._cases, self._stop = sampler, plan, cases, stop
+        self._sampler, self._cases, self._stop = sampler, cases, stop
+        self._simulate = partial(simulate_part, plan, keep=with_measures)
+        self._lost = partial(lost, plan)
         self._workers = Workers() if workers is None else workers
         self._batch, self._draws, self._in_flight = batch, draws, in_flight
         self._ahead = not sampler.learns and stop is None
@@ -106,7 +109,11 @@ class SearchLoop:
         running: deque[tuple[list[_Group], Job[Case, Episode] | None]] = deque()
         while True:
             while self._has_room(len(running)) and (groups := self._ask()):
-                running.append((groups, self._submit(groups)))
+                job = None
+                if not groups[0].episodes:
+                    cases = [case for group in groups for case in group.cases]
+                    job = self._workers.submit(self._simulate, cases, self._lost)
+                running.append((groups, job))
             if not running:
                 return
             groups, job = running.popleft()
@@ -185,13 +192,6 @@ class SearchLoop:
 
     def _pend(self) -> None:
         self._sampler.pend([case for group in self._pending for case in group.cases])
-
-    def _submit(self, groups: Sequence[_Group]) -> Job[Case, Episode] | None:
-        """Submit the cases of groups; None for groups that ran before."""
-        if groups[0].episodes:
-            return None
-        cases = [case for group in groups for case in group.cases]
-        return submit_cases(self._plan, cases, self._workers)
 
     def _collect(self, groups: Sequence[_Group], job: Job[Case, Episode]) -> None:
         """Collect the episodes of groups; note which ran again because a worker had died."""

@@ -25,7 +25,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import submit_cases
+from merge_sumo.simulation.evaluate import evaluate, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -81,8 +81,8 @@ def repeat(
     if not chosen:
         return []
     found = []
-    job = submit_cases(plan, [outcome.case for outcome in chosen], workers)
-    for outcome, ran in zip(chosen, workers.collect(job), strict=True):
+    again = evaluate(plan, [outcome.case for outcome in chosen], workers, with_measures)
+    for outcome, ran in zip(chosen, again, strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
             found.append(repeat_of(outcome, run.trajectory(outcome.index), ran))
     found.sort(key=lambda one: one.index)

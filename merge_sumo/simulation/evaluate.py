@@ -24,7 +24,7 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.workers import Job, Workers, when_worker_ends
+from merge_sumo.workers import Workers, when_worker_ends
 
 R = TypeVar("R")
 
@@ -120,21 +120,6 @@ def evaluate(
     return available.run(partial(simulate_part, plan, keep=keep), cases, lost_part, chunk=chunk)
 
 
-def submit_cases(
-    plan: SimulationPlan, cases: Sequence[Case], workers: Workers
-) -> Job[Case, Episode]:
-    """Submit cases to workers, a share to each; `collect` returns their episodes in order.
-
-    Args:
-        plan: how the cases run.
-        cases: cases of the scenario of the plan.
-        workers: where they run.
-    """
-    size = workers.chunk_size(len(cases))
-    chunks = [cases[first : first + size] for first in range(0, len(cases), size)]
-    return workers.submit(partial(simulate, plan), chunks, partial(lost, plan))
-
-
 def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
     """Open the simulator of a plan in a worker, and have all workers started.
 
@@ -147,7 +132,7 @@ def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
         pov = "" if own is None else f" or the POV {own.spec}"
         raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
 
-    workers.collect(workers.submit(partial(_open_simulators, plan), [[None]], died))
+    workers.collect(workers.submit(partial(_open_simulators, plan), [None], died))
 
 
 _kept: tuple[tuple[object, ...], Simulator] | None = None

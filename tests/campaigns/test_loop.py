@@ -44,11 +44,11 @@ class Played(Workers):
         super().__init__()
         self.count = count
 
-    def submit(self, function, chunks, lost) -> Job[Any, Any]:
-        return Job(function, list(chunks), lost)
+    def submit(self, function, items, lost, chunk=None) -> Job[Any, Any]:
+        return Job(function, [items], lost)
 
     def collect(self, job: Job[Any, Any]) -> list[Any]:
-        return [played(case) for chunk in job.chunks for case in chunk]
+        return [played(case) for case in job.chunks[0]]
 
 
 PLAN = plan_for("design1")
