@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import groupby
+from operator import itemgetter
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -247,7 +250,7 @@ class _Search:
         return Explanation(self._index, tuple(start), levels, tuple(parameters))
 
     def _confirm(self, plan: SimulationPlan) -> None:
-        if self._passes(plan, list(self._stated)) != list(self._stated.values()):
+        if self._passes(plan, self._stated) != list(self._stated.values()):
             raise UserError(
                 f"case {self._index} ends otherwise when it runs again: the VUT is not that of the "
                 "campaign, or does not repeat itself, and nothing can be said of its changes"
@@ -257,7 +260,7 @@ class _Search:
         """Return an axis with the nearest values that pass."""
 
         def ask(values: list[float]) -> list[bool]:
-            trials = [trial(axis.name, value) for value in values]
+            trials = map(partial(trial, axis.name), values)
             return self._passes(self._study.plan, trials)
 
         below, above = nearest(axis, -1, ask), nearest(axis, 1, ask)
@@ -273,21 +276,20 @@ class _Search:
     def _with_parameter(self, name: str, value: float) -> Trial:
         return self._vut.with_value(name, value), self._case
 
-    def _passes(self, plan: SimulationPlan, trials: Sequence[Trial]) -> list[bool]:
+    def _passes(self, plan: SimulationPlan, trials: Iterable[Trial]) -> list[bool]:
         """Run trials, those of a VUT at a time; a value that the controller refuses fails."""
-        passes = dict.fromkeys(trials, False)
-        for spec in dict.fromkeys(spec for spec, _ in trials):
-            of_vut = [trial for trial in trials if trial[0] == spec]
+        passes = []
+        for spec, of_vut in groupby(trials, key=itemgetter(0)):
+            cases = [case for _, case in of_vut]
             try:
-                if spec != plan.vut.spec:
-                    plan = replace(plan, vut=plan.vut.with_spec(spec))
-                cases = [case for _, case in of_vut]
-                passed = evaluate(plan, cases, self._study.workers, pass_of)
-                passes |= zip(of_vut, passed, strict=True)
+                vut = plan.vut if spec == self._vut else plan.vut.with_spec(spec)
+                passed = evaluate(replace(plan, vut=vut), cases, self._study.workers, pass_of)
+                passes += list(passed)
             except UserError:
                 if spec == self._vut:
                     raise
-        return [passes[trial] for trial in trials]
+                passes += [False] * len(cases)
+        return passes
 
 
 def _axis(name: str, value: float, low: float, high: float, digits: int, steps: int) -> Axis:
