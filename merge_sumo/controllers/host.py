@@ -60,7 +60,6 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         failed: why the request failed; "" where it did not.
         is_finding: whether the code of the controller failed to load.
         max_corridors: corridors that one driver can serve.
-        max_workers: processes that can have a driver.
         files: files of code that were loaded, where they may be others than before.
         parameters: those of the controllers that were made.
         accelerations_mps2: answers of the drivers, (K,).
@@ -72,7 +71,6 @@ class HostReply(msgspec.Struct, omit_defaults=True):
     failed: str = ""
     is_finding: bool = False
     max_corridors: int | None = None
-    max_workers: int | None = None
     files: list[bytes] = []
     parameters: dict[str, float] = {}
     accelerations_mps2: list[float] = []
@@ -141,9 +139,7 @@ class _Host:
         spec = msgspec.convert(settings["spec"], ControllerSpec)
         options = ControllerOptions(deadline_s=settings["deadline_s"], in_process=True)
         self._kind = kind = named(settings["kind"])(spec, options)
-        return HostReply(
-            max_corridors=kind.max_corridors, max_workers=kind.max_workers, files=self._files()
-        )
+        return HostReply(max_corridors=kind.max_corridors, files=self._files())
 
     def _make(self, request: HostRequest) -> HostReply:
         driver = self._kind.driver(request.corridors, None)
@@ -175,7 +171,7 @@ class _Host:
         return HostReply()
 
     def _beat(self, now_s: float) -> None:
-        """Tell the other process, now and then, that one controller after the other is called."""
+        """Send None from time to time, as one controller after the other is called."""
         if now_s - self._alive_s > ALIVE_S:
             self._alive_s = now_s
             self._connection.send_bytes(encode(None))

@@ -152,7 +152,7 @@ class HostedKind(ControllerKind):
             self._process = self.process()
             loaded = self._process.loaded
         self._loaded = loaded
-        self.max_corridors, self.max_workers = loaded.max_corridors, loaded.max_workers
+        self.max_corridors, self.max_workers = loaded.max_corridors, kind.max_workers
         self.code = paths_of(loaded)
 
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:

@@ -263,7 +263,7 @@ class ChildProcess(Started):
     def kill(self) -> None:
         """End the process, and the processes that it started."""
         if not self.alive:
-            return  # what its descriptors were may be others' by now
+            return  # its descriptors may belong to others by now
         self.alive = False
         self._connection.close()
         self._socket.close()

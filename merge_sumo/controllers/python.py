@@ -217,8 +217,8 @@ class HereKind(OfPython):
 class PythonController(Controller):
     """An object with `act(seen)`, or one that is called itself.
 
-    An object without `reset` is never told that an episode begins, so each episode has a new one; a
-    function has nothing to reset.
+    An object without `reset` keeps its state, so each episode has a new one; a function has nothing
+    to reset.
     """
 
     def __init__(self, kind: OfPython) -> None:
@@ -326,7 +326,7 @@ class BatchedVut(ControllerDriver):
         return self._kind.present(self._object)
 
     def reason(self, corridor: int) -> str | None:
-        """Return what went wrong in a corridor."""
+        """Return the error of a corridor."""
         return self._errors.get(corridor)
 
     def close(self) -> None:
@@ -416,7 +416,7 @@ def _module_of(source: str) -> ModuleType:
 
 
 def _imported(name: str) -> ModuleType:
-    """Return a module; as for a user who starts Python there, it may be in the working folder."""
+    """Return a module; as in a Python started there, it may be in the working folder."""
     folder = str(Path.cwd())
     is_new = folder not in sys.path
     if is_new:
@@ -434,7 +434,8 @@ def _imported(name: str) -> ModuleType:
 def module_of_file(path: Path) -> ModuleType:
     """Return the module that a file holds; it is executed once, and again when it has changed.
 
-    Modules next to it are found. Raises OSError where it cannot be read, and what its code raises.
+    Modules next to it are found. Raises OSError where it cannot be read, and the errors of its
+    code.
     """
     return _executed(path.resolve(), path.stat().st_mtime_ns)
 

@@ -29,7 +29,7 @@ def is_code(target: Any) -> bool:
 def check_methods(vut: Any) -> None:
     """Raise `UserError` where a method of a class or object cannot be called as a VUT's is.
 
-    Only plain methods are checked: what else is called fails when it is called.
+    Only plain methods are checked: others fail when they are called.
     """
     owner = vut if isinstance(vut, type) else type(vut)
     batched = callable(getattr(vut, "act_batch", None))

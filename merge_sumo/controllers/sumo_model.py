@@ -69,7 +69,7 @@ class SumoKind(ControllerKind):
     own_code = False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Take model and options; `UserError` for what SUMO does not have."""
+        """Take model and options; `UserError` for others than SUMO's."""
         super().__init__(spec, options)
         model = spec.argument
         if model not in MODELS:
@@ -94,7 +94,7 @@ class SumoKind(ControllerKind):
 
 
 class SumoVut(Driver):
-    """Answers what SUMO decided in its step."""
+    """Answers the accelerations on which SUMO decided in its step."""
 
     def __init__(self, corridors: int, world: World, rows: Sequence[int] = (VUT,)) -> None:
         """Drive the vehicles in rows of a world that was opened with a vType for them.

@@ -31,7 +31,7 @@ def load_traci() -> Any:
 
 @cache
 def packer() -> Callable[..., bytes]:
-    """Return what packs typed values: letters of a form, and the values."""
+    """Return the function that packs typed values: letters of a form, and the values."""
     connection = load_traci().connection.Connection
     pack: Callable[..., bytes] = connection.__new__(connection)._pack
     return pack

@@ -313,10 +313,9 @@ class World:
     def _read_x_m(self, expected_m: FloatArray) -> FloatArray:
         """Read positions from SUMO, (A, corridors), and check that they are as expected."""
         position_m = self._of_all(self._get_position)
-        # In most steps every vehicle is on the lane on which it was.
-        off_m = position_m + self._start_m - expected_m
-        if not np.vdot(off_m, off_m) <= EXACT_M**2:
-            self._start_m = self._of_all(self._lane_begins_m)
+        off_m = np.abs(position_m + self._start_m - expected_m)
+        for index in np.flatnonzero(~(off_m <= EXACT_M)).tolist():  # it may be on another lane
+            self._start_m.flat[index] = self._lane_begins_m(self._ids[index])
         x_m = position_m + self._start_m
         off = np.abs(x_m - expected_m).max()
         if not off <= EXACT_M:

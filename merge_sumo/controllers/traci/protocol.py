@@ -212,7 +212,7 @@ def version_answer() -> bytes:
 
 
 def packed(function: str, answer: Any) -> bytes:
-    """Return the typed value of what libsumo answers, as SUMO's own server packs it.
+    """Return an answer of libsumo as a typed value, as SUMO's own server packs it.
 
     Args:
         function: the function of libsumo, which decides where the type in Python does not.
@@ -281,4 +281,4 @@ ROWS: dict[str, tuple[str, Callable[[Any], Any]]] = {
     # libsumo has the state of a light as a letter, the wire as its number.
     "getNextTLS": ("sidb", lambda light: (*light[:3], ord(light[3]))),
 }
-"""Of answers that are rows, the letters of a row, and its values from what libsumo answers."""
+"""Of answers that are rows, the letters of a row, and a function that gives its values."""

@@ -52,7 +52,7 @@ SERVED_BY = {
 WITH_PARAMETER = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
 """Functions whose variables have a parameter in a subscription."""
 OWN_TYPE = f"{VUT_ID}@{VUT_ID}"
-"""What SUMO calls the type of a vehicle that has numbers of its own."""
+"""SUMO's name for the type of a vehicle that has numbers of its own."""
 OFF_THE_LANE_M = 2.0
 """A vehicle that its own model moves is on a lane up to here: half of the width of a wide one."""
 COMING = 2
@@ -110,8 +110,9 @@ def effect_of(names: tuple[str, ...]) -> Effect:
 def is_answered(names: tuple[str, ...]) -> bool:
     """Return whether SUMO is asked the question that has these names.
 
-    Not of its window, without which SUMO may end, and not of what a merge does not need: trains,
-    programs of traffic lights, routes to find, and distances between any two positions.
+    Not answered are questions of its window, without which SUMO may end, and those that a merge
+    does not need: trains, programs of traffic lights, routes to find, and distances between any
+    two positions.
     """
     name = names[0] if names else "gui."
     if name.startswith(("gui.", "simulation.find", "simulation.getDistance")):
