@@ -16,7 +16,6 @@ from support.plans import plan_for
 from support.processes import none_left
 from support.vut_contract import cases_of, factory
 
-from merge_sumo.api import open_run
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.measures import Measures
@@ -33,7 +32,6 @@ class Pov:
         gap_m = seen.x_pov_m - seen.x_vut_m
         return -1.0 if abs(gap_m) < 40.0 and seen.x_vut_m < 0.0 else 0.3
 """
-FEW = ("--cases", 8, "--sampler", "uniform")
 
 
 @pytest.fixture(autouse=True)
@@ -167,14 +165,3 @@ class TestACampaign:
             assert_refused(call(command, "--vut", "design1", *arguments), said)
         left = {path.name for path in Path().iterdir()} - {"__pycache__"}
         assert left == {"my_pov.py"}
-
-
-@pytest.mark.parametrize(("scenario", "is_said"), [("us23-lane", True), ("us23", False)])
-def test_a_campaign_says_where_a_pov_of_sumo_does_not_see_the_vut(call, scenario, is_said):
-    asked = ("--vut", "gap", "--pov", "sumo:IDM", "--level", "own", "--scenario", scenario, *FEW)
-    code, _, err = call("campaign", *asked, "--out", "run", "--quiet")
-    assert code == 0
-    said = "until the VUT has merged, the POV sumo:IDM keeps its speed"
-    assert (said in err) is is_said
-    slowed = [one.measures.pov_slowdown_mps > 1e-6 for one in open_run("run").run.outcomes]
-    assert not (is_said and any(slowed))
