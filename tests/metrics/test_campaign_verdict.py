@@ -96,36 +96,38 @@ def read_junit(file: Path) -> etree._Element:
     return root
 
 
+@pytest.fixture(scope="module")
+def written(tmp_path_factory) -> Run:
+    vut = HOSTILE.replace("\ud800", "")
+    folder = tmp_path_factory.mktemp("junit") / "run"
+    return write_run(folder, 20, (0, 2), vut=vut, errors={3: HOSTILE}, timeouts=(4, 6))
+
+
+@pytest.fixture(scope="module")
+def root(written) -> etree._Element:
+    opened = ms.open_run(written.folder)
+    gates = [Gate(name).check(opened.verdict, opened.summary) for name in ("errors", "fmc")]
+    path = written.folder.with_name("junit.xml")
+    write_junit(path, written, opened.facts, opened.verdict, gates)
+    return read_junit(path)
+
+
 class TestJUnit:
-    @pytest.fixture(scope="class")
-    def run(self, tmp_path_factory) -> Run:
-        vut = HOSTILE.replace("\ud800", "")
-        folder = tmp_path_factory.mktemp("junit") / "run"
-        return write_run(folder, 20, (0, 2), vut=vut, errors={3: HOSTILE}, timeouts=(4, 6))
-
-    @pytest.fixture(scope="class")
-    def root(self, run) -> etree._Element:
-        opened = ms.open_run(run.folder)
-        gates = [Gate(name).check(opened.verdict, opened.summary) for name in ("errors", "fmc")]
-        path = run.folder.with_name("junit.xml")
-        write_junit(path, run, opened.facts, opened.verdict, gates)
-        return read_junit(path)
-
-    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, run, root):
+    def test_has_a_suite_per_level_with_every_case_and_one_of_gates(self, written, root):
         assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
         names = root.xpath("//testcase/@name")
         assert len(set(names)) == len(names) == 3 + 40
         for suite, level in zip(root[1:], (0, 2), strict=True):
-            at_level = [o.measures for o in run.outcomes if o.case.level == level]
+            at_level = [o.measures for o in written.outcomes if o.case.level == level]
             assert float(suite.get("time")) == pytest.approx(sum(o.t_end_s for o in at_level))
         assert (root.get("errors"), root[1].get("errors"), root[2].get("errors")) == ("1", "0", "1")
-        failed = judge(run.outcomes).failures
+        failed = judge(written.outcomes).failures
         assert root.get("failures") == str(failed + 2 + 2), "with 2 timeouts and 2 gates"
 
-    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, run, root):
+    def test_has_the_message_of_an_error_as_xml_can_hold_it(self, written, root):
         (error,) = root.xpath("//error")
         assert error.get("type") == "VUT_ERROR"
-        ended = run.outcome(3).measures
+        ended = written.outcome(3).measures
         said = "</failure><x>\\x00\\x1b[2J\\ud800\\uffff\\u202e\\n&\"'"
         assert error.get("message") == error.text == f"VUT_ERROR at {ended.t_end_s:g} s: {said}."
 

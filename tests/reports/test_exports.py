@@ -87,23 +87,25 @@ def test_a_free_vut_has_the_controller_that_a_parameter_names(scenario):
     assert (declared.get("name"), declared.get("value")) == ("EgoController", "user")
 
 
+@pytest.fixture(scope="module")
+def lane_run(tmp_path_factory):
+    """Return a campaign in which the VUT merges at M, on the lane, or never."""
+    folder, scenario = tmp_path_factory.mktemp("lane") / "run", named_scenario("us23-lane")
+    return write_run(folder, 2, levels=(1,), timeouts=[1], scenario=scenario)
+
+
+@pytest.fixture(scope="module")
+def lane_scenario(lane_run, tmp_path_factory):
+    road, folder = road_for(lane_run.scenario), tmp_path_factory.mktemp("osc") / "case"
+    return write_openscenario(lane_run, 0, folder, road)
+
+
 class TestAMergeFromALane:
-    @pytest.fixture(scope="class")
-    def made(self, tmp_path_factory):
-        """Return a campaign in which the VUT merges at M, on the lane, or never."""
-        folder, scenario = tmp_path_factory.mktemp("lane") / "run", named_scenario("us23-lane")
-        return write_run(folder, 2, levels=(1,), timeouts=[1], scenario=scenario)
-
-    @pytest.fixture(scope="class")
-    def scenario(self, made, tmp_path_factory):
-        road, folder = road_for(made.scenario), tmp_path_factory.mktemp("osc") / "case"
-        return write_openscenario(made, 0, folder, road)
-
-    def test_is_a_step_of_the_trajectory_from_lane_to_lane(self, made, scenario):
+    def test_is_a_step_of_the_trajectory_from_lane_to_lane(self, lane_run, lane_scenario):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            xosc.ParseOpenScenario(str(scenario))
-        tree, trajectory = etree.parse(scenario), made.trajectory(0)
+            xosc.ParseOpenScenario(str(lane_scenario))
+        tree, trajectory = etree.parse(lane_scenario), lane_run.trajectory(0)
         *before, merge = vertices(tree, "vut")
         x_vut = trajectory.x_vut_m
         assert {y for _, x, y, _ in before if x > -70.0} == {-3.2}
@@ -112,11 +114,11 @@ class TestAMergeFromALane:
         stop = tree.find(".//Storyboard/StopTrigger//SimulationTimeCondition")
         assert float(stop.get("value")) == pytest.approx(trajectory.t_end_s)
 
-    def test_is_a_column_of_a_table(self, made, tmp_path):
-        path = write_table(made, [0, 1], tmp_path / "merges.csv")
+    def test_is_a_column_of_a_table(self, lane_run, tmp_path):
+        path = write_table(lane_run, [0, 1], tmp_path / "merges.csv")
         assert path == tmp_path / "merges.csv"
         frame = polars.read_csv(path)
-        assert frame.columns == list(columns_of(made.scenario))
+        assert frame.columns == list(columns_of(lane_run.scenario))
         first, second = (frame.filter(case=case)["merged"].to_list() for case in (0, 1))
         assert first == [*(0 for _ in first[1:]), 1]
         assert set(second) == {0}

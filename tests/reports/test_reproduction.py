@@ -46,7 +46,7 @@ class TestATinyReproduction:
         with pytest.raises(UserError, match="exists"):
             write_reproduction(tiny, tmp_path)
 
-    def test_puts_our_numbers_beside_the_papers(self, tiny):
+    def test_puts_our_numbers_next_to_those_of_the_paper(self, tiny):
         table = "\n".join(tiny.lines())
         for column in tiny.to_record()["columns"]:
             ours = column["samplers"]["gpr"]["fmc"]["median"]
