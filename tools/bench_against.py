@@ -26,7 +26,7 @@ from typing import Any
 from measuring import append_record, benchmark_parser, spread
 from oracle import greedy_cover
 
-from merge_sumo.analysis.sampler_study import Task, search
+from merge_sumo.analysis.sampler_study import search
 from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
@@ -119,7 +119,7 @@ class Versions:
         The failures of the old version's campaign are none, so that campaign need not run.
         """
         sampler = self.pair.settings(cases, seed).sampler
-        (found,) = search(self.new, [Task(sampler, (self.pair.level,), cases, None, seed)])
+        (found,) = search(self.new, (self.pair.level,), cases, None, [(sampler, seed)])
         failing = [outcome.case for outcome in found.outcomes if outcome.failed]
         outcomes = [episode.outcome for episode in simulate(self.old, failing)]
         return self._points(outcome.case for outcome in outcomes if passes(outcome))

@@ -26,7 +26,7 @@ import numpy as np
 from measuring import append_record, benchmark_parser
 from oracle import greedy_cover
 
-from merge_sumo.analysis.sampler_study import COMPARED_BATCH, Task, search
+from merge_sumo.analysis.sampler_study import COMPARED_BATCH, search
 from merge_sumo.analysis.truth import DENSE_CASES, ground_truth
 from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.plan import resolve
@@ -77,7 +77,7 @@ def dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     for name in names:
         shares, needed = [], []
         for seed in range(options.first, options.first + options.seeds):
-            (found,) = search(plan, [Task(name, (level,), cases, options.batch, seed)])
+            (found,) = search(plan, (level,), cases, options.batch, [(name, seed)])
             failed = [outcome for outcome in found.outcomes if outcome.failed]
             index = np.array([outcome.index for outcome in failed], dtype=np.int64)
             points = to_unit([outcome.case for outcome in failed], level, scenario=US23)
@@ -95,7 +95,7 @@ def dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
 def cost_of_batches(_: object, names: Sequence[str]) -> dict[str, dict[int, float]]:
     """Print and return the CPU seconds of a batch after N cases of `design1` at level 2."""
     plan = resolve(CampaignSettings(vut="design1", levels=(2,), scenario=US23))
-    (known,) = search(plan, [Task("uniform", (2,), HISTORIES[-1], None, 0)])
+    (known,) = search(plan, (2,), HISTORIES[-1], None, [("uniform", 0)])
     print(f"{'seconds for a batch after N =':30s}" + " ".join(f"{n:7d}" for n in HISTORIES))
     figures: dict[str, dict[int, float]] = {}
     for name in names:

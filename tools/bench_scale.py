@@ -172,9 +172,13 @@ class Served(Workers):
         super().__init__()
         self._sent = pickle.dumps(list(ran))
 
-    def submit(self, function: Any, chunks: Any, lost: Any) -> Job[Any, Any]:
+    def submit(
+        self, function: Any, items: Sequence[Any], lost: Any, chunk: int | None = None
+    ) -> Job[Any, Any]:
         """Run nothing."""
-        return Job(function, list(chunks), lost)
+        size = chunk or self.chunk_size(len(items))
+        chunks = [items[first : first + size] for first in range(0, len(items), size)]
+        return Job(function, chunks, lost)
 
     def collect(self, job: Job[Any, Any]) -> list[Any]:
         """Return episodes for the chunks of a job."""

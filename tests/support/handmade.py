@@ -31,7 +31,7 @@ def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Tra
     """
     starts = np.array(case.starts())
     x, v = starts[:, 0], starts[:, 1]
-    rows = []
+    rows: list[np.ndarray] = []
     while x[VUT] < 0.0 and len(rows) * DT_S < 12.0:
         t_s = len(rows) * DT_S
         a = np.zeros(len(x))
